@@ -1,0 +1,405 @@
+//! The sections of an experiment, field by field.
+
+use serde::{Deserialize, Serialize};
+
+/// A whole experiment, resolved: what is learnt, from which motion, how, and for how long.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Experiment {
+    /// The experiment's name; a preset's own name unless overridden.
+    pub name: String,
+    /// Seed of everything random: networks, actors, minibatches.
+    pub seed: u64,
+    /// The reference motion, one entry per source.
+    pub clips: Vec<ClipSource>,
+    /// The tracking task.
+    pub task: Tracking,
+    /// Sizes and initial values of the networks.
+    pub network: Network,
+    /// V-MPO's own numbers.
+    pub vmpo: Vmpo,
+    /// Adam.
+    pub optimiser: Optimiser,
+    /// How experience is cut up and put together again.
+    pub unroll: Unroll,
+    /// What one actor process does.
+    pub actor: Actor,
+    /// Regression towards the servo action before V-MPO starts.
+    pub warm_start: WarmStart,
+    /// The learner as a service.
+    pub learner: Learner,
+    /// When the run ends.
+    pub budget: Budget,
+}
+
+/// Where reference motion comes from: a built-in clip or a file in dm_control's HDF5 layout.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ClipSource {
+    /// `builtin:NAME`, or the path of an HDF5 file.
+    pub source: String,
+    /// One of dm_control's named subsets: `walk_tiny`, `run_jump_tiny`, `get_up`, `locomotion_small`, `all`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub subset: Option<String>,
+    /// Clip names inside the file; every clip of the file (or subset) when empty.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub ids: Vec<String>,
+    /// First frame used, counted from the clip's start.
+    #[serde(default)]
+    pub start_step: usize,
+    /// Last frame used, inclusive for the data and exclusive for starts, as in dm_control; the clip's end when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub end_step: Option<usize>,
+    /// Weight of every start of these clips in the draw.
+    #[serde(default = "one")]
+    pub weight: f64,
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+impl ClipSource {
+    /// The whole of one source, weight 1.
+    pub fn whole(source: impl Into<String>) -> Self {
+        Self { source: source.into(), subset: None, ids: Vec::new(), start_step: 0, end_step: None, weight: 1.0 }
+    }
+}
+
+/// Multi-clip motion-capture tracking (`dm_control/locomotion/tasks/reference_pose/tracking.py`).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Tracking {
+    /// Which frames ahead of the current one the policy sees (S: the next five).
+    pub reference_steps: Vec<usize>,
+    /// Frames a started episode must at least be able to last (dm_control: 10). The last
+    /// `max(reference_steps) + min_steps` frames are no starts; 5 gives the supplement's "last 10 frames".
+    pub min_steps: usize,
+    /// τ: the episode ends with discount 0 when the termination error exceeds it (S).
+    pub termination_threshold: f64,
+    /// How the termination error adds up.
+    pub termination_error: TerminationError,
+    /// Seconds after which an episode is truncated (dm_control's example: 30).
+    pub time_limit: f64,
+    /// Start every episode at its clip's first frame instead of a random one.
+    pub always_start_at_clip_start: bool,
+    /// Preset the actuators' filter state to the reference pose at reset. dm_control leaves it at 0, mid-range.
+    pub preset_actuators: bool,
+    /// Task observations, by dm_control's names without `walker/`, in this order
+    /// (MoCapAct's choice: the supplement's "relative target positions and orientations in the local frame").
+    pub observations: Vec<String>,
+}
+
+impl Default for Tracking {
+    fn default() -> Self {
+        Self {
+            reference_steps: vec![1, 2, 3, 4, 5],
+            min_steps: 10,
+            termination_threshold: 0.3,
+            termination_error: TerminationError::DmControl,
+            time_limit: 30.0,
+            always_start_at_clip_start: false,
+            preset_actuators: false,
+            observations: ["body_height", "reference_rel_bodies_pos_local", "reference_rel_bodies_quats"]
+                .map(String::from)
+                .to_vec(),
+        }
+    }
+}
+
+/// ε, the termination error.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TerminationError {
+    /// ½·mean|Δ body positions| + ½·mean|Δ joints|: what the published code computes.
+    DmControl,
+    /// ‖Δ body positions‖₁ + ‖Δ joints‖₁, summed: the supplement's text, taken literally.
+    Supplement,
+}
+
+/// Sizes and initial values of every network.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Network {
+    /// Hidden sizes of the reference encoder (S: 2×1024).
+    pub encoder: Vec<usize>,
+    /// A linear path from the encoder's input to its output (S: with the MLP low level).
+    pub encoder_linear_path: bool,
+    /// Hidden sizes of the MLP low level (S: 2×1024).
+    pub low_level: Vec<usize>,
+    /// Hidden sizes of the value function (S: 3×1024).
+    pub value: Vec<usize>,
+    /// Width of the learned clip embedding the value function sees (S: 30).
+    pub clip_embedding: usize,
+    /// The latent between encoder and low level.
+    pub latent: Latent,
+    /// The policy's standard deviation before learning (D; softplus at 0 is ln 2).
+    pub initial_std: f64,
+    /// Floor of the policy's standard deviation (D).
+    pub min_std: f64,
+    /// Scale of the policy head's initial weights, relative to the other layers' (D).
+    pub policy_head_scale: f64,
+    /// Where the policy's mean starts: the middle of every joint's range, or the clips' mean pose as an action (D).
+    pub initial_pose: InitialPose,
+    /// Observations are normalised by the mean and standard deviation of the first so many steps; 0 leaves them raw (D).
+    pub normaliser_steps: u64,
+}
+
+impl Default for Network {
+    fn default() -> Self {
+        Self {
+            encoder: vec![1024, 1024],
+            encoder_linear_path: true,
+            low_level: vec![1024, 1024],
+            value: vec![1024, 1024, 1024],
+            clip_embedding: 30,
+            latent: Latent::default(),
+            initial_std: std::f64::consts::LN_2,
+            min_std: 1e-3,
+            policy_head_scale: 1.0,
+            initial_pose: InitialPose::MidRange,
+            normaliser_steps: 0,
+        }
+    }
+}
+
+/// Where the policy's mean starts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum InitialPose {
+    /// Action 0: the middle of every joint's range.
+    MidRange,
+    /// The mean pose of the reference clips, as an action.
+    ReferenceMean,
+}
+
+/// The stochastic latent z.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Latent {
+    /// Dimensions of z (S: 60).
+    pub size: usize,
+    /// β: strength of the KL to the prior (S: 5e-4).
+    pub beta: f64,
+    /// Floor of the encoder's standard deviation (D).
+    pub min_std: f64,
+    /// The encoder's standard deviation before learning (D).
+    pub initial_std: f64,
+    /// p(z_t | z_{t−1}).
+    pub prior: Prior,
+}
+
+impl Default for Latent {
+    fn default() -> Self {
+        Self { size: 60, beta: 5e-4, min_std: 1e-3, initial_std: std::f64::consts::LN_2, prior: Prior::Standard }
+    }
+}
+
+/// The latent's prior.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Prior {
+    /// N(0, I).
+    Standard,
+    /// N(α z_{t−1}, (1 − α²) I), N(0, I) at an episode's first step (NPMP: α = 0.95).
+    Ar1 {
+        /// α.
+        alpha: f64,
+    },
+}
+
+/// V-MPO.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Vmpo {
+    /// γ (S).
+    pub discount: f64,
+    /// ε_η: limit of the E-step (S).
+    pub epsilon_eta: f64,
+    /// ε_μ: limit on the mean (S).
+    pub epsilon_mean: f64,
+    /// ε_Σ: limit on the covariance (S: MLP, LSTM).
+    pub epsilon_std: f64,
+    /// η, α_μ, α_Σ at the start (S).
+    pub initial_temperature: f64,
+    /// α_μ at the start (S).
+    pub initial_alpha_mean: f64,
+    /// α_Σ at the start (S).
+    pub initial_alpha_std: f64,
+    /// Share of the valid steps the E-step imitates (S: the top half).
+    pub top_fraction: f64,
+    /// The target network, with which actors act, is copied every so many learner steps (V).
+    pub target_period: u64,
+    /// Gradient steps on each batch (V: 1).
+    pub gradient_steps: usize,
+    /// Unrolls in a gradient step; must divide the batch (V: the whole batch).
+    pub minibatch_unrolls: usize,
+    /// λ of the return: 1 is the paper's n-step return, below it GAE's mixture (D).
+    pub lambda: f64,
+    /// Entropy bonus (V: none).
+    pub entropy: f64,
+    /// Weight of the value loss (D).
+    pub value_weight: f64,
+}
+
+impl Default for Vmpo {
+    fn default() -> Self {
+        Self {
+            discount: 0.95,
+            epsilon_eta: 0.1,
+            epsilon_mean: 0.1,
+            epsilon_std: 1e-5,
+            initial_temperature: 1.0,
+            initial_alpha_mean: 1.0,
+            initial_alpha_std: 1.0,
+            top_fraction: 0.5,
+            target_period: 100,
+            gradient_steps: 1,
+            minibatch_unrolls: 128,
+            lambda: 1.0,
+            entropy: 0.0,
+            value_weight: 1.0,
+        }
+    }
+}
+
+/// Adam.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Optimiser {
+    /// Learning rate of every network (S).
+    pub learning_rate: f64,
+    /// Learning rate of the multipliers (S: the same).
+    pub multiplier_learning_rate: f64,
+    /// The learning rate falls linearly to this share of itself at the budget's end; 1 is constant (S).
+    pub final_learning_rate_share: f64,
+    /// β₁.
+    pub beta1: f64,
+    /// β₂.
+    pub beta2: f64,
+    /// ε.
+    pub epsilon: f64,
+    /// Global gradient norm is clipped to this; 0 is off (V).
+    pub max_gradient_norm: f64,
+}
+
+impl Default for Optimiser {
+    fn default() -> Self {
+        Self {
+            learning_rate: 1e-4,
+            multiplier_learning_rate: 1e-4,
+            final_learning_rate_share: 1.0,
+            beta1: 0.9,
+            beta2: 0.999,
+            epsilon: 1e-8,
+            max_gradient_norm: 0.0,
+        }
+    }
+}
+
+/// Unrolls and batches.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Unroll {
+    /// T: transitions an unroll (S).
+    pub length: usize,
+    /// B: unrolls a batch (S).
+    pub batch: usize,
+    /// An unroll whose parameters are more than so many published versions old is refused as stale (D).
+    pub max_staleness: u64,
+}
+
+impl Default for Unroll {
+    fn default() -> Self {
+        Self { length: 32, batch: 128, max_staleness: 1000 }
+    }
+}
+
+/// One actor process.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Actor {
+    /// Threads; each owns its environments and its copy of the policy.
+    pub threads: usize,
+    /// Environments a thread; one batched forward pass serves them all.
+    pub environments: usize,
+}
+
+impl Default for Actor {
+    fn default() -> Self {
+        Self { threads: 1, environments: 16 }
+    }
+}
+
+/// Regression towards the servo action of frame t + 1, on rollouts of that action with noise (D; the paper has none).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct WarmStart {
+    /// Gradient steps; 0 is no warm start.
+    pub steps: u64,
+    /// Environment steps of demonstrations gathered first.
+    pub demonstration_steps: u64,
+    /// Standard deviation of the noise added to the servo action.
+    pub noise: f64,
+    /// Unrolls in a regression step.
+    pub minibatch_unrolls: usize,
+    /// Adam's learning rate while regressing.
+    pub learning_rate: f64,
+}
+
+impl Default for WarmStart {
+    fn default() -> Self {
+        Self { steps: 0, demonstration_steps: 32_768, noise: 0.1, minibatch_unrolls: 32, learning_rate: 1e-3 }
+    }
+}
+
+/// The learner as a service.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Learner {
+    /// Threads of libtorch in the update.
+    pub threads: usize,
+    /// Seconds between checkpoints.
+    pub checkpoint_seconds: f64,
+    /// Checkpoints kept.
+    pub checkpoints_kept: usize,
+    /// Seconds between metric lines.
+    pub metrics_seconds: f64,
+}
+
+impl Default for Learner {
+    fn default() -> Self {
+        Self { threads: 1, checkpoint_seconds: 60.0, checkpoints_kept: 3, metrics_seconds: 5.0 }
+    }
+}
+
+/// When the run ends; whatever comes first. Zero is no limit.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Budget {
+    /// Minutes of wall-clock time, counted from the first unroll of this run of the learner.
+    pub minutes: f64,
+    /// Environment steps trained on, over the run's whole life.
+    pub environment_steps: u64,
+    /// Batches trained on, over the run's whole life.
+    pub updates: u64,
+}
+
+impl Default for Experiment {
+    fn default() -> Self {
+        Self {
+            name: "tracking-mlp".into(),
+            seed: 1,
+            clips: vec![ClipSource::whole("builtin:CMU_007_01")],
+            task: Tracking::default(),
+            network: Network::default(),
+            vmpo: Vmpo::default(),
+            optimiser: Optimiser::default(),
+            unroll: Unroll::default(),
+            actor: Actor::default(),
+            warm_start: WarmStart::default(),
+            learner: Learner::default(),
+            budget: Budget::default(),
+        }
+    }
+}

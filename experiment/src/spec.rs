@@ -1,0 +1,90 @@
+//! What a task looks like from outside the simulator: sizes and names.
+
+use serde::{Deserialize, Serialize};
+
+use crate::Tracking;
+
+/// Tracking bodies of the V2020 humanoid, `face` among them.
+const BODIES: usize = 31;
+/// Hinges, and so actuators, of the CMU humanoid.
+pub const ACTION_SIZE: usize = 56;
+/// Proprioception (supplement 1.1, with MoCapAct's order): joints_pos 56, joints_vel 56, velocimeter 3, gyro 3,
+/// end_effectors_pos 12, world_zaxis 3, actuator_activation 56, touch 10, torque 6.
+pub const PROPRIOCEPTION_SIZE: usize = 205;
+/// Reward terms of the tracking task, in the order of dm_control's sorted reward channels.
+pub const TRACKING_REWARD_TERMS: [&str; 5] =
+    ["appendages", "body_quaternions", "center_of_mass", "joints_velocity", "termination"];
+/// The most a tracking step can pay: 0.5 + 0.5·(0.1 + 1 + 0.15 + 0.65).
+pub const TRACKING_MAX_REWARD: f64 = 1.45;
+
+/// Sizes and names of a task: all that networks, wire and learner know of it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TaskSpec {
+    /// Length of the proprioception vector.
+    pub proprioception: usize,
+    /// Length of the task observation vector (for tracking, the references).
+    pub task: usize,
+    /// Length of the action vector, each in [−1, 1].
+    pub action: usize,
+    /// Names of the reward terms; their sum is the reward.
+    pub reward_terms: Vec<String>,
+    /// Names of the clips; a clip's index is its place here.
+    pub clips: Vec<String>,
+}
+
+impl TaskSpec {
+    /// The tracking task over these clips.
+    ///
+    /// # Errors
+    /// The name of an observation that the tracking task does not have.
+    pub fn tracking(config: &Tracking, clips: Vec<String>) -> Result<Self, String> {
+        let steps = config.reference_steps.len();
+        let mut task = 0;
+        for name in &config.observations {
+            task += tracking_observation_size(name, steps).ok_or_else(|| name.clone())?;
+        }
+        Ok(Self {
+            proprioception: PROPRIOCEPTION_SIZE,
+            task,
+            action: ACTION_SIZE,
+            reward_terms: TRACKING_REWARD_TERMS.map(String::from).to_vec(),
+            clips,
+        })
+    }
+}
+
+/// Every task observation the tracking task offers, by dm_control's name without `walker/`.
+pub const TRACKING_OBSERVATIONS: [&str; 14] = [
+    "body_height",
+    "appendages_pos",
+    "sensors_accelerometer",
+    "velocimeter_control",
+    "gyro_control",
+    "joints_vel_control",
+    "time_in_clip",
+    "reference_rel_joints",
+    "reference_rel_bodies_pos_local",
+    "reference_rel_bodies_quats",
+    "reference_ego_bodies_quats",
+    "reference_rel_root_quat",
+    "reference_rel_root_pos_local",
+    "reference_appendages_pos",
+];
+
+/// Length of one of [`TRACKING_OBSERVATIONS`] with `steps` reference steps; `None` for any other name.
+pub fn tracking_observation_size(name: &str, steps: usize) -> Option<usize> {
+    Some(match name {
+        "body_height" | "time_in_clip" => 1,
+        "appendages_pos" => 15,
+        "sensors_accelerometer" | "velocimeter_control" | "gyro_control" => 3,
+        "joints_vel_control" => ACTION_SIZE,
+        "reference_rel_joints" => steps * ACTION_SIZE,
+        "reference_rel_bodies_pos_local" => steps * BODIES * 3,
+        "reference_rel_bodies_quats" | "reference_ego_bodies_quats" => steps * BODIES * 4,
+        "reference_rel_root_quat" => steps * 4,
+        "reference_rel_root_pos_local" => steps * 3,
+        "reference_appendages_pos" => steps * 15,
+        _ => return None,
+    })
+}
