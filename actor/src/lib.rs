@@ -1,1 +1,28 @@
-//! comic-actor
+//! Whatever needs a simulator: acting for a learner, evaluating a policy, measuring how fast both go.
+//!
+//! # Layout
+//! - [`worker`] is the hot path: one thread, its environments, one batched forward pass a step, unrolls out.
+//! - [`acting`] is what a forward pass reads and writes; [`policy`] is the one through libtorch.
+//! - [`mailbox`] hands the newest parameters to the workers, who look at unroll boundaries only.
+//! - [`session`] is the connection to the learner: it joins, fetches assets, watches parameters, sends unrolls until
+//!   each is acknowledged, and comes back by itself after every loss.
+//! - [`run`] puts these together into an actor process.
+//! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads what the learner wrote.
+//! - [`bench`] holds the figures of `comic-actor bench`.
+//!
+//! Nothing here knows a loss, and nothing here is unbounded: finished unrolls wait in a bounded channel, unrolls that
+//! are not acknowledged in a bounded window, and behind a full window the environments stand still.
+
+pub mod acting;
+pub mod bench;
+pub mod checkpoint;
+mod error;
+pub mod evaluate;
+pub mod mailbox;
+pub mod policy;
+pub mod run;
+mod seeds;
+pub mod session;
+pub mod worker;
+
+pub use error::Error;

@@ -64,7 +64,24 @@ impl ClipSource {
     pub fn whole(source: impl Into<String>) -> Self {
         Self { source: source.into(), subset: None, ids: Vec::new(), start_step: 0, end_step: None, weight: 1.0 }
     }
+
+    /// The command line's form: `SOURCE`, or `SOURCE#SELECTION` where the selection is a named subset or clip names
+    /// separated by commas: `builtin:walk`, `cmu.h5#walk_tiny`, `cmu.h5#CMU_007_01,CMU_002_03`.
+    pub fn parse(argument: &str) -> Self {
+        match argument.rsplit_once('#') {
+            Some((source, selection)) if SUBSETS.contains(&selection) => {
+                Self { subset: Some(selection.into()), ..Self::whole(source) }
+            }
+            Some((source, selection)) => {
+                Self { ids: selection.split(',').map(String::from).collect(), ..Self::whole(source) }
+            }
+            None => Self::whole(argument),
+        }
+    }
 }
+
+/// dm_control's named subsets of the CMU clips (`cmu_subsets.py`).
+pub const SUBSETS: [&str; 5] = ["walk_tiny", "run_jump_tiny", "get_up", "locomotion_small", "all"];
 
 /// Multi-clip motion-capture tracking (`dm_control/locomotion/tasks/reference_pose/tracking.py`).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -377,7 +394,7 @@ impl Default for Learner {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Budget {
-    /// Minutes of wall-clock time, counted from the first unroll of this run of the learner.
+    /// Minutes of wall-clock time since the first unroll, earlier lives of the learner included.
     pub minutes: f64,
     /// Environment steps trained on, over the run's whole life.
     pub environment_steps: u64,

@@ -1,1 +1,27 @@
-//! comic-learner
+//! The learner: one process that serves thousands of actors and learns from what they send.
+//!
+//! # Layout
+//! - [`run`] puts the parts together and takes them apart again.
+//! - [`service`] is gRPC on tokio; [`publish`] is parameters on their way down.
+//! - [`trainer`] is the OS thread that owns the device: batches in, gradient steps, parameters out. [`warm_start`] is what
+//!   it does before.
+//! - [`vmpo`] is the algorithm: losses, and the gradient step. [`adam`] is its optimiser.
+//! - [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
+//! - [`metrics`] is what a person sees.
+//!
+//! There is no MuJoCo here: whatever needs a simulator is done by actors.
+
+pub mod adam;
+pub mod bench;
+pub mod checkpoint;
+pub mod metrics;
+pub mod options;
+pub mod publish;
+pub mod run;
+pub mod service;
+pub mod statistics;
+pub mod tensors;
+pub mod trainer;
+pub mod vmpo;
+pub mod warm_start;
+pub mod writer;

@@ -1,1 +1,29 @@
-//! comic-networks
+//! The networks: what acts and what learns are the same functions, inside `tch::no_grad` or with gradient.
+//!
+//! # Layout
+//! - [`Policy`] is everything acting needs: normaliser, reference encoder, MLP low level. Its parameters travel.
+//! - [`Value`] is what only the learner needs. It lives in a parameter store of its own.
+//! - [`DiagonalGaussian`] is the one distribution: actions and latents.
+//! - [`to_safetensors`] and [`from_safetensors`] carry a parameter store over a wire or onto a disk.
+//!
+//! Every network takes rows: `[N, ·]` float32 tensors, where a learner's N is unrolls × steps.
+//! Sums over N depend in their last bits on N and on the number of threads; with both equal, acting and learning
+//! give the same numbers bit for bit.
+//!
+//! Initial weights are uniform in ±1/√fan_in (variance scaling with scale ⅓) and biases 0 unless said otherwise.
+//! They come from libtorch's generator: call `tch::manual_seed` first to make them reproducible.
+
+mod error;
+mod gaussian;
+mod layers;
+mod normaliser;
+mod parameters;
+mod policy;
+mod value;
+
+pub use error::Error;
+pub use gaussian::DiagonalGaussian;
+pub use normaliser::{NORMALISED_LIMIT, NORMALISER_MIN_STD, NormalisedObservation, NormaliserStatistics};
+pub use parameters::{from_safetensors, to_safetensors};
+pub use policy::{Acting, Policy};
+pub use value::Value;

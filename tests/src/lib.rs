@@ -1,1 +1,8 @@
-//! comic-tests
+//! What the whole-system tests share.
+//!
+//! # Layout
+//! - [`repository`] looks at the workspace's own files and dependencies.
+//! - [`system`] runs a learner and actors as a user would: real programs, real sockets, one directory for the run.
+
+pub mod repository;
+pub mod system;

@@ -1,1 +1,78 @@
-fn main(){}
+//! `cargo xtask`: set-up, tests, training, benchmarks and plots from one entry.
+//!
+//! # Layout
+//! - [`setup`] fills `.deps` with the native libraries; everything else calls it first.
+//! - [`check`] runs the tests and the linters.
+//! - [`train`] runs one learner and its actors on this machine and shows what they do.
+//! - [`bench`] and [`python`] make the figures of the README, [`plot`] its curves.
+//!
+//! This program runs before there is a libtorch or a MuJoCo, so it links neither.
+
+mod bench;
+mod check;
+mod interrupt;
+mod plot;
+mod progress;
+mod python;
+mod setup;
+mod train;
+mod workspace;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+#[derive(Parser)]
+#[command(name = "cargo xtask", about = "Set up, test, train and measure CoMic", disable_help_subcommand = true)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Fetch libmujoco, libtorch and the humanoid into .deps
+    Setup(setup::Options),
+    /// Set up and run every test
+    Test(check::TestOptions),
+    /// Check formatting and run clippy, warnings being errors
+    Lint,
+    /// Set up, build, and train with one learner and its actors on this machine
+    Train(train::Options),
+    /// Measure; one JSON line per figure
+    Bench(bench::Options),
+    /// Draw the curves of runs, or of ../shared/baselines, as one picture
+    Plot {
+        /// Files of metrics, `runs/NAME/metrics.jsonl`; `LABEL=FILE` gives a curve its name
+        #[arg(required = true)]
+        metrics: Vec<String>,
+        /// What the curves show
+        #[arg(long = "y", value_enum, default_value = "episode-return")]
+        quantity: plot::Quantity,
+        /// The picture
+        #[arg(long, default_value = "curves.svg")]
+        out: PathBuf,
+    },
+    /// Make the tests' fixtures anew by the scripts in tests/python
+    Fixtures(python::FixtureOptions),
+}
+
+fn main() -> ExitCode {
+    let result = match Arguments::parse().command {
+        Command::Setup(options) => setup::run(&options),
+        Command::Test(options) => check::test(&options),
+        Command::Lint => check::lint(),
+        Command::Train(options) => train::run(options),
+        Command::Bench(options) => bench::run(&options),
+        Command::Plot { metrics, quantity, out } => plot::run(&metrics, quantity, &out),
+        Command::Fixtures(options) => python::fixtures(&options),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}

@@ -1,0 +1,140 @@
+//! Reading what the learner wrote; writing is the learner's affair alone.
+//!
+//! A checkpoint is a directory whose `MANIFEST.json` maps each file's name to its SHA-256 (hexadecimal). Of its files
+//! two matter here: `experiment.toml` and `policy.safetensors`, the parameters of the online policy.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use comic_experiment::Experiment;
+use sha2::{Digest as _, Sha256};
+
+use crate::Error;
+
+const MANIFEST: &str = "MANIFEST.json";
+const EXPERIMENT: &str = "experiment.toml";
+const POLICY: &str = "policy.safetensors";
+
+/// What acting needs of a checkpoint.
+#[derive(Clone, Debug)]
+pub struct Checkpoint {
+    /// The checkpoint's directory.
+    pub path: PathBuf,
+    /// The experiment it belongs to.
+    pub experiment: Experiment,
+    /// Parameters of the online policy (safetensors).
+    pub policy: Vec<u8>,
+}
+
+/// Reads the newest complete checkpoint that `path` names: a run directory (which holds `checkpoints/`), a directory of
+/// checkpoints (`checkpoint-NNNNNNNNNN`), or one checkpoint. Among several, a damaged one is passed over with a warning.
+///
+/// # Errors
+/// [`Error::Checkpoint`] when there is none, or the one that was named is damaged.
+pub fn read(path: &Path) -> Result<Checkpoint, Error> {
+    if path.join(MANIFEST).is_file() {
+        return read_one(path);
+    }
+    let below = path.join("checkpoints");
+    let directory = if below.is_dir() { below } else { path.to_path_buf() };
+    for candidate in numbered(&directory)?.into_iter().rev() {
+        match read_one(&candidate) {
+            Ok(checkpoint) => return Ok(checkpoint),
+            Err(error) => tracing::warn!("passed over a damaged checkpoint: {error}"),
+        }
+    }
+    Err(refuse(path, "no complete checkpoint here (a run directory, its `checkpoints`, or one of them is wanted)"))
+}
+
+/// Numbered checkpoints, oldest first: the numbers are zero-padded.
+fn numbered(directory: &Path) -> Result<Vec<PathBuf>, Error> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(directory).map_err(|error| refuse(directory, error))? {
+        let entry = entry.map_err(|error| refuse(directory, error))?;
+        if entry.file_name().to_string_lossy().starts_with("checkpoint-") && entry.path().is_dir() {
+            found.push(entry.path());
+        }
+    }
+    found.sort();
+    Ok(found)
+}
+
+fn read_one(path: &Path) -> Result<Checkpoint, Error> {
+    let manifest = std::fs::read(path.join(MANIFEST)).map_err(|error| refuse(path, format!("{MANIFEST}: {error}")))?;
+    let manifest: BTreeMap<String, String> =
+        serde_json::from_slice(&manifest).map_err(|error| refuse(path, format!("{MANIFEST}: {error}")))?;
+    let experiment = String::from_utf8(part(path, &manifest, EXPERIMENT)?)
+        .map_err(|error| refuse(path, format!("{EXPERIMENT}: {error}")))?;
+    let experiment = Experiment::from_toml(&path.join(EXPERIMENT).display().to_string(), &experiment)?;
+    Ok(Checkpoint { path: path.to_path_buf(), experiment, policy: part(path, &manifest, POLICY)? })
+}
+
+fn part(path: &Path, manifest: &BTreeMap<String, String>, name: &str) -> Result<Vec<u8>, Error> {
+    let expected = manifest.get(name).ok_or_else(|| refuse(path, format!("{MANIFEST} does not name {name}")))?;
+    let bytes = std::fs::read(path.join(name)).map_err(|error| refuse(path, format!("{name}: {error}")))?;
+    let mut found = String::with_capacity(64);
+    for byte in Sha256::digest(&bytes) {
+        // Writing to a string cannot fail.
+        let _ = write!(found, "{byte:02x}");
+    }
+    if found == *expected { Ok(bytes) } else { Err(refuse(path, format!("{name} is damaged: its SHA-256 differs"))) }
+}
+
+fn refuse(path: &Path, reason: impl ToString) -> Error {
+    Error::Checkpoint { path: path.to_path_buf(), reason: reason.to_string() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn write(path: &Path, policy: &[u8]) {
+        std::fs::create_dir_all(path).unwrap();
+        let mut manifest = BTreeMap::new();
+        for (name, bytes) in [(EXPERIMENT, Experiment::default().to_toml().unwrap().as_bytes()), (POLICY, policy)] {
+            std::fs::write(path.join(name), bytes).unwrap();
+            let hash: String = Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+            manifest.insert(name, hash);
+        }
+        std::fs::write(path.join(MANIFEST), serde_json::to_vec(&manifest).unwrap()).unwrap();
+    }
+
+    fn run_with_two() -> tempfile::TempDir {
+        let run = tempfile::tempdir().unwrap();
+        write(&run.path().join("checkpoints/checkpoint-0000000009"), b"older");
+        write(&run.path().join("checkpoints/checkpoint-0000000010"), b"newer");
+        run
+    }
+
+    #[test]
+    fn a_run_its_checkpoints_and_a_single_one_can_be_named() {
+        let run = run_with_two();
+        assert_eq!(read(run.path()).unwrap().policy, b"newer");
+        assert_eq!(read(&run.path().join("checkpoints")).unwrap().policy, b"newer");
+        assert_eq!(read(&run.path().join("checkpoints/checkpoint-0000000009")).unwrap().policy, b"older");
+    }
+
+    #[test]
+    fn a_damaged_checkpoint_is_passed_over_but_refused_when_named() {
+        let run = run_with_two();
+        let newest = run.path().join("checkpoints/checkpoint-0000000010");
+        std::fs::write(newest.join(POLICY), b"altered").unwrap();
+        assert_eq!(read(run.path()).unwrap().policy, b"older");
+        let error = read(&newest).unwrap_err();
+        assert!(error.is_configuration() && error.to_string().contains("SHA-256 differs"), "{error}");
+    }
+
+    #[test]
+    fn an_incomplete_checkpoint_is_passed_over() {
+        let run = run_with_two();
+        std::fs::remove_file(run.path().join("checkpoints/checkpoint-0000000010").join(MANIFEST)).unwrap();
+        assert_eq!(read(run.path()).unwrap().policy, b"older");
+    }
+
+    #[test]
+    fn an_empty_directory_holds_none() {
+        let empty = tempfile::tempdir().unwrap();
+        assert!(read(empty.path()).unwrap_err().to_string().contains("no complete checkpoint"));
+    }
+}

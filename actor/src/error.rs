@@ -1,0 +1,131 @@
+//! What can go wrong in an actor.
+
+use std::path::PathBuf;
+
+/// An actor's errors. [`Error::is_configuration`] tells those that no restart can mend.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// The learner's address is no URL.
+    #[error("`{url}` is no address of a learner: give one like http://host:7070")]
+    Url {
+        /// What was given.
+        url: String,
+    },
+    /// The learner answers, and will not have this actor.
+    #[error("the learner at {url} refused this actor: {message} (do both programs come from the same release?)")]
+    Refused {
+        /// The learner's address.
+        url: String,
+        /// Its reason.
+        message: String,
+    },
+    /// The learner has worked with this process and will not do so any longer.
+    #[error("the learner does not take actor {actor} back: {message}; start the actor again")]
+    Dismissed {
+        /// The index it had.
+        actor: u64,
+        /// The learner's reason.
+        message: String,
+    },
+    /// The learner's experiment document is not one that this actor understands.
+    #[error("the learner's experiment cannot be used: {0}")]
+    Experiment(#[from] comic_experiment::Error),
+    /// The task's specification does not parse.
+    #[error("the learner's task specification cannot be used: {0}")]
+    Spec(#[from] toml::de::Error),
+    /// Both sides computed different sizes from the same document.
+    #[error("learner and actor disagree on {what}: build both from the same release")]
+    Disagreement {
+        /// What they disagree on.
+        what: &'static str,
+    },
+    /// After a reconnect the learner serves another experiment.
+    #[error("the learner now serves another experiment than the one this actor runs: start the actor again")]
+    Changed,
+    /// The process was told to stop before it had begun.
+    #[error("stopped before the learner answered")]
+    Stopped,
+    /// An asset did not arrive as announced.
+    #[error("asset `{origin}` did not arrive as the learner announced it: {reason}")]
+    Asset {
+        /// The asset's name in the experiment.
+        origin: String,
+        /// What was wrong.
+        reason: String,
+    },
+    /// Parameters off the wire that break the protocol.
+    #[error("malformed parameters off the wire: {reason}")]
+    Parameters {
+        /// What was wrong.
+        reason: String,
+    },
+    /// Parameters that do not fit the experiment's networks.
+    #[error("the parameters do not fit the networks of the experiment: {reason}")]
+    Misfit {
+        /// What was wrong.
+        reason: String,
+    },
+    /// A file or directory.
+    #[error("{}: {source}", path.display())]
+    File {
+        /// Which.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
+    /// No place to keep assets.
+    #[error("no cache directory is known: name one with --cache, or set HOME or XDG_CACHE_HOME")]
+    NoCache,
+    /// A checkpoint that cannot be used.
+    #[error("checkpoint {}: {reason}", path.display())]
+    Checkpoint {
+        /// Where it lies.
+        path: PathBuf,
+        /// Why not.
+        reason: String,
+    },
+    /// The command line asks for what makes no sense.
+    #[error("{0}")]
+    Usage(String),
+    /// Reference clips.
+    #[error(transparent)]
+    Clips(#[from] comic_clips::Error),
+    /// The task or its simulator.
+    #[error(transparent)]
+    Task(#[from] comic_tasks::Error),
+    /// libtorch.
+    #[error("libtorch: {0}")]
+    Torch(#[from] tch::TchError),
+    /// A worker thread ended by a panic; its message went to stderr.
+    #[error("a worker thread panicked")]
+    WorkerPanicked,
+    /// A thread or the runtime could not be started.
+    #[error("cannot start a thread: {0}")]
+    Thread(#[source] std::io::Error),
+}
+
+impl Error {
+    /// Whether the configuration is wrong, so that starting again cannot help (exit code 2 instead of 1).
+    pub fn is_configuration(&self) -> bool {
+        matches!(
+            self,
+            Self::Url { .. }
+                | Self::Refused { .. }
+                | Self::Experiment(_)
+                | Self::Spec(_)
+                | Self::Disagreement { .. }
+                | Self::Misfit { .. }
+                | Self::NoCache
+                | Self::Checkpoint { .. }
+                | Self::Usage(_)
+                | Self::Clips(_)
+                | Self::Task(_)
+        )
+    }
+
+    pub(crate) fn file(path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.into();
+        move |source| Self::File { path, source }
+    }
+}

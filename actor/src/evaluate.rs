@@ -1,0 +1,100 @@
+//! How well a policy tracks, per clip and reward term.
+//!
+//! An episode's normalised reward is its return / ([`TRACKING_MAX_REWARD`] × the steps that were left in the clip at
+//! its start), so that falling early counts. Beside it stand the reward per survived step / [`TRACKING_MAX_REWARD`],
+//! which forgives a fall, and the fraction survived, which sees nothing else.
+//!
+//! [`TRACKING_MAX_REWARD`]: comic_experiment::TRACKING_MAX_REWARD
+
+pub mod command;
+mod report;
+mod rollout;
+mod table;
+
+use std::sync::Arc;
+
+use comic_tasks::{ClipStarts, TrackingEnvironment, TrackingTask};
+use rand::{Rng as _, SeedableRng as _};
+use rand_pcg::Pcg64;
+
+use crate::Error;
+use crate::acting::{ActingSizes, ForwardPass};
+use crate::seeds::derive;
+
+pub use report::{ClipReport, Finished, Report};
+pub use rollout::{Evaluated, Start, Startable};
+
+/// How to evaluate.
+#[derive(Clone, Copy, Debug)]
+pub struct Options {
+    /// Episodes of each clip from random starts; every start once when absent.
+    pub episodes: Option<usize>,
+    /// The mean action and the latent's mean instead of samples.
+    pub deterministic: bool,
+    /// Seed of random starts and of the noise.
+    pub seed: u64,
+    /// Environments in one forward pass.
+    pub environments: usize,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { episodes: None, deterministic: false, seed: 1, environments: 16 }
+    }
+}
+
+/// Evaluates over the starts of the clips of `task`; `latent` is Z.
+///
+/// `progress` is called with (episodes done, episodes in all) after each episode.
+///
+/// # Errors
+/// A failing forward pass, a start that the task does not have.
+pub fn evaluate<F: ForwardPass>(
+    evaluated: &mut Evaluated<'_, F>,
+    task: &Arc<TrackingTask>,
+    latent: usize,
+    options: &Options,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Report, Error> {
+    let spec = task.spec();
+    let starts = chosen(task.starts(), options);
+    let environments = (0..options.environments.min(starts.len()).max(1) as u64)
+        .map(|index| task.environment(derive(options.seed, index)))
+        .collect::<Vec<TrackingEnvironment>>();
+    let sizes =
+        ActingSizes { proprioception: spec.proprioception, task: spec.task, latent, action: spec.action };
+    let finished = rollout::run(evaluated, environments, sizes, &starts, options, progress)?;
+    Ok(Report::new(spec, &finished, options))
+}
+
+/// What is to be rolled out: all starts, or random ones.
+fn chosen(clips: &[ClipStarts], options: &Options) -> Vec<Start> {
+    let mut rng = Pcg64::seed_from_u64(derive(options.seed, u64::MAX));
+    let mut chosen = Vec::new();
+    for ClipStarts { clip, frames, .. } in clips.iter().filter(|clip| !clip.frames.is_empty()) {
+        let start = |start| Start { clip: *clip, start };
+        match options.episodes {
+            None => chosen.extend(frames.clone().map(start)),
+            Some(episodes) => chosen.extend((0..episodes).map(|_| start(rng.random_range(frames.clone())))),
+        }
+    }
+    chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_start_once_or_so_many_random_ones_that_a_seed_repeats() {
+        let clips = [0..3, 0..0, 5..6].into_iter().enumerate();
+        let clips: Vec<_> = clips.map(|(clip, frames)| ClipStarts { clip, frames, probability: 0.0 }).collect();
+        let all = chosen(&clips, &Options::default());
+        assert_eq!(all.iter().map(|s| (s.clip, s.start)).collect::<Vec<_>>(), [(0, 0), (0, 1), (0, 2), (2, 5)]);
+        let random = Options { episodes: Some(4), ..Options::default() };
+        let some = chosen(&clips, &random);
+        assert_eq!(some.len(), 8);
+        assert!(some.iter().all(|s| clips[s.clip].frames.contains(&s.start)));
+        assert_eq!(some, chosen(&clips, &random));
+    }
+}

@@ -1,0 +1,148 @@
+//! `comic-actor evaluate`.
+
+use std::io::{IsTerminal as _, Write as _};
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use clap::Args;
+use comic_clips::Catalogue;
+use comic_experiment::{ClipSource, Experiment};
+use comic_tasks::TrackingTask;
+
+use super::{Evaluated, Options, Report, evaluate};
+use crate::Error;
+use crate::checkpoint;
+use crate::policy::TorchPolicy;
+
+const JSON_HELP: &str = "\
+With --json one object goes to standard output:
+  deterministic  whether means were taken instead of samples
+  seed           the seed
+  clips          one object for each clip, in the clips' order:
+    clip               name
+    episodes           number of episodes
+    diverged           how many of them ended because the simulation diverged
+    length_mean        mean steps of an episode
+    return_mean        mean return
+    normalised_reward  mean of return / (1.45 x steps left in the clip at the episode's start)
+    reward_per_step    reward per survived step / 1.45
+    fraction_survived  mean of steps / steps left in the clip at the episode's start
+    reward_terms       each reward term's mean per step, by name
+  overall        the same over all episodes; its clip is \"overall\"";
+
+/// Evaluates a policy: return, normalised reward, fraction of the clip survived and reward terms, per clip.
+#[derive(Args, Clone, Debug)]
+#[command(after_long_help = JSON_HELP)]
+pub struct Evaluate {
+    /// A run's directory, its `checkpoints`, or one checkpoint; the newest complete one is taken.
+    #[arg(long, value_name = "DIR", required_unless_present = "preset")]
+    checkpoint: Option<PathBuf>,
+    /// The experiment to evaluate without a checkpoint: a preset's name or a TOML file.
+    #[arg(long, value_name = "NAME|FILE", conflicts_with = "checkpoint")]
+    preset: Option<String>,
+    /// Overrides a field of the preset, for instance `--set task.termination_threshold=0.5`.
+    #[arg(long, value_name = "FIELD=VALUE", requires = "preset")]
+    set: Vec<String>,
+    /// The policy as it is before any learning.
+    #[arg(long)]
+    untrained: bool,
+    /// The servo action itself, the pose of the next reference frame, instead of a policy.
+    #[arg(long, conflicts_with = "untrained")]
+    servo: bool,
+    /// Clips in place of the experiment's own.
+    #[arg(long, value_name = "FILE|builtin:NAME", value_delimiter = ',')]
+    clips: Vec<String>,
+    /// The mean action and the latent's mean instead of samples.
+    #[arg(long)]
+    deterministic: bool,
+    /// Episodes of each clip from random starts, instead of every start once.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    episodes: Option<u32>,
+    /// Seed of random starts and of the noise.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// JSON instead of a table; see below.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Evaluate {
+    /// Evaluates and prints.
+    ///
+    /// # Errors
+    /// Whatever keeps it from that.
+    pub fn run(&self) -> Result<(), Error> {
+        let report = self.evaluate()?;
+        let text = if self.json {
+            let json = serde_json::to_string_pretty(&report)
+                .map_err(|error| Error::Usage(format!("cannot write the report as JSON: {error}")))?;
+            json + "\n"
+        } else {
+            report.to_string()
+        };
+        std::io::stdout().write_all(text.as_bytes()).map_err(Error::file("standard output"))
+    }
+
+    fn evaluate(&self) -> Result<Report, Error> {
+        let (mut experiment, parameters) = self.subject()?;
+        if !self.clips.is_empty() {
+            experiment.clips = self.clips.iter().map(ClipSource::whole).collect();
+        }
+        let catalogue = Catalogue::open(&experiment.clips)?;
+        let task = Arc::new(TrackingTask::new(&experiment.task, &catalogue)?);
+        let options = Options {
+            episodes: self.episodes.map(|episodes| episodes as usize),
+            deterministic: self.deterministic,
+            seed: self.seed,
+            ..Options::default()
+        };
+        let latent = experiment.network.latent.size;
+        let mut policy = self.policy(&experiment, &task, &catalogue, parameters.as_deref())?;
+        let mut evaluated = policy.as_mut().map_or(Evaluated::Servo, Evaluated::Policy);
+        evaluate(&mut evaluated, &task, latent, &options, &mut show_progress)
+    }
+
+    /// The experiment, and the parameters when there is a checkpoint.
+    fn subject(&self) -> Result<(Experiment, Option<Vec<u8>>), Error> {
+        if let Some(path) = &self.checkpoint {
+            let found = checkpoint::read(path)?;
+            tracing::info!(checkpoint = %found.path.display(), "evaluating");
+            return Ok((found.experiment, Some(found.policy)));
+        }
+        let preset = self.preset.as_deref().unwrap_or_default();
+        if !self.untrained && !self.servo {
+            return Err(Error::Usage(
+                "a preset has no trained policy: add --untrained or --servo, or name a --checkpoint".into(),
+            ));
+        }
+        Ok((comic_experiment::resolve(preset, &self.set)?, None))
+    }
+
+    fn policy(
+        &self,
+        experiment: &Experiment,
+        task: &TrackingTask,
+        catalogue: &Catalogue,
+        parameters: Option<&[u8]>,
+    ) -> Result<Option<TorchPolicy>, Error> {
+        if self.servo {
+            return Ok(None);
+        }
+        let policy = match parameters {
+            Some(parameters) if !self.untrained => TorchPolicy::from_parameters(task.spec(), experiment, parameters)?,
+            _ => TorchPolicy::untrained(task.spec(), experiment, experiment.seed, || Ok(catalogue.mean_action()?))?,
+        };
+        Ok(Some(policy))
+    }
+}
+
+fn show_progress(done: usize, all: usize) {
+    let mut stderr = std::io::stderr();
+    if stderr.is_terminal() {
+        let end = if done == all { "\n" } else { "" };
+        // Progress that cannot be shown is no reason to stop.
+        let _ = write!(stderr, "\r{done} of {all} episodes{end}");
+    } else if done.is_multiple_of(100) || done == all {
+        tracing::info!(done, all, "episodes");
+    }
+}

@@ -1,0 +1,159 @@
+//! What an evaluation found.
+
+use std::collections::BTreeMap;
+
+use comic_experiment::{TRACKING_MAX_REWARD, TaskSpec};
+use comic_tasks::MAX_REWARD_TERMS;
+use serde::{Deserialize, Serialize};
+
+use super::Options;
+
+/// An episode that is over.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Finished {
+    /// The clip's index.
+    pub clip: usize,
+    /// Steps that were left in the clip at the start.
+    pub steps_left: usize,
+    /// Steps it lasted.
+    pub steps: usize,
+    /// Sums of the reward terms.
+    pub returns: [f64; MAX_REWARD_TERMS],
+    /// The simulation diverged.
+    pub diverged: bool,
+}
+
+/// An evaluation: `comic-actor evaluate --json` prints exactly this.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Report {
+    /// Whether actions and latents were the means instead of samples.
+    pub deterministic: bool,
+    /// Seed of random starts and noise.
+    pub seed: u64,
+    /// One for each clip that has a start, in the clips' order.
+    pub clips: Vec<ClipReport>,
+    /// Over all episodes of all clips.
+    pub overall: ClipReport,
+}
+
+/// The episodes of one clip. Means are over episodes unless said otherwise.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ClipReport {
+    /// The clip's name; `overall` for all of them.
+    pub clip: String,
+    /// Number of episodes.
+    pub episodes: usize,
+    /// How many of them ended because the simulation diverged.
+    pub diverged: usize,
+    /// Mean number of steps.
+    pub length_mean: f64,
+    /// Mean return.
+    pub return_mean: f64,
+    /// Mean of return / (1.45 × steps left in the clip at the start).
+    pub normalised_reward: f64,
+    /// Mean over all steps of reward / 1.45.
+    pub reward_per_step: f64,
+    /// Mean of steps / steps left in the clip at the start.
+    pub fraction_survived: f64,
+    /// Mean over all steps of each reward term.
+    pub reward_terms: BTreeMap<String, f64>,
+}
+
+impl Report {
+    /// Sums up `finished` over the clips of `spec`.
+    pub fn new(spec: &TaskSpec, finished: &[Finished], options: &Options) -> Self {
+        let clips = spec
+            .clips
+            .iter()
+            .enumerate()
+            .map(|(index, name)| {
+                let of_clip: Vec<Finished> = finished.iter().filter(|e| e.clip == index).copied().collect();
+                ClipReport::new(name, &spec.reward_terms, &of_clip)
+            })
+            .filter(|clip| clip.episodes > 0)
+            .collect();
+        let overall = ClipReport::new("overall", &spec.reward_terms, finished);
+        Self { deterministic: options.deterministic, seed: options.seed, clips, overall }
+    }
+}
+
+impl ClipReport {
+    fn new(clip: &str, terms: &[String], finished: &[Finished]) -> Self {
+        let mean = |value: &dyn Fn(&Finished) -> f64| ratio(finished.iter().map(value).sum(), finished.len() as f64);
+        let total = |episode: &Finished| episode.returns.iter().sum::<f64>();
+        let steps: f64 = finished.iter().map(|episode| episode.steps as f64).sum();
+        let per_step = |value: &dyn Fn(&Finished) -> f64| ratio(finished.iter().map(value).sum(), steps);
+        Self {
+            clip: clip.to_string(),
+            episodes: finished.len(),
+            diverged: finished.iter().filter(|episode| episode.diverged).count(),
+            length_mean: mean(&|episode| episode.steps as f64),
+            return_mean: mean(&total),
+            normalised_reward: mean(&|episode| ratio(total(episode), TRACKING_MAX_REWARD * episode.steps_left as f64)),
+            reward_per_step: per_step(&total) / TRACKING_MAX_REWARD,
+            fraction_survived: mean(&|episode| ratio(episode.steps as f64, episode.steps_left as f64)),
+            reward_terms: terms
+                .iter()
+                .zip(0..MAX_REWARD_TERMS)
+                .map(|(name, term)| (name.clone(), per_step(&|episode| episode.returns[term])))
+                .collect(),
+        }
+    }
+}
+
+/// 0 where there is nothing to divide by: JSON has no NaN.
+fn ratio(sum: f64, count: f64) -> f64 {
+    if count > 0.0 { sum / count } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn spec() -> TaskSpec {
+        TaskSpec {
+            proprioception: 1,
+            task: 1,
+            action: 1,
+            reward_terms: vec!["pose".into(), "velocity".into()],
+            clips: vec!["walk".into(), "run".into(), "unused".into()],
+        }
+    }
+
+    fn episode(clip: usize, steps_left: usize, steps: usize, pose: f64, velocity: f64) -> Finished {
+        let mut returns = [0.0; MAX_REWARD_TERMS];
+        returns[..2].copy_from_slice(&[pose, velocity]);
+        Finished { clip, steps_left, steps, returns, diverged: false }
+    }
+
+    #[test]
+    fn the_formulas_by_hand() {
+        let finished = [episode(0, 10, 5, 2.9, 1.45), episode(0, 20, 20, 14.5, 14.5), episode(1, 4, 4, 0.0, 5.8)];
+        let report = Report::new(&spec(), &finished, &Options::default());
+        let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-12, "{a} is not {b}");
+        assert_eq!(report.clips.len(), 2, "a clip without an episode has no row");
+
+        let walk = &report.clips[0];
+        close(walk.return_mean, f64::midpoint(4.35, 29.0));
+        // 4.35 / (1.45 × 10) = 0.3 and 29 / (1.45 × 20) = 1: falling half-way costs the other half.
+        close(walk.normalised_reward, 0.65);
+        // (3 + 20) / 25: a fall is forgiven.
+        close(walk.reward_per_step, 23.0 / 25.0);
+        close(walk.fraction_survived, 0.75);
+        close(walk.length_mean, 12.5);
+        close(walk.reward_terms["pose"], (2.9 + 14.5) / 25.0);
+        close(walk.reward_terms["velocity"], (1.45 + 14.5) / 25.0);
+
+        assert_eq!((report.overall.clip.as_str(), report.overall.episodes), ("overall", 3));
+        close(report.overall.normalised_reward, (0.3 + 1.0 + 1.0) / 3.0);
+    }
+
+    #[test]
+    fn no_episode_at_all_is_no_nan() {
+        let report = Report::new(&spec(), &[], &Options::default());
+        let json = serde_json::to_string(&report).unwrap();
+        assert_eq!(serde_json::from_str::<Report>(&json).unwrap(), report);
+    }
+}

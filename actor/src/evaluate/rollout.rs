@@ -1,0 +1,234 @@
+//! Rolling out a list of starts, many environments in one forward pass.
+
+use comic_tasks::{Environment, MAX_REWARD_TERMS, Outcome, TrackingEnvironment};
+use rand::SeedableRng as _;
+use rand_pcg::Pcg64;
+
+use super::{Finished, Options};
+use crate::Error;
+use crate::acting::{ActingBatch, ActingSizes, ForwardPass, clip_action, sample_action};
+
+/// Whose actions are evaluated.
+#[derive(Debug)]
+pub enum Evaluated<'a, F> {
+    /// A policy's.
+    Policy(&'a mut F),
+    /// The servo action: the pose of the next reference frame, without noise.
+    Servo,
+}
+
+/// Where an episode starts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Start {
+    /// The clip's index.
+    pub clip: usize,
+    /// Frame within the clip.
+    pub start: usize,
+}
+
+/// An environment that can be told where to start.
+pub trait Startable: Environment {
+    /// Begins an episode there.
+    ///
+    /// # Errors
+    /// When the clip has no such start.
+    fn start_at(&mut self, start: Start) -> Result<(), Error>;
+}
+
+impl Startable for TrackingEnvironment {
+    fn start_at(&mut self, start: Start) -> Result<(), Error> {
+        Ok(self.reset_to(start.clip, start.start)?)
+    }
+}
+
+/// An environment, and the episode it is in.
+struct Lane<E> {
+    environment: E,
+    episode: Option<Finished>,
+}
+
+/// Rolls out every start; episodes come back in the order they end.
+pub(super) fn run<E: Startable, F: ForwardPass>(
+    evaluated: &mut Evaluated<'_, F>,
+    environments: Vec<E>,
+    sizes: ActingSizes,
+    starts: &[Start],
+    options: &Options,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<Finished>, Error> {
+    let mut rng = Pcg64::seed_from_u64(options.seed);
+    let mut batch = ActingBatch::new(environments.len(), sizes);
+    let mut lanes: Vec<Lane<E>> =
+        environments.into_iter().map(|environment| Lane { environment, episode: None }).collect();
+    let mut queue = starts.iter().copied();
+    let mut finished = Vec::with_capacity(starts.len());
+    let mut scratch = (vec![0.0; sizes.action], vec![0.0; sizes.action]);
+    for (index, lane) in lanes.iter_mut().enumerate() {
+        lane.begin(queue.next(), &mut batch, index)?;
+    }
+    while lanes.iter().any(|lane| lane.episode.is_some()) {
+        act(evaluated, &lanes, &mut batch, options, &mut rng)?;
+        for (index, lane) in lanes.iter_mut().enumerate() {
+            if let Some(episode) = lane.step(&mut batch, index, options, &mut rng, &mut scratch) {
+                finished.push(episode);
+                progress(finished.len(), starts.len());
+                lane.begin(queue.next(), &mut batch, index)?;
+            }
+        }
+    }
+    Ok(finished)
+}
+
+fn act<E: Startable, F: ForwardPass>(
+    evaluated: &mut Evaluated<'_, F>,
+    lanes: &[Lane<E>],
+    batch: &mut ActingBatch,
+    options: &Options,
+    rng: &mut Pcg64,
+) -> Result<(), Error> {
+    // Without noise the latent is its mean.
+    if !options.deterministic {
+        batch.draw_latent_noise(rng);
+    }
+    match evaluated {
+        Evaluated::Policy(forward) => forward.forward(batch),
+        Evaluated::Servo => {
+            for (index, lane) in lanes.iter().enumerate().filter(|(_, lane)| lane.episode.is_some()) {
+                let row = batch.row(index);
+                lane.environment.servo_action(row.mean);
+                row.std.fill(0.0);
+            }
+            Ok(())
+        }
+    }
+}
+
+impl<E: Startable> Lane<E> {
+    fn begin(&mut self, start: Option<Start>, batch: &mut ActingBatch, index: usize) -> Result<(), Error> {
+        self.episode = None;
+        let Some(start) = start else { return Ok(()) };
+        self.environment.start_at(start)?;
+        let row = batch.row(index);
+        self.environment.observe(row.proprioception, row.task);
+        row.previous_latent.fill(0.0);
+        let steps_left = self.environment.episode().steps_left;
+        self.episode =
+            Some(Finished { clip: start.clip, steps_left, steps: 0, returns: [0.0; MAX_REWARD_TERMS], diverged: false });
+        Ok(())
+    }
+
+    /// One step; the episode if it is over.
+    fn step(
+        &mut self,
+        batch: &mut ActingBatch,
+        index: usize,
+        options: &Options,
+        rng: &mut Pcg64,
+        (sampled, clipped): &mut (Vec<f32>, Vec<f32>),
+    ) -> Option<Finished> {
+        let episode = self.episode.as_mut()?;
+        let row = batch.row(index);
+        if options.deterministic {
+            sampled.copy_from_slice(row.mean);
+        } else {
+            sample_action(row.mean, row.std, sampled, rng);
+        }
+        clip_action(sampled, clipped);
+        let step = self.environment.step(clipped);
+        episode.steps += 1;
+        for (sum, term) in episode.returns.iter_mut().zip(&step.reward_terms) {
+            *sum += term;
+        }
+        episode.diverged = step.outcome == Outcome::Diverged;
+        row.previous_latent.copy_from_slice(row.latent);
+        self.environment.observe(row.proprioception, row.task);
+        if step.outcome == Outcome::Running { None } else { self.episode.take() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use comic_tasks::{Episode, Step};
+
+    use super::*;
+
+    /// Falls after three steps when it starts at an odd frame; pays 1 a step for an action of exactly 0.25.
+    struct Fixed {
+        start: usize,
+        step: usize,
+    }
+
+    impl Environment for Fixed {
+        fn reset(&mut self) {}
+        fn step(&mut self, action: &[f32]) -> Step {
+            self.step += 1;
+            let mut reward_terms = [0.0; MAX_REWARD_TERMS];
+            reward_terms[0] = if action[0] == 0.25 { 1.0 } else { 0.0 };
+            let (discount, outcome) = match (self.start % 2, self.step) {
+                (1, 3) => (0.0, Outcome::Terminated),
+                (_, 10) => (1.0, Outcome::Truncated),
+                _ => (1.0, Outcome::Running),
+            };
+            Step { reward_terms, discount, outcome }
+        }
+        fn observe(&self, proprioception: &mut [f32], _task: &mut [f32]) {
+            proprioception[0] = self.step as f32;
+        }
+        fn episode(&self) -> Episode {
+            Episode { clip: 0, start: self.start, steps_left: 10 }
+        }
+        fn servo_action(&self, action: &mut [f32]) {
+            action.fill(0.25);
+        }
+    }
+
+    impl Startable for Fixed {
+        fn start_at(&mut self, start: Start) -> Result<(), Error> {
+            (self.start, self.step) = (start.start, 0);
+            Ok(())
+        }
+    }
+
+    struct Quarter;
+
+    impl ForwardPass for Quarter {
+        fn load(&mut self, _parameters: &[u8]) -> Result<(), Error> {
+            Ok(())
+        }
+        fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+            assert!(batch.latent_noise.iter().all(|noise| *noise == 0.0), "the latent's mean has no noise");
+            let steps = batch.proprioception.clone();
+            for (previous, step) in batch.previous_latent.iter().zip(steps) {
+                assert_eq!(*previous, step, "the latent of the step before, 0 at the first");
+            }
+            for (latent, previous) in batch.latent.iter_mut().zip(&batch.previous_latent) {
+                *latent = previous + 1.0;
+            }
+            batch.mean.fill(0.25);
+            batch.std.fill(9.0);
+            Ok(())
+        }
+    }
+
+    fn episodes(evaluated: &mut Evaluated<'_, Quarter>, environments: usize) -> Vec<(usize, usize, f64)> {
+        let environments = (0..environments).map(|_| Fixed { start: 0, step: 0 }).collect();
+        let starts: Vec<Start> = (0..7).map(|start| Start { clip: 0, start }).collect();
+        let options = Options { deterministic: true, ..Options::default() };
+        let sizes = ActingSizes { proprioception: 1, task: 0, latent: 1, action: 2 };
+        let finished = run(evaluated, environments, sizes, &starts, &options, &mut |_, _| ()).unwrap();
+        let mut found: Vec<_> = finished.iter().map(|e| (e.steps, e.steps_left, e.returns[0])).collect();
+        found.sort_by(|a, b| a.partial_cmp(b).unwrap());
+        found
+    }
+
+    #[test]
+    fn every_start_is_rolled_out_to_its_end_whatever_the_number_of_environments() {
+        let (fallen, whole) = ((3, 10, 3.0), (10, 10, 10.0));
+        let expected = [fallen, fallen, fallen, whole, whole, whole, whole];
+        for environments in [1, 2] {
+            assert_eq!(episodes(&mut Evaluated::Servo, environments), expected);
+        }
+        // One environment at a time, or the latents' law could not be read off the steps.
+        assert_eq!(episodes(&mut Evaluated::Policy(&mut Quarter), 1), expected);
+    }
+}

@@ -1,0 +1,48 @@
+//! A report for people.
+
+use std::fmt;
+
+use super::{ClipReport, Report};
+
+const FIXED: [&str; 6] = ["episodes", "return", "normalised", "per step", "survived", "length"];
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let terms: Vec<&str> = self.overall.reward_terms.keys().map(String::as_str).collect();
+        let mut rows = vec![header(&terms)];
+        rows.extend(self.clips.iter().map(row));
+        // With one clip the two are the same.
+        if self.clips.len() != 1 {
+            rows.push(row(&self.overall));
+        }
+        let columns = rows[0].len();
+        let widths: Vec<usize> =
+            (0..columns).map(|column| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0)).collect();
+        for row in &rows {
+            write!(f, "{:<width$}", row[0], width = widths[0])?;
+            for (cell, width) in row.iter().zip(&widths).skip(1) {
+                write!(f, "  {cell:>width$}")?;
+            }
+            writeln!(f)?;
+        }
+        Ok(())
+    }
+}
+
+fn header(terms: &[&str]) -> Vec<String> {
+    ["clip"].iter().chain(&FIXED).chain(terms).map(|cell| (*cell).to_string()).collect()
+}
+
+fn row(clip: &ClipReport) -> Vec<String> {
+    let mut cells = vec![
+        clip.clip.clone(),
+        clip.episodes.to_string(),
+        format!("{:.2}", clip.return_mean),
+        format!("{:.3}", clip.normalised_reward),
+        format!("{:.3}", clip.reward_per_step),
+        format!("{:.3}", clip.fraction_survived),
+        format!("{:.1}", clip.length_mean),
+    ];
+    cells.extend(clip.reward_terms.values().map(|value| format!("{value:.3}")));
+    cells
+}

@@ -1,0 +1,100 @@
+//! The newest directive of the learner, kept for the workers.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+
+use bytes::Bytes;
+
+/// How to act.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Conduct {
+    /// By the policy.
+    Policy,
+    /// By the servo action with noise: material for the warm start.
+    Demonstrate,
+}
+
+/// One version of how to act; a version means nothing without its learner epoch.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Directive {
+    /// Which life of the learner published it.
+    pub learner_epoch: u64,
+    /// Its version within that life.
+    pub version: u64,
+    /// How to act with it.
+    pub conduct: Conduct,
+    /// The acting parameters (safetensors); may be empty for a demonstration.
+    pub parameters: Bytes,
+}
+
+/// Holds one directive, always the newest: a slow worker skips the ones in between. Closing it stops the workers.
+#[derive(Debug, Default)]
+pub struct Mailbox {
+    newest: Mutex<Option<Arc<Directive>>>,
+    changed: Condvar,
+    closed: AtomicBool,
+}
+
+impl Mailbox {
+    /// Replaces the directive.
+    pub fn publish(&self, directive: Directive) {
+        *self.newest.lock().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(directive));
+        self.changed.notify_all();
+    }
+
+    /// The newest directive, waiting for the first one; `None` once the mailbox is closed.
+    pub fn wait(&self) -> Option<Arc<Directive>> {
+        let mut newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        loop {
+            if self.is_closed() {
+                return None;
+            }
+            if let Some(directive) = &*newest {
+                return Some(Arc::clone(directive));
+            }
+            newest = self.changed.wait(newest).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    /// Tells the workers to stop after the step they are in.
+    pub fn close(&self) {
+        // Under the lock, or a waiter between its check and its wait would sleep for ever.
+        let _newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        self.closed.store(true, Ordering::Release);
+        self.changed.notify_all();
+    }
+
+    /// Whether the workers were told to stop.
+    pub fn is_closed(&self) -> bool {
+        self.closed.load(Ordering::Acquire)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn directive(version: u64) -> Directive {
+        Directive { learner_epoch: 1, version, conduct: Conduct::Policy, parameters: Bytes::new() }
+    }
+
+    #[test]
+    fn a_slow_worker_skips_versions() {
+        let mailbox = Mailbox::default();
+        mailbox.publish(directive(1));
+        mailbox.publish(directive(2));
+        assert_eq!(mailbox.wait().unwrap().version, 2);
+        assert_eq!(mailbox.wait().unwrap().version, 2);
+    }
+
+    #[test]
+    fn closing_wakes_a_worker_that_waits_for_the_first_directive() {
+        let mailbox = Arc::new(Mailbox::default());
+        let waiter = std::thread::spawn({
+            let mailbox = Arc::clone(&mailbox);
+            move || mailbox.wait()
+        });
+        mailbox.close();
+        assert!(waiter.join().unwrap().is_none());
+    }
+}

@@ -1,0 +1,97 @@
+//! The `comic-actor` program.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Context as _;
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use comic_actor::evaluate::command::Evaluate;
+use comic_actor::{Error, bench, policy, run};
+use tracing_subscriber::EnvFilter;
+
+const EXIT_CODES: &str = "\
+Exit codes: 0 when the run is over or the actor was told to stop, 2 when the configuration is wrong and starting
+again cannot help, 1 otherwise (for instance when the learner now serves another experiment).
+Logs go to standard error; RUST_LOG chooses what (default: info).";
+
+/// Steps humanoids for a learner; it needs nothing but the learner's address.
+#[derive(Debug, Parser)]
+#[command(version, args_conflicts_with_subcommands = true, after_help = EXIT_CODES)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Option<Command>,
+    #[command(flatten)]
+    act: Act,
+    /// How log lines are written.
+    #[arg(long, value_enum, default_value_t = LogFormat::Text, global = true)]
+    log_format: LogFormat,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Evaluates a policy, per clip and reward term.
+    Evaluate(Evaluate),
+    /// Measures how fast an actor is, one JSON line a figure.
+    #[command(hide = true)]
+    Bench(bench::Bench),
+}
+
+#[derive(Args, Debug)]
+struct Act {
+    /// The learner's address, for instance http://host:7070.
+    #[arg(long, value_name = "URL", env = "COMIC_LEARNER")]
+    learner: Option<String>,
+    /// Threads; the experiment's number unless given.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+    /// Environments a thread; the experiment's number unless given.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=4096))]
+    environments: Option<u16>,
+    /// Where files from the learner are kept; `comic` in the user's cache directory unless given.
+    #[arg(long, value_name = "DIR", env = "COMIC_CACHE")]
+    cache: Option<PathBuf>,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum LogFormat {
+    Text,
+    Json,
+}
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    start_logging(arguments.log_format);
+    policy::use_one_torch_thread();
+    match command(arguments) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            tracing::error!("{error:#}");
+            let configuration = error.downcast_ref::<Error>().is_some_and(Error::is_configuration);
+            ExitCode::from(if configuration { 2 } else { 1 })
+        }
+    }
+}
+
+fn command(arguments: Arguments) -> anyhow::Result<()> {
+    match arguments.command {
+        Some(Command::Evaluate(evaluate)) => evaluate.run().context("cannot evaluate"),
+        Some(Command::Bench(bench)) => bench.run().context("cannot measure"),
+        None => {
+            let Act { learner, threads, environments, cache } = arguments.act;
+            let learner = learner.ok_or_else(|| {
+                Error::Usage("no learner: give its address with --learner http://host:7070, or see --help".into())
+            })?;
+            let (threads, environments) = (threads.map(usize::from), environments.map(usize::from));
+            run::run(&run::Options { learner, threads, environments, cache }).context("cannot act")
+        }
+    }
+}
+
+fn start_logging(format: LogFormat) {
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
+    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match format {
+        LogFormat::Text => builder.with_target(false).init(),
+        LogFormat::Json => builder.json().init(),
+    }
+}

@@ -1,0 +1,106 @@
+//! The forward pass through libtorch.
+
+use comic_experiment::{Experiment, InitialPose, TaskSpec};
+use comic_networks::Policy;
+use tch::nn::VarStore;
+use tch::{Device, Tensor};
+
+use crate::Error;
+use crate::acting::{ActingBatch, ActingSizes, ForwardPass};
+
+/// The behaviour policy: its networks and their parameters, on the CPU.
+#[derive(Debug)]
+pub struct TorchPolicy {
+    store: VarStore,
+    policy: Policy,
+}
+
+/// One thread a forward pass: environments are spread over threads already. Call it once, before any other libtorch.
+pub fn use_one_torch_thread() {
+    tch::set_num_interop_threads(1);
+    tch::set_num_threads(1);
+}
+
+/// The widths of an experiment's acting arrays.
+pub fn acting_sizes(spec: &TaskSpec, experiment: &Experiment) -> ActingSizes {
+    ActingSizes {
+        proprioception: spec.proprioception,
+        task: spec.task,
+        latent: experiment.network.latent.size,
+        action: spec.action,
+    }
+}
+
+impl TorchPolicy {
+    /// Freshly initialised networks of the experiment, drawn from `seed`.
+    ///
+    /// `mean_action` (`[A]`, control order) is the clips' mean pose as an action, asked for only if the experiment
+    /// starts there.
+    ///
+    /// # Errors
+    /// What `mean_action` returns.
+    pub fn untrained(
+        spec: &TaskSpec,
+        experiment: &Experiment,
+        seed: u64,
+        mean_action: impl FnOnce() -> Result<[f64; 56], Error>,
+    ) -> Result<Self, Error> {
+        let pose = match experiment.network.initial_pose {
+            InitialPose::MidRange => vec![0.0; spec.action],
+            InitialPose::ReferenceMean => mean_action()?.iter().map(|value| *value as f32).collect(),
+        };
+        // Two's complement, so every seed is one of libtorch's.
+        tch::manual_seed(seed.cast_signed());
+        let store = VarStore::new(Device::Cpu);
+        let policy = Policy::new(&store.root(), spec, &experiment.network, &pose).map_err(misfit)?;
+        Ok(Self { store, policy })
+    }
+
+    /// The networks of the experiment with these parameters (safetensors).
+    ///
+    /// # Errors
+    /// [`Error::Misfit`] when a name, shape, type or value does not fit.
+    pub fn from_parameters(spec: &TaskSpec, experiment: &Experiment, parameters: &[u8]) -> Result<Self, Error> {
+        let mut policy = Self::untrained(spec, experiment, 0, || Ok([0.0; 56]))?;
+        policy.load(parameters)?;
+        Ok(policy)
+    }
+
+    /// The parameters as safetensors.
+    ///
+    /// # Errors
+    /// [`Error::Misfit`] when they cannot be written.
+    pub fn to_parameters(&self) -> Result<Vec<u8>, Error> {
+        comic_networks::to_safetensors(&self.store).map_err(misfit)
+    }
+}
+
+fn misfit(error: impl std::fmt::Display) -> Error {
+    Error::Misfit { reason: error.to_string() }
+}
+
+impl ForwardPass for TorchPolicy {
+    fn load(&mut self, parameters: &[u8]) -> Result<(), Error> {
+        comic_networks::from_safetensors(&mut self.store, parameters).map_err(misfit)
+    }
+
+    fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+        let environments = batch.environments() as i64;
+        let sizes = batch.sizes();
+        let matrix =
+            |values: &[f32], width: usize| Tensor::f_from_slice(values)?.f_view([environments, width as i64]);
+        tch::no_grad(|| {
+            let acting = self.policy.act(
+                &matrix(&batch.proprioception, sizes.proprioception)?,
+                &matrix(&batch.task, sizes.task)?,
+                &matrix(&batch.previous_latent, sizes.latent)?,
+                &matrix(&batch.latent_noise, sizes.latent)?,
+            );
+            let read = |tensor: &Tensor, values: &mut [f32]| tensor.f_copy_data(values, values.len());
+            read(&acting.latent, &mut batch.latent)?;
+            read(&acting.action.mean, &mut batch.mean)?;
+            read(&acting.action.std, &mut batch.std)?;
+            Ok(())
+        })
+    }
+}

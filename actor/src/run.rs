@@ -1,0 +1,178 @@
+//! An actor process: join, build the environments, act until told to stop.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use comic_clips::Catalogue;
+use comic_tasks::{TrackingEnvironment, TrackingTask};
+use tokio::runtime::Runtime;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::{mpsc, watch};
+
+use crate::Error;
+use crate::mailbox::Mailbox;
+use crate::policy::TorchPolicy;
+use crate::seeds::derive;
+use crate::session::{self, Joined, Limits};
+use crate::worker::{FinishedUnroll, Progress, Worker};
+
+/// A stopped actor delivers finished unrolls for so long: a second less than the five in which it promises to leave.
+const FLUSH: Duration = Duration::from_secs(4);
+/// Unrolls that may wait between the workers and the connection, and how many the learner may still have to
+/// acknowledge: two for each environment, within these limits.
+const FEWEST_UNACKNOWLEDGED: usize = 4;
+const MOST_UNACKNOWLEDGED: usize = 256;
+/// Names, shapes and alignment of a safetensors document may differ a little from our own.
+const PARAMETERS_SLACK: u64 = 1 << 16;
+const LOG_EVERY: Duration = Duration::from_secs(10);
+
+/// What `comic-actor` is told on its command line.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// For instance `http://host:7070`.
+    pub learner: String,
+    /// Threads; the experiment's number when absent.
+    pub threads: Option<usize>,
+    /// Environments a thread; the experiment's number when absent.
+    pub environments: Option<usize>,
+    /// Directory of the asset cache; the user's own when absent.
+    pub cache: Option<PathBuf>,
+}
+
+type TrackingWorker = Worker<TrackingEnvironment, TorchPolicy>;
+
+/// Acts for a learner until the run is over or the process is told to stop (SIGTERM, SIGINT).
+///
+/// # Errors
+/// [`Error`]; a lost connection is none.
+pub fn run(options: &Options) -> Result<(), Error> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .thread_name("session")
+        .enable_all()
+        .build()
+        .map_err(Error::Thread)?;
+    let mailbox = Arc::new(Mailbox::default());
+    let stop = stop_on_signal(&runtime, &mailbox)?;
+    let session = session::Options { learner: options.learner.clone(), cache: options.cache.clone() };
+    let joined = match runtime.block_on(session::join(&session, stop.clone())) {
+        Err(Error::Stopped) => return Ok(()),
+        joined => joined?,
+    };
+    let threads = options.threads.unwrap_or(joined.experiment.actor.threads).max(1);
+    let environments = options.environments.unwrap_or(joined.experiment.actor.environments).max(1);
+    let (workers, parameters) = build(&joined, threads, environments)?;
+    tracing::info!(experiment = joined.experiment.name, threads, environments, "acting");
+
+    let unacknowledged =
+        (2 * threads).saturating_mul(environments).clamp(FEWEST_UNACKNOWLEDGED, MOST_UNACKNOWLEDGED);
+    let limits = Limits { window: unacknowledged, parameters: parameters + PARAMETERS_SLACK, flush: FLUSH };
+    // One round of unrolls fits: then a worker goes on stepping while the connection takes what it made.
+    let (sender, unrolls) = mpsc::channel(unacknowledged / 2);
+    let progress = Arc::new(Progress::default());
+    let session = runtime.spawn(joined.run(limits, unrolls, Arc::clone(&mailbox), stop));
+    let reporter = runtime.spawn(report(Arc::clone(&progress)));
+
+    let handles = start(workers, &mailbox, sender, &progress)?;
+    let settled = runtime.block_on(session);
+    mailbox.close();
+    reporter.abort();
+    for handle in handles {
+        handle.join().map_err(|_| Error::WorkerPanicked)??;
+    }
+    let settled = settled.map_err(|_| Error::WorkerPanicked)??;
+    tracing::info!(steps = progress.steps.load(Ordering::Relaxed), ?settled, "leaving");
+    Ok(())
+}
+
+/// Becomes true at SIGTERM or SIGINT, and closes the mailbox so that the workers stop.
+fn stop_on_signal(runtime: &Runtime, mailbox: &Arc<Mailbox>) -> Result<watch::Receiver<bool>, Error> {
+    let _context = runtime.enter();
+    let mut terminate = signal(SignalKind::terminate()).map_err(Error::Thread)?;
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(Error::Thread)?;
+    let (sender, receiver) = watch::channel(false);
+    let mailbox = Arc::clone(mailbox);
+    runtime.spawn(async move {
+        tokio::select! {
+            _ = terminate.recv() => {}
+            _ = interrupt.recv() => {}
+        }
+        tracing::info!("told to stop: delivering what is finished");
+        mailbox.close();
+        sender.send_replace(true);
+        // The sender lives on, or waiting for a change would end in an error.
+        std::future::pending::<()>().await;
+    });
+    Ok(receiver)
+}
+
+/// The workers, and the bytes that the acting parameters take.
+fn build(joined: &Joined, threads: usize, environments: usize) -> Result<(Vec<TrackingWorker>, u64), Error> {
+    let (experiment, spec) = (&joined.experiment, &joined.spec);
+    let catalogue = Catalogue::open_with(&experiment.clips, |source| joined.assets.get(source).cloned())?;
+    let task = Arc::new(TrackingTask::new(&experiment.task, &catalogue)?);
+    if task.spec() != spec {
+        return Err(Error::Disagreement { what: "the task's observations, rewards or clips" });
+    }
+    let mut parameters = 0;
+    let mut workers = Vec::with_capacity(threads);
+    for thread in 0..threads as u64 {
+        let seed = derive(joined.seed, thread);
+        let environments =
+            (1..=environments as u64).map(|environment| task.environment(derive(seed, environment))).collect();
+        // The first parameters off the wire replace what it starts with.
+        let policy = TorchPolicy::untrained(spec, experiment, seed, || Ok([0.0; 56]))?;
+        parameters = policy.to_parameters()?.len() as u64;
+        let noise = experiment.warm_start.noise as f32;
+        workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), noise, derive(seed, 0)));
+    }
+    Ok((workers, parameters))
+}
+
+type WorkerThread = thread::JoinHandle<Result<(), Error>>;
+
+fn start(
+    workers: Vec<TrackingWorker>,
+    mailbox: &Arc<Mailbox>,
+    unrolls: mpsc::Sender<FinishedUnroll>,
+    progress: &Arc<Progress>,
+) -> Result<Vec<WorkerThread>, Error> {
+    workers
+        .into_iter()
+        .enumerate()
+        .map(|(index, worker)| {
+            let (closing, unrolls, progress) = (Closing(Arc::clone(mailbox)), unrolls.clone(), Arc::clone(progress));
+            thread::Builder::new()
+                .name(format!("worker-{index}"))
+                .spawn(move || {
+                    let closing = closing;
+                    worker.run(&closing.0, &unrolls, &progress)
+                })
+                .map_err(Error::Thread)
+        })
+        .collect()
+}
+
+/// Stops the other workers when one ends, be it by an error or a panic: half an actor is none.
+struct Closing(Arc<Mailbox>);
+
+impl Drop for Closing {
+    fn drop(&mut self) {
+        self.0.close();
+    }
+}
+
+async fn report(progress: Arc<Progress>) {
+    let mut last = (Instant::now(), 0);
+    loop {
+        tokio::time::sleep(LOG_EVERY).await;
+        let steps = progress.steps.load(Ordering::Relaxed);
+        let rate = (steps - last.1) as f64 / last.0.elapsed().as_secs_f64();
+        let episodes = progress.episodes.load(Ordering::Relaxed);
+        tracing::info!(steps, episodes, steps_per_second = rate.round(), "acting");
+        last = (Instant::now(), steps);
+    }
+}

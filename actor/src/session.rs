@@ -1,0 +1,227 @@
+//! The connection to the learner, which an actor keeps for its whole life and never gives up on.
+//!
+//! [`join`] asks the learner who we are and what to run; [`Joined::run`] then exchanges unrolls and parameters. A lost
+//! connection is made again, with back-off, for ever; what was not acknowledged is sent again, in order. Only another
+//! experiment, a refusal, or the learner's word that the run is over end it.
+
+mod assets;
+mod backoff;
+mod connection;
+mod exchange;
+mod outbox;
+mod parameters;
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use comic_experiment::{Experiment, TaskSpec};
+use comic_proto::v1::JoinReply;
+use comic_proto::{UnrollLayout, UnrollShape};
+use tokio::sync::{mpsc, watch};
+use tokio::time::Instant;
+
+use crate::Error;
+use crate::mailbox::Mailbox;
+use crate::worker::FinishedUnroll;
+use backoff::Backoff;
+use connection::{Connector, Failure, Link};
+use exchange::{Ended, Exchange};
+use outbox::Outbox;
+
+pub use assets::default_cache;
+pub use outbox::Settled;
+pub use parameters::{Assembled, Assembler};
+
+/// Shorter connections are failures too: the back-off goes on growing.
+const STABLE: Duration = Duration::from_secs(5);
+
+/// Where the learner is and where assets are kept.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// For instance `http://host:7070`.
+    pub learner: String,
+    /// Directory of the asset cache; [`default_cache`] when absent.
+    pub cache: Option<PathBuf>,
+}
+
+/// Limits of an exchange.
+#[derive(Clone, Copy, Debug)]
+pub struct Limits {
+    /// Unrolls sent or waiting to be sent that are not acknowledged yet; beyond, none is taken from the workers.
+    pub window: usize,
+    /// Bytes of parameters the experiment's networks can have.
+    pub parameters: u64,
+    /// How long a stopped actor goes on delivering what its workers had finished.
+    pub flush: Duration,
+}
+
+/// What the learner told this actor, and the connection it said it on.
+#[derive(Debug)]
+pub struct Joined {
+    /// The experiment, resolved.
+    pub experiment: Experiment,
+    /// Sizes and names of the task.
+    pub spec: TaskSpec,
+    /// Layout of the unrolls; its hash is the learner's.
+    pub layout: Arc<UnrollLayout>,
+    /// This actor's index.
+    pub actor: u64,
+    /// Seed of this actor's random numbers.
+    pub seed: u64,
+    /// Where the experiment's clip sources lie on this machine.
+    pub assets: HashMap<String, PathBuf>,
+    terms: Terms,
+    connector: Connector,
+    link: Link,
+}
+
+/// What may not change between two `Join`s.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Terms {
+    experiment: String,
+    task_spec: String,
+    layout_hash: Vec<u8>,
+}
+
+impl Terms {
+    fn of(reply: &JoinReply) -> Self {
+        Self {
+            experiment: reply.experiment.clone(),
+            task_spec: reply.task_spec.clone(),
+            layout_hash: reply.layout_hash.clone(),
+        }
+    }
+}
+
+/// Joins the learner, waiting for it as long as it takes, and fetches the assets this machine lacks.
+///
+/// # Errors
+/// A refusal, an experiment that cannot be used, no cache directory, a full disk; [`Error::Stopped`] when `stop` became
+/// true first.
+pub async fn join(options: &Options, mut stop: watch::Receiver<bool>) -> Result<Joined, Error> {
+    tokio::select! {
+        joined = join_for_ever(options) => joined,
+        _ = stop.wait_for(|stop| *stop) => Err(Error::Stopped),
+    }
+}
+
+async fn join_for_ever(options: &Options) -> Result<Joined, Error> {
+    let mut connector = Connector::new(&options.learner)?;
+    let mut backoff = Backoff::default();
+    loop {
+        match attempt(options, &mut connector).await {
+            Ok((link, experiment, spec, layout, assets)) => {
+                let reply = &link.reply;
+                return Ok(Joined {
+                    experiment,
+                    spec,
+                    layout,
+                    actor: reply.actor,
+                    seed: reply.seed,
+                    assets,
+                    terms: Terms::of(reply),
+                    connector,
+                    link,
+                });
+            }
+            Err(Failure::Fatal(error)) => return Err(error),
+            Err(Failure::Lost(reason)) => backoff.wait(&options.learner, &reason).await,
+        }
+    }
+}
+
+type Answer = (Link, Experiment, TaskSpec, Arc<UnrollLayout>, HashMap<String, PathBuf>);
+
+async fn attempt(options: &Options, connector: &mut Connector) -> Result<Answer, Failure> {
+    let mut link = connector.connect().await?;
+    let (experiment, spec, layout) = read_reply(&link.reply).map_err(Failure::Fatal)?;
+    let assets = assets::fetch(&mut link, options.cache.as_deref()).await?;
+    Ok((link, experiment, spec, layout, assets))
+}
+
+fn read_reply(reply: &JoinReply) -> Result<(Experiment, TaskSpec, Arc<UnrollLayout>), Error> {
+    let experiment = Experiment::from_toml("the learner's experiment", &reply.experiment)?;
+    let spec: TaskSpec = toml::from_str(&reply.task_spec)?;
+    let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
+    if reply.layout_hash != layout.hash()[..] {
+        return Err(Error::Disagreement { what: "the layout of an unroll" });
+    }
+    Ok((experiment, spec, Arc::new(layout)))
+}
+
+impl Joined {
+    /// Sends unrolls and receives parameters until the run is over (`Ok`), or all workers are gone and everything is
+    /// acknowledged (`Ok`). When `stop` becomes true it delivers what the workers had finished, for at most
+    /// `limits.flush`.
+    ///
+    /// # Errors
+    /// [`Error::Changed`], a refusal at a reconnect.
+    pub async fn run(
+        self,
+        limits: Limits,
+        unrolls: mpsc::Receiver<FinishedUnroll>,
+        mailbox: Arc<Mailbox>,
+        stop: watch::Receiver<bool>,
+    ) -> Result<Settled, Error> {
+        let mut outbox = Outbox::new(limits.window, self.layout.hash());
+        let ended = tokio::select! {
+            ended = self.keep_connected(limits, unrolls, mailbox, &mut outbox) => ended,
+            () = deadline(stop, limits.flush) => Ok(()),
+        };
+        if !outbox.is_empty() {
+            tracing::warn!(unrolls = outbox.len(), "left with unrolls that were not acknowledged");
+        }
+        ended.map(|()| outbox.settled())
+    }
+
+    async fn keep_connected(
+        mut self,
+        limits: Limits,
+        mut unrolls: mpsc::Receiver<FinishedUnroll>,
+        mailbox: Arc<Mailbox>,
+        outbox: &mut Outbox,
+    ) -> Result<(), Error> {
+        let mut backoff = Backoff::default();
+        let mut link = Some(self.link);
+        loop {
+            if unrolls.is_closed() && unrolls.is_empty() && outbox.is_empty() {
+                return Ok(());
+            }
+            let attempt = match link.take() {
+                Some(link) => Ok(link),
+                None => self.connector.reconnect(&self.terms).await,
+            };
+            let reason = match attempt {
+                Ok(link) => {
+                    let since = Instant::now();
+                    let exchange = Exchange { unrolls: &mut unrolls, outbox, mailbox: &mailbox, limits };
+                    match exchange.run(link, self.connector.incarnation()).await {
+                        Ended::Drained | Ended::Over => return Ok(()),
+                        Ended::Lost(reason) => {
+                            if since.elapsed() > STABLE {
+                                backoff = Backoff::default();
+                            }
+                            reason
+                        }
+                    }
+                }
+                Err(Failure::Fatal(error)) => return Err(error),
+                Err(Failure::Lost(reason)) => reason,
+            };
+            backoff.wait(self.connector.address(), &reason).await;
+        }
+    }
+}
+
+async fn deadline(mut stop: watch::Receiver<bool>, flush: Duration) {
+    if stop.wait_for(|stop| *stop).await.is_err() {
+        // Nobody can ask us to stop any more.
+        std::future::pending::<()>().await;
+    }
+    tokio::time::sleep(flush).await;
+}
+
+#[cfg(test)]
+mod tests;

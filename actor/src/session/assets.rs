@@ -1,0 +1,106 @@
+//! Files the experiment needs, fetched from the learner once and kept by their SHA-256.
+
+use std::collections::HashMap;
+use std::fmt::Write as _;
+use std::io::{Read as _, Write as _};
+use std::path::{Path, PathBuf};
+
+use comic_proto::v1::{Asset, AssetRequest};
+use sha2::{Digest as _, Sha256};
+use tempfile::NamedTempFile;
+
+use super::connection::{Failure, Link};
+use crate::Error;
+
+/// Where assets are kept unless told otherwise: `comic` under `XDG_CACHE_HOME` or `~/.cache`.
+pub fn default_cache() -> Option<PathBuf> {
+    let absolute = |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let base = absolute("XDG_CACHE_HOME").or_else(|| absolute("HOME").map(|home| home.join(".cache")))?;
+    Some(base.join("comic"))
+}
+
+/// Makes every asset of the reply a verified file on this machine; the result goes from source to file.
+pub(super) async fn fetch(link: &mut Link, cache: Option<&Path>) -> Result<HashMap<String, PathBuf>, Failure> {
+    let assets = link.reply.assets.clone();
+    if assets.is_empty() {
+        return Ok(HashMap::new());
+    }
+    let cache = cache.map(Path::to_path_buf).or_else(default_cache).ok_or(Failure::Fatal(Error::NoCache))?;
+    let directory = cache.join("assets");
+    std::fs::create_dir_all(&directory).map_err(|error| Failure::Fatal(Error::file(&directory)(error)))?;
+    let mut located = HashMap::new();
+    for asset in assets {
+        let path = directory.join(file_name(&asset)?);
+        if is_whole(&path, &asset).map_err(Failure::Fatal)? {
+            tracing::debug!(source = asset.source, "asset is in the cache");
+        } else {
+            tracing::info!(source = asset.source, bytes = asset.size, "fetching an asset");
+            download(link, &asset, &directory, &path).await?;
+        }
+        located.insert(asset.source, path);
+    }
+    Ok(located)
+}
+
+/// The name in the cache is the hash alone: nothing that a learner calls an asset can lead out of the directory.
+fn file_name(asset: &Asset) -> Result<String, Failure> {
+    if asset.sha256.len() != 32 {
+        return Err(broken(asset, format!("its SHA-256 has {} bytes", asset.sha256.len())));
+    }
+    let mut name = String::with_capacity(64);
+    for byte in &asset.sha256 {
+        // Writing to a string cannot fail.
+        let _ = write!(name, "{byte:02x}");
+    }
+    Ok(name)
+}
+
+fn broken(asset: &Asset, reason: String) -> Failure {
+    Failure::Fatal(Error::Asset { origin: asset.source.clone(), reason })
+}
+
+fn is_whole(path: &Path, asset: &Asset) -> Result<bool, Error> {
+    let mut file = match std::fs::File::open(path) {
+        Ok(file) => file,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(false),
+        Err(error) => return Err(Error::file(path)(error)),
+    };
+    if file.metadata().map_err(Error::file(path))?.len() != asset.size {
+        return Ok(false);
+    }
+    let mut hash = Sha256::new();
+    let mut buffer = vec![0; 1 << 20];
+    loop {
+        match file.read(&mut buffer).map_err(Error::file(path))? {
+            0 => return Ok(hash.finalize()[..] == asset.sha256[..]),
+            read => hash.update(&buffer[..read]),
+        }
+    }
+}
+
+/// Writes beside the final name and renames, so that another actor on this machine sees the whole file or none.
+async fn download(link: &mut Link, asset: &Asset, directory: &Path, path: &Path) -> Result<(), Failure> {
+    let local = |error| Failure::Fatal(Error::file(path)(error));
+    let mut file = NamedTempFile::new_in(directory).map_err(local)?;
+    let mut stream = link.client.fetch_asset(AssetRequest { sha256: asset.sha256.clone() }).await?.into_inner();
+    let mut hash = Sha256::new();
+    let mut received = 0_u64;
+    while let Some(chunk) = stream.message().await? {
+        received += chunk.data.len() as u64;
+        if received > asset.size {
+            return Err(broken(asset, format!("more than the {} bytes announced", asset.size)));
+        }
+        hash.update(&chunk.data);
+        file.write_all(&chunk.data).map_err(local)?;
+    }
+    if received < asset.size {
+        // The learner went away in the middle: that is no fault of the asset.
+        return Err(Failure::Lost(format!("asset `{}` broke off after {received} bytes", asset.source)));
+    }
+    if hash.finalize()[..] != asset.sha256[..] {
+        return Err(broken(asset, "its SHA-256 differs".to_string()));
+    }
+    file.as_file().sync_all().map_err(local)?;
+    file.persist(path).map_err(|error| local(error.error))?;
+    Ok(())
+}

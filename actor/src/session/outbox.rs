@@ -1,0 +1,188 @@
+//! Unrolls that the learner has not acknowledged.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use comic_proto::v1::{UnrollAck, UnrollHeader, UnrollMessage, Verdict};
+
+use crate::worker::FinishedUnroll;
+
+/// How often a refusal is logged.
+const REFUSAL_LOG: Duration = Duration::from_secs(60);
+
+/// How the learner answered, in numbers of unrolls.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Settled {
+    /// Taken into a batch.
+    pub taken: u64,
+    /// Known to the learner already: the acknowledgement was lost, not the unroll.
+    pub duplicate: u64,
+    /// Too old, or made under an earlier life of the learner.
+    pub stale: u64,
+    /// Refused as invalid, or with a verdict this actor does not know.
+    pub invalid: u64,
+}
+
+/// A bounded queue in the order of sequence numbers; the front part has been sent on the current connection.
+#[derive(Debug)]
+pub(super) struct Outbox {
+    window: usize,
+    layout_hash: Vec<u8>,
+    waiting: VecDeque<(u64, FinishedUnroll)>,
+    sent: usize,
+    next_sequence: u64,
+    settled: Settled,
+    refusal_logged: Option<Instant>,
+}
+
+impl Outbox {
+    pub(super) fn new(window: usize, layout_hash: [u8; 32]) -> Self {
+        Self {
+            window: window.max(1),
+            layout_hash: layout_hash.to_vec(),
+            waiting: VecDeque::new(),
+            sent: 0,
+            next_sequence: 0,
+            settled: Settled::default(),
+            refusal_logged: None,
+        }
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.waiting.len()
+    }
+
+    pub(super) fn has_room(&self) -> bool {
+        self.waiting.len() < self.window
+    }
+
+    pub(super) fn has_unsent(&self) -> bool {
+        self.sent < self.waiting.len()
+    }
+
+    pub(super) fn settled(&self) -> Settled {
+        self.settled
+    }
+
+    /// A new connection: everything is to be sent again.
+    pub(super) fn rewind(&mut self) {
+        self.sent = 0;
+    }
+
+    /// Gives the unroll its sequence number.
+    pub(super) fn push(&mut self, unroll: FinishedUnroll) {
+        self.waiting.push_back((self.next_sequence, unroll));
+        self.next_sequence += 1;
+    }
+
+    /// The next unroll to send, or none.
+    pub(super) fn send(&mut self, actor: u64, incarnation: u64) -> Option<UnrollMessage> {
+        let (sequence, unroll) = self.waiting.get(self.sent)?;
+        self.sent += 1;
+        let header = UnrollHeader {
+            actor,
+            incarnation,
+            sequence: *sequence,
+            learner_epoch: unroll.learner_epoch,
+            version: unroll.version,
+            layout_hash: self.layout_hash.clone(),
+            demonstration: unroll.demonstration,
+            episodes: unroll.episodes.clone(),
+        };
+        Some(UnrollMessage { header: Some(header), payload: unroll.payload.clone() })
+    }
+
+    /// Forgets an acknowledged unroll, whatever the verdict: a refused one is not made better by sending it again.
+    pub(super) fn settle(&mut self, ack: &UnrollAck) {
+        let Ok(place) = self.waiting.binary_search_by_key(&ack.sequence, |(sequence, _)| *sequence) else {
+            tracing::debug!(sequence = ack.sequence, "an acknowledgement of what is not waiting for one");
+            return;
+        };
+        if place >= self.sent {
+            tracing::warn!(sequence = ack.sequence, "an acknowledgement of what was not sent");
+            return;
+        }
+        self.waiting.remove(place);
+        self.sent -= 1;
+        match Verdict::try_from(ack.verdict) {
+            Ok(Verdict::Taken) => self.settled.taken += 1,
+            Ok(Verdict::Duplicate) => self.settled.duplicate += 1,
+            Ok(Verdict::Stale | Verdict::Superseded) => self.settled.stale += 1,
+            Ok(Verdict::Invalid | Verdict::Unspecified) | Err(_) => {
+                self.settled.invalid += 1;
+                self.log_refusal(ack);
+            }
+        }
+    }
+
+    fn log_refusal(&mut self, ack: &UnrollAck) {
+        if self.refusal_logged.is_none_or(|last| last.elapsed() >= REFUSAL_LOG) {
+            self.refusal_logged = Some(Instant::now());
+            let (sequence, refused) = (ack.sequence, self.settled.invalid);
+            tracing::warn!(sequence, refused, "the learner refused an unroll: {}", ack.detail);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+
+    use super::*;
+
+    fn unroll() -> FinishedUnroll {
+        FinishedUnroll {
+            payload: Bytes::new(),
+            learner_epoch: 1,
+            version: 1,
+            demonstration: false,
+            episodes: Vec::new(),
+        }
+    }
+
+    fn ack(sequence: u64, verdict: Verdict) -> UnrollAck {
+        UnrollAck { sequence, verdict: verdict.into(), detail: String::new() }
+    }
+
+    fn sent(outbox: &mut Outbox) -> Vec<u64> {
+        std::iter::from_fn(|| outbox.send(0, 0)).map(|message| message.header.unwrap().sequence).collect()
+    }
+
+    #[test]
+    fn what_was_not_acknowledged_is_sent_again_in_order() {
+        let mut outbox = Outbox::new(8, [0; 32]);
+        (0..4).for_each(|_| outbox.push(unroll()));
+        assert_eq!(sent(&mut outbox), [0, 1, 2, 3]);
+        outbox.settle(&ack(1, Verdict::Taken));
+        outbox.settle(&ack(0, Verdict::Stale));
+        outbox.push(unroll());
+        outbox.rewind();
+        assert_eq!(sent(&mut outbox), [2, 3, 4]);
+        outbox.settle(&ack(2, Verdict::Duplicate));
+        assert_eq!(outbox.settled(), Settled { taken: 1, duplicate: 1, stale: 1, invalid: 0 });
+    }
+
+    #[test]
+    fn acknowledgements_of_the_unknown_and_the_unsent_change_nothing() {
+        let mut outbox = Outbox::new(2, [0; 32]);
+        outbox.push(unroll());
+        outbox.settle(&ack(0, Verdict::Taken));
+        outbox.settle(&ack(7, Verdict::Taken));
+        assert_eq!(outbox.settled(), Settled::default());
+        assert_eq!(sent(&mut outbox), [0]);
+    }
+
+    #[test]
+    fn the_window_bounds_it() {
+        let mut outbox = Outbox::new(2, [0; 32]);
+        (0..2).for_each(|_| outbox.push(unroll()));
+        assert!(!outbox.has_room());
+        sent(&mut outbox);
+        outbox.settle(&ack(0, Verdict::Taken));
+        assert!(outbox.has_room());
+    }
+}

@@ -1,0 +1,225 @@
+//! The hot path: one thread steps its environments and fills one unroll of each.
+//!
+//! Every environment writes exactly one row an iteration, so all unrolls of a thread begin and end together, and
+//! parameters change there and nowhere else. An iteration is observe → act → step:
+//!
+//! - *observe* copies the current observation of every environment into row t;
+//! - *act* makes one forward pass for all of them;
+//! - *step* samples the actions, writes them into row t, and moves every environment on.
+//!
+//! An episode's last observation takes a row of its own, in which nothing is done (`Valid` 0): that iteration resets
+//! the environment instead of stepping it, so the next row is the next episode's first. Row T is the observation that
+//! follows the last slot, and row 0 of the next unroll is the same observation again; only where row T is an episode's
+//! last, the next unroll starts with the fresh episode instead.
+
+mod lane;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use bytes::Bytes;
+use comic_proto::UnrollLayout;
+use comic_proto::v1::EpisodeStatistics;
+use comic_tasks::Environment;
+use rand::SeedableRng as _;
+use rand_pcg::Pcg64;
+use tokio::sync::mpsc;
+
+use crate::Error;
+use crate::acting::{ActingBatch, ActingSizes, ForwardPass};
+use crate::mailbox::{Conduct, Directive, Mailbox};
+use lane::Lane;
+
+/// A full unroll, without what only the connection knows (actor, incarnation, sequence number).
+#[derive(Clone, Debug)]
+pub struct FinishedUnroll {
+    /// Little-endian arrays in the layout's order.
+    pub payload: Bytes,
+    /// Learner epoch of the parameters that acted.
+    pub learner_epoch: u64,
+    /// Version of the parameters that acted, from the first row to the last.
+    pub version: u64,
+    /// Acted by the servo, not by the policy.
+    pub demonstration: bool,
+    /// Episodes that ended in this unroll.
+    pub episodes: Vec<EpisodeStatistics>,
+}
+
+/// What a process has done so far, for its log.
+#[derive(Debug, Default)]
+pub struct Progress {
+    /// Transitions simulated.
+    pub steps: AtomicU64,
+    /// Episodes ended.
+    pub episodes: AtomicU64,
+}
+
+/// E environments and the behaviour policy that moves them.
+#[derive(Debug)]
+pub struct Worker<E, F> {
+    lanes: Vec<Lane<E>>,
+    batch: ActingBatch,
+    forward: F,
+    layout: Arc<UnrollLayout>,
+    demonstration_noise: f32,
+    /// What the current unroll is made with; none before the first directive.
+    directive: Option<Arc<Directive>>,
+    rng: Pcg64,
+}
+
+impl<E: Environment, F: ForwardPass> Worker<E, F> {
+    /// Resets every environment.
+    ///
+    /// `demonstration_noise` is the standard deviation around the servo action when the learner asks for
+    /// demonstrations; `seed` is the source of the latents' and the actions' noise.
+    pub fn new(
+        environments: Vec<E>,
+        forward: F,
+        layout: Arc<UnrollLayout>,
+        demonstration_noise: f32,
+        seed: u64,
+    ) -> Self {
+        let shape = layout.shape();
+        let sizes = ActingSizes {
+            proprioception: shape.proprioception,
+            task: shape.task,
+            latent: shape.latent,
+            action: shape.action,
+        };
+        let mut batch = ActingBatch::new(environments.len(), sizes);
+        let lanes = environments
+            .into_iter()
+            .enumerate()
+            .map(|(index, environment)| Lane::new(environment, &layout, &mut batch.row(index)))
+            .collect();
+        Self { lanes, batch, forward, layout, demonstration_noise, directive: None, rng: Pcg64::seed_from_u64(seed) }
+    }
+
+    /// Acts by the newest directive and hands every full unroll to `unrolls`, until the mailbox is closed or nobody
+    /// takes unrolls any more. A full channel holds the environments still.
+    ///
+    /// # Errors
+    /// Parameters that do not fit, or a failing forward pass.
+    pub fn run(
+        mut self,
+        mailbox: &Mailbox,
+        unrolls: &mpsc::Sender<FinishedUnroll>,
+        progress: &Progress,
+    ) -> Result<(), Error> {
+        while let Some(directive) = mailbox.wait() {
+            self.adopt(&directive)?;
+            let Some(finished) = self.unroll(&|| mailbox.is_closed(), progress)? else { return Ok(()) };
+            for unroll in finished {
+                if unrolls.blocking_send(unroll).is_err() {
+                    return Ok(());
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes a directive for the next unroll.
+    ///
+    /// # Errors
+    /// Parameters that do not fit.
+    pub fn adopt(&mut self, directive: &Arc<Directive>) -> Result<(), Error> {
+        if self.directive.as_ref().is_some_and(|current| Arc::ptr_eq(current, directive)) {
+            return Ok(());
+        }
+        if directive.conduct == Conduct::Policy {
+            self.forward.load(&directive.parameters)?;
+        }
+        self.directive = Some(Arc::clone(directive));
+        Ok(())
+    }
+
+    /// One unroll of every environment; `None`, and the unrolls' beginnings are lost, when `stopped` says so.
+    ///
+    /// # Errors
+    /// A failing forward pass.
+    pub fn unroll(
+        &mut self,
+        stopped: &dyn Fn() -> bool,
+        progress: &Progress,
+    ) -> Result<Option<Vec<FinishedUnroll>>, Error> {
+        let length = self.layout.shape().length;
+        for t in 0..length {
+            if stopped() {
+                return Ok(None);
+            }
+            self.observe(t);
+            self.act()?;
+            self.step(t, progress);
+        }
+        self.observe(length);
+        Ok(Some(self.finish()))
+    }
+
+    fn observe(&mut self, t: usize) {
+        for (index, lane) in self.lanes.iter_mut().enumerate() {
+            lane.write_observation(t, &self.batch.row(index));
+        }
+    }
+
+    fn act(&mut self) -> Result<(), Error> {
+        self.batch.draw_latent_noise(&mut self.rng);
+        if self.demonstrates() {
+            self.demonstrate();
+            return Ok(());
+        }
+        self.forward.forward(&mut self.batch)
+    }
+
+    fn step(&mut self, t: usize, progress: &Progress) {
+        let (mut steps, mut episodes) = (0, 0);
+        for (index, lane) in self.lanes.iter_mut().enumerate() {
+            let mut row = self.batch.row(index);
+            if lane.at_episode_end() {
+                lane.pass(t, &row);
+                lane.begin_episode(&mut row);
+            } else {
+                lane.step(t, &mut row, &mut self.rng);
+                steps += 1;
+                episodes += u64::from(lane.at_episode_end());
+            }
+        }
+        progress.steps.fetch_add(steps, Ordering::Relaxed);
+        progress.episodes.fetch_add(episodes, Ordering::Relaxed);
+    }
+
+    fn finish(&mut self) -> Vec<FinishedUnroll> {
+        let demonstration = self.demonstrates();
+        let (learner_epoch, version) =
+            self.directive.as_ref().map_or((0, 0), |directive| (directive.learner_epoch, directive.version));
+        let (lanes, batch, layout) = (&mut self.lanes, &mut self.batch, &self.layout);
+        lanes
+            .iter_mut()
+            .enumerate()
+            .map(|(index, lane)| {
+                let (payload, episodes) = lane.take_unroll(layout);
+                if lane.at_episode_end() {
+                    lane.begin_episode(&mut batch.row(index));
+                }
+                FinishedUnroll { payload, learner_epoch, version, demonstration, episodes }
+            })
+            .collect()
+    }
+
+    fn demonstrates(&self) -> bool {
+        self.directive.as_ref().is_some_and(|directive| directive.conduct == Conduct::Demonstrate)
+    }
+
+    /// The servo action as the mean. It has no latent: z stays 0, so z_{t−1} is 0 throughout.
+    fn demonstrate(&mut self) {
+        for (index, lane) in self.lanes.iter().enumerate() {
+            let row = self.batch.row(index);
+            lane.servo_action(row.mean);
+            row.std.fill(self.demonstration_noise);
+            row.latent.fill(0.0);
+            row.previous_latent.fill(0.0);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,331 @@
+//! The law of the rows, with an environment and a policy that can be counted by hand.
+
+use comic_proto::UnrollShape;
+use comic_tasks::{Episode, MAX_REWARD_TERMS, Outcome, Step};
+use proptest::prelude::*;
+
+use super::*;
+
+/// An observation names its episode and its step, so a row can be recognised; episode k lasts `lengths[k]` steps.
+#[derive(Debug)]
+struct Counter {
+    lengths: Vec<usize>,
+    /// Counted from 1 after the first reset.
+    episodes: usize,
+    step: usize,
+    last_action: f32,
+}
+
+impl Counter {
+    fn new(lengths: &[usize]) -> Self {
+        Self { lengths: lengths.to_vec(), episodes: 0, step: 0, last_action: 0.0 }
+    }
+    fn length(&self) -> usize {
+        self.lengths[(self.episodes - 1) % self.lengths.len()]
+    }
+}
+
+impl Environment for Counter {
+    fn reset(&mut self) {
+        self.episodes += 1;
+        self.step = 0;
+    }
+    fn step(&mut self, action: &[f32]) -> Step {
+        assert!(self.step < self.length(), "an episode was stepped beyond its end");
+        assert!(action.iter().all(|value| (-1.0..=1.0).contains(value)), "the simulator saw an unclipped action");
+        self.last_action = action[0];
+        self.step += 1;
+        let mut reward_terms = [0.0; MAX_REWARD_TERMS];
+        reward_terms[0] = 1.0;
+        reward_terms[1] = self.step as f64;
+        let ended = self.step == self.length();
+        let (discount, outcome) = match (ended, self.episodes % 3) {
+            (false, _) => (1.0, Outcome::Running),
+            (true, 0) => (0.0, Outcome::Terminated),
+            (true, 1) => (1.0, Outcome::Truncated),
+            (true, _) => (0.0, Outcome::Diverged),
+        };
+        Step { reward_terms, discount, outcome }
+    }
+    fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
+        proprioception.copy_from_slice(&[self.episodes as f32, self.step as f32]);
+        task.fill(self.last_action);
+    }
+    fn episode(&self) -> Episode {
+        Episode { clip: self.episodes % 2, start: 0, steps_left: self.length() }
+    }
+    fn servo_action(&self, action: &mut [f32]) {
+        action.fill(self.step as f32 / 1000.0);
+    }
+}
+
+/// The mean is the parameters' first byte, the latent counts the episode's steps (z_t = z_{t−1} + 1).
+#[derive(Debug, Default)]
+struct Plain {
+    parameter: f32,
+}
+
+impl ForwardPass for Plain {
+    fn load(&mut self, parameters: &[u8]) -> Result<(), Error> {
+        self.parameter = f32::from(parameters[0]);
+        Ok(())
+    }
+    fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+        for (latent, previous) in batch.latent.iter_mut().zip(&batch.previous_latent) {
+            *latent = previous + 1.0;
+        }
+        batch.mean.fill(self.parameter);
+        batch.std.fill(0.5);
+        Ok(())
+    }
+}
+
+fn layout(length: usize) -> Arc<UnrollLayout> {
+    Arc::new(UnrollLayout::new(UnrollShape {
+        length,
+        proprioception: 2,
+        task: 1,
+        action: 3,
+        latent: 2,
+        reward_terms: 2,
+    }))
+}
+
+fn directive(version: u64, conduct: Conduct) -> Arc<Directive> {
+    Arc::new(Directive { learner_epoch: 7, version, conduct, parameters: Bytes::from(vec![version as u8]) })
+}
+
+/// Reads an unroll as the learner would: by the layout alone.
+struct Rows<'a> {
+    layout: &'a UnrollLayout,
+    payload: &'a [u8],
+}
+
+impl Rows<'_> {
+    fn row(&self, field: Field, t: usize) -> Vec<f32> {
+        let width = self.layout.width(field);
+        let bytes = &self.payload[self.layout.range(field)];
+        bytes[t * width * 4..(t + 1) * width * 4]
+            .chunks_exact(4)
+            .map(|word| f32::from_le_bytes(word.try_into().unwrap()))
+            .collect()
+    }
+    fn one(&self, field: Field, t: usize) -> f32 {
+        self.row(field, t)[0]
+    }
+    fn clip(&self, t: usize) -> u32 {
+        self.one(Field::Clip, t).to_bits()
+    }
+    /// Episode and step of the observation.
+    fn place(&self, t: usize) -> (usize, usize) {
+        let row = self.row(Field::Proprioception, t);
+        (row[0] as usize, row[1] as usize)
+    }
+}
+
+use comic_proto::Field;
+
+/// `unrolls` unrolls of environments with these episode lengths; `[environment][unroll]`.
+fn record(length: usize, lanes: &[Vec<usize>], unrolls: usize) -> (Arc<UnrollLayout>, Vec<Vec<FinishedUnroll>>) {
+    let layout = layout(length);
+    let environments = lanes.iter().map(|lengths| Counter::new(lengths)).collect();
+    let mut worker = Worker::new(environments, Plain::default(), Arc::clone(&layout), 0.1, 3);
+    worker.adopt(&directive(0, Conduct::Policy)).unwrap();
+    let mut recorded = vec![Vec::new(); lanes.len()];
+    for _ in 0..unrolls {
+        let finished = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap();
+        for (lane, unroll) in recorded.iter_mut().zip(finished) {
+            lane.push(unroll);
+        }
+    }
+    (layout, recorded)
+}
+
+fn episode_lengths() -> impl Strategy<Value = Vec<usize>> {
+    prop::collection::vec(1_usize..12, 1..6)
+}
+
+proptest! {
+    /// Whatever the lengths of episodes and unrolls: reading the valid rows in order gives every transition once.
+    #[test]
+    fn every_transition_appears_exactly_once(
+        length in 1_usize..10,
+        lanes in prop::collection::vec(episode_lengths(), 1..4),
+    ) {
+        let (layout, recorded) = record(length, &lanes, 8);
+        for (unrolls, lengths) in recorded.iter().zip(&lanes) {
+            let mut expected = (1, 0);
+            for unroll in unrolls {
+                let rows = Rows { layout: &layout, payload: &unroll.payload };
+                for t in 0..length {
+                    if rows.one(Field::Valid, t) == 0.0 {
+                        continue;
+                    }
+                    prop_assert_eq!(rows.place(t), expected);
+                    prop_assert_eq!(rows.place(t + 1), (expected.0, expected.1 + 1), "the next row is the outcome");
+                    prop_assert_eq!(rows.one(Field::Reward, t), 1.0);
+                    let over = expected.1 + 1 == lengths[(expected.0 - 1) % lengths.len()];
+                    let discount = if over && expected.0 % 3 != 1 { 0.0 } else { 1.0 };
+                    prop_assert_eq!(rows.one(Field::Discount, t), discount);
+                    expected = if over { (expected.0 + 1, 0) } else { (expected.0, expected.1 + 1) };
+                }
+            }
+        }
+    }
+
+    /// First[t+1] = 1 iff Valid[t] = 0; row 0 is first iff it is an episode's first; an invalid row carries nothing.
+    #[test]
+    fn first_and_valid_mark_the_episode_boundaries(length in 1_usize..10, lengths in episode_lengths()) {
+        let (layout, recorded) = record(length, std::slice::from_ref(&lengths), 8);
+        for unroll in &recorded[0] {
+            let rows = Rows { layout: &layout, payload: &unroll.payload };
+            for t in 0..=length {
+                let (episode, step) = rows.place(t);
+                prop_assert_eq!(rows.one(Field::First, t) == 1.0, step == 0);
+                prop_assert_eq!(rows.clip(t), (episode % 2) as u32);
+                if t < length {
+                    let valid = rows.one(Field::Valid, t) == 1.0;
+                    prop_assert_eq!(rows.one(Field::First, t + 1) == 1.0, !valid);
+                    prop_assert_eq!(valid, step < lengths[(episode - 1) % lengths.len()]);
+                    prop_assert!(valid || (rows.one(Field::Reward, t) == 0.0 && rows.one(Field::Discount, t) == 0.0));
+                }
+            }
+        }
+    }
+
+    /// Row 0 repeats row T of the unroll before, or is a fresh episode's first where that was an episode's last.
+    #[test]
+    fn the_next_unroll_continues(length in 1_usize..10, lengths in episode_lengths()) {
+        let (layout, recorded) = record(length, std::slice::from_ref(&lengths), 8);
+        for pair in recorded[0].windows(2) {
+            let (before, after) = (
+                Rows { layout: &layout, payload: &pair[0].payload },
+                Rows { layout: &layout, payload: &pair[1].payload },
+            );
+            let (episode, step) = before.place(length);
+            let over = step == lengths[(episode - 1) % lengths.len()];
+            prop_assert_eq!(after.place(0), if over { (episode + 1, 0) } else { (episode, step) });
+            if !over {
+                prop_assert_eq!(before.row(Field::Task, length), after.row(Field::Task, 0));
+            }
+        }
+    }
+
+    /// The statistics of an episode are the sums over its valid rows.
+    #[test]
+    fn rewards_add_up_to_the_episode_statistics(length in 1_usize..10, lengths in episode_lengths()) {
+        let (layout, recorded) = record(length, std::slice::from_ref(&lengths), 8);
+        let mut sums = [0.0_f32; 2];
+        let mut steps = 0;
+        let mut expected = Vec::new();
+        let mut reported = Vec::new();
+        for unroll in &recorded[0] {
+            let rows = Rows { layout: &layout, payload: &unroll.payload };
+            for t in (0..length).filter(|t| rows.one(Field::Valid, *t) == 1.0) {
+                let reward = rows.row(Field::Reward, t);
+                sums = [sums[0] + reward[0], sums[1] + reward[1]];
+                steps += 1;
+                let (episode, step) = rows.place(t + 1);
+                let episode_length = lengths[(episode - 1) % lengths.len()];
+                if step == episode_length {
+                    expected.push((steps, episode_length as u32, sums.to_vec()));
+                    (sums, steps) = ([0.0; 2], 0);
+                }
+            }
+            reported.extend(unroll.episodes.iter().map(|e| (e.steps, e.steps_left_at_start, e.returns.clone())));
+            prop_assert_eq!(&reported, &expected, "an episode is reported in the unroll it ends in");
+        }
+    }
+
+    /// z_{t−1} is 0 at an episode's first step and the sampled latent afterwards, across unrolls too.
+    #[test]
+    fn the_previous_latent_follows_the_episode(length in 1_usize..10, lengths in episode_lengths()) {
+        let (layout, recorded) = record(length, &[lengths], 8);
+        for unroll in &recorded[0] {
+            let rows = Rows { layout: &layout, payload: &unroll.payload };
+            for t in (0..length).filter(|t| rows.one(Field::Valid, *t) == 1.0) {
+                prop_assert_eq!(rows.one(Field::PreviousLatent, t), rows.place(t).1 as f32);
+            }
+        }
+    }
+}
+
+#[test]
+fn the_unroll_records_the_unclipped_action_and_the_simulator_sees_the_clipped_one() {
+    let layout = layout(32);
+    let mut worker = Worker::new(vec![Counter::new(&[1000])], Plain::default(), Arc::clone(&layout), 0.1, 3);
+    worker.adopt(&directive(1, Conduct::Policy)).unwrap();
+    let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
+    let rows = Rows { layout: &layout, payload: &unroll.payload };
+    let beyond = (0..32).filter(|t| rows.one(Field::Action, *t) > 1.0).count();
+    assert!(beyond > 5, "mean 1 and std 0.5 leave the range half of the time, seen {beyond}");
+    for t in 0..32 {
+        assert_eq!(rows.one(Field::Task, t + 1), rows.one(Field::Action, t).clamp(-1.0, 1.0));
+        assert_eq!(rows.one(Field::Mean, t), 1.0);
+        assert_eq!(rows.one(Field::Std, t), 0.5);
+    }
+}
+
+#[test]
+fn parameters_change_at_unroll_boundaries_only_and_the_header_names_them() {
+    let layout = layout(5);
+    let mut worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), Arc::clone(&layout), 0.1, 3);
+    for version in 1..4 {
+        worker.adopt(&directive(version, Conduct::Policy)).unwrap();
+        let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
+        let rows = Rows { layout: &layout, payload: &unroll.payload };
+        assert_eq!((unroll.learner_epoch, unroll.version, unroll.demonstration), (7, version, false));
+        assert!((0..5).all(|t| rows.one(Field::Mean, t) == version as f32));
+    }
+}
+
+#[test]
+fn a_demonstration_is_the_servo_action_with_noise_and_no_latent() {
+    let layout = layout(8);
+    let mut worker = Worker::new(vec![Counter::new(&[5])], Plain::default(), Arc::clone(&layout), 0.25, 3);
+    worker.adopt(&directive(9, Conduct::Demonstrate)).unwrap();
+    let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
+    let rows = Rows { layout: &layout, payload: &unroll.payload };
+    assert!(unroll.demonstration);
+    for t in (0..8).filter(|t| rows.one(Field::Valid, *t) == 1.0) {
+        assert_eq!(rows.one(Field::Mean, t), rows.place(t).1 as f32 / 1000.0);
+        assert_eq!(rows.one(Field::Std, t), 0.25);
+        assert_ne!(rows.one(Field::Action, t), rows.one(Field::Mean, t));
+        assert_eq!(rows.row(Field::PreviousLatent, t), [0.0, 0.0]);
+        assert_ne!(rows.row(Field::LatentNoise, t), [0.0, 0.0]);
+    }
+}
+
+#[test]
+fn a_seed_fixes_every_byte() {
+    let lanes = [vec![4, 7], vec![3]];
+    let (_, once) = record(6, &lanes, 3);
+    let (_, again) = record(6, &lanes, 3);
+    for (a, b) in once.iter().flatten().zip(again.iter().flatten()) {
+        assert_eq!(a.payload, b.payload);
+    }
+}
+
+#[test]
+fn a_closed_mailbox_ends_the_worker_and_a_full_channel_holds_it() {
+    let layout = layout(4);
+    let worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), layout, 0.1, 3);
+    let mailbox = Mailbox::default();
+    mailbox.publish(Directive { learner_epoch: 1, version: 1, conduct: Conduct::Policy, parameters: Bytes::from_static(b"1") });
+    let progress = Progress::default();
+    let (sender, mut receiver) = mpsc::channel(1);
+    std::thread::scope(|scope| {
+        let running = scope.spawn(|| {
+            let sender = sender;
+            worker.run(&mailbox, &sender, &progress)
+        });
+        for _ in 0..3 {
+            receiver.blocking_recv().unwrap();
+        }
+        // At most one unroll waits in the channel and one in the worker's hand: it cannot have run ahead further.
+        assert!(progress.steps.load(Ordering::Relaxed) <= 4 * 5);
+        mailbox.close();
+        receiver.close();
+        running.join().unwrap().unwrap();
+    });
+}

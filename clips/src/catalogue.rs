@@ -1,0 +1,266 @@
+//! The clips of an experiment: which there are, and how to get at each.
+
+use std::{
+    fmt,
+    path::{Path, PathBuf},
+};
+
+use comic_experiment::ClipSource;
+use sha2::{Digest, Sha256};
+
+use crate::{
+    Clip, Entry, Error, WalkerModel, builtin, file::ClipFile, file::Header, nearest::hint, pose_to_action, subset,
+};
+
+const BUILTIN: &str = "builtin:";
+
+/// An experiment's clip sources, opened. Cheap to open and to hold, whatever the size of the files: only the
+/// attributes of the chosen clips are read, and motion when [`Catalogue::load`] asks for it.
+pub struct Catalogue {
+    entries: Vec<Entry>,
+    /// For each entry, its place in `sources`.
+    source_of: Vec<usize>,
+    sources: Vec<Source>,
+}
+
+/// A file that a catalogue reads, for actors to fetch and verify.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Asset {
+    /// As the experiment names it.
+    pub source: String,
+    /// Where it is here.
+    pub path: PathBuf,
+    /// Of the whole file.
+    pub sha256: [u8; 32],
+    /// Bytes.
+    pub size: u64,
+}
+
+enum Source {
+    Builtin,
+    File { source: String, file: ClipFile },
+}
+
+impl Catalogue {
+    /// Opens every source; a file's path is the source itself. Clips are in the order of the sources, sorted by name
+    /// within one.
+    ///
+    /// # Errors
+    /// [`Error`], for a source, subset, clip or sub-range that there is not, and for a file whose attributes are not
+    /// those of a clip.
+    pub fn open(sources: &[ClipSource]) -> Result<Self, Error> {
+        Self::open_with(sources, |source| Some(PathBuf::from(source)))
+    }
+
+    /// [`Catalogue::open`] where `locate` says in which local file a source is, or `None` when there is none. Built-in
+    /// clips are not asked for.
+    ///
+    /// # Errors
+    /// As [`Catalogue::open`].
+    pub fn open_with(sources: &[ClipSource], locate: impl Fn(&str) -> Option<PathBuf>) -> Result<Self, Error> {
+        if sources.iter().all(|source| source.weight == 0.0) {
+            return Err(Error::NoSources);
+        }
+        let mut catalogue = Self { entries: Vec::new(), source_of: Vec::new(), sources: Vec::new() };
+        for source in sources {
+            if !(source.weight >= 0.0 && source.weight.is_finite()) {
+                return Err(Error::Weight { source_name: source.source.clone(), weight: source.weight });
+            }
+            match source.source.strip_prefix(BUILTIN) {
+                Some(name) => catalogue.add_builtin(source, name)?,
+                None => catalogue.add_file(source, locate(&source.source).as_deref())?,
+            }
+        }
+        Ok(catalogue)
+    }
+
+    /// The clips; a clip's index is its place here.
+    pub fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    /// Reads one clip, whole; its sub-range is [`Entry::frames`].
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] when a dataset is missing, mis-shaped or not finite; [`Error::NoSuchIndex`].
+    pub fn load(&self, index: usize) -> Result<Clip, Error> {
+        let (entry, source) = self.at(index)?;
+        match source {
+            Source::Builtin => builtin::load(&entry.name),
+            Source::File { file, .. } => file.load(&entry.name),
+        }
+    }
+
+    /// The files behind the clips, hashed, each once; built-in clips have none.
+    ///
+    /// # Errors
+    /// [`Error::Unreadable`].
+    pub fn assets(&self) -> Result<Vec<Asset>, Error> {
+        let mut assets: Vec<Asset> = Vec::new();
+        for source in &self.sources {
+            if let Source::File { source, file } = source
+                && assets.iter().all(|asset| asset.source != *source)
+            {
+                assets.push(asset(source, file.path())?);
+            }
+        }
+        Ok(assets)
+    }
+
+    /// The action that aims at the clips' mean pose: the mean of [`pose_to_action`] over the frames in use of every
+    /// clip, each counted with its clip's weight; in `ctrl` order. Of files, only the joint angles are read.
+    ///
+    /// # Errors
+    /// As [`Catalogue::load`].
+    pub fn mean_action(&self) -> Result<[f64; 56], Error> {
+        let (mut sum, mut weight) = ([0.0; 56], 0.0);
+        for index in 0..self.entries.len() {
+            let (entry, source) = self.at(index)?;
+            let joints = match source {
+                Source::Builtin => builtin::load(&entry.name)?.motion.joints,
+                Source::File { file, .. } => file.joints(&entry.name)?,
+            };
+            for pose in joints.get(entry.frames()).unwrap_or_default() {
+                weight += entry.weight;
+                for (total, action) in sum.iter_mut().zip(pose_to_action(pose)) {
+                    *total += entry.weight * action;
+                }
+            }
+        }
+        Ok(sum.map(|total| total / weight))
+    }
+
+    fn at(&self, index: usize) -> Result<(&Entry, &Source), Error> {
+        let entry = self.entries.get(index);
+        let source = self.source_of.get(index).and_then(|source| self.sources.get(*source));
+        entry.zip(source).ok_or(Error::NoSuchIndex { index, clips: self.entries.len() })
+    }
+
+    fn add_builtin(&mut self, source: &ClipSource, name: &str) -> Result<(), Error> {
+        if source.subset.is_some() || !source.ids.is_empty() {
+            return Err(Error::BuiltinSelection { source_name: source.source.clone() });
+        }
+        let (own, steps, dt) = builtin::describe(name)?;
+        self.add(source, Source::Builtin, vec![(own.into(), Header { steps, dt, model: WalkerModel::Cmu2020 })])
+    }
+
+    fn add_file(&mut self, source: &ClipSource, path: Option<&Path>) -> Result<(), Error> {
+        let Some(path) = path.filter(|path| path.exists()) else {
+            return Err(Error::NoSuchFile {
+                source_name: source.source.clone(),
+                hint: hint_for_file(&source.source, path),
+            });
+        };
+        let file = ClipFile::open(path)?;
+        let names = choose(source, &file)?;
+        let headers = file.headers(&names)?;
+        let clips = names.into_iter().zip(headers).collect();
+        self.add(source, Source::File { source: source.source.clone(), file }, clips)
+    }
+
+    fn add(&mut self, source: &ClipSource, opened: Source, clips: Vec<(String, Header)>) -> Result<(), Error> {
+        for (name, Header { steps, dt, model }) in clips {
+            let (start_step, end_step, weight) = (source.start_step, source.end_step, source.weight);
+            let entry = Entry { name, steps, dt, model, start_step, end_step, weight };
+            entry.check_range()?;
+            self.entries.push(entry);
+            self.source_of.push(self.sources.len());
+        }
+        self.sources.push(opened);
+        Ok(())
+    }
+}
+
+impl fmt::Debug for Catalogue {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.debug_struct("Catalogue").field("entries", &self.entries).finish_non_exhaustive()
+    }
+}
+
+/// The clips of `file` that `source` asks for, sorted.
+fn choose(source: &ClipSource, file: &ClipFile) -> Result<Vec<String>, Error> {
+    let has = |name: &String| file.names().binary_search(name).is_ok();
+    let known = || file.names().iter().map(String::as_str);
+    let mut names = match &source.subset {
+        None => file.names().to_vec(),
+        Some(name) => subset(name)?,
+    };
+    if names.is_empty() {
+        return Err(Error::NoClips { path: file.path().into() });
+    }
+    if source.ids.is_empty() {
+        let missing: Vec<&str> = names.iter().filter(|name| !has(name)).map(String::as_str).collect();
+        return match &source.subset {
+            Some(subset) if !missing.is_empty() => Err(Error::SubsetIncomplete {
+                path: file.path().into(),
+                subset: subset.clone(),
+                missing: missing.len(),
+                total: names.len(),
+                first: first_few(&missing),
+            }),
+            _ => Ok(names),
+        };
+    }
+    for name in &source.ids {
+        if names.binary_search(name).is_ok() && has(name) {
+            continue;
+        }
+        return Err(match &source.subset {
+            Some(subset) if has(name) => Error::NotInSubset {
+                source_name: source.source.clone(),
+                name: name.clone(),
+                subset: subset.clone(),
+                hint: hint(name, names.iter().map(String::as_str)),
+            },
+            _ => {
+                let near = hint(name, known());
+                let all = || format!("; it has {}", first_few(&known().collect::<Vec<_>>()));
+                let hint = if near.is_empty() { all() } else { near };
+                Error::NoSuchClip { path: file.path().into(), name: name.clone(), hint }
+            }
+        });
+    }
+    names.clone_from(&source.ids);
+    names.sort_unstable();
+    match names.windows(2).find(|pair| pair[0] == pair[1]) {
+        Some(pair) => Err(Error::ListedTwice { source_name: source.source.clone(), name: pair[0].clone() }),
+        None => Ok(names),
+    }
+}
+
+fn first_few(names: &[&str]) -> String {
+    const FEW: usize = 5;
+    let list = names.iter().take(FEW).copied().collect::<Vec<_>>().join(", ");
+    if names.len() > FEW { format!("{list}, …") } else { list }
+}
+
+/// A built-in clip named without its prefix, or the nearest HDF5 files in the same directory.
+fn hint_for_file(source: &str, path: Option<&Path>) -> String {
+    if builtin::builtin_names().contains(&source) {
+        return format!(" (did you mean `{BUILTIN}{source}`?)");
+    }
+    let Some(path) = path else {
+        return "; there is no local copy of it".into();
+    };
+    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let files: Vec<String> = std::fs::read_dir(directory)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter_map(|entry| entry.file_name().into_string().ok())
+        .filter(|name| [".h5", ".hdf5"].iter().any(|ending| name.ends_with(ending)))
+        .collect();
+    let wanted = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    match hint(&wanted, files.iter().map(String::as_str)) {
+        near if near.is_empty() => "; name an HDF5 file in dm_control's layout, or builtin:NAME".into(),
+        near => near,
+    }
+}
+
+fn asset(source: &str, path: &Path) -> Result<Asset, Error> {
+    let unreadable = |reason| Error::Unreadable { path: path.into(), reason };
+    let mut file = std::fs::File::open(path).map_err(unreadable)?;
+    let mut hasher = Sha256::new();
+    let size = std::io::copy(&mut file, &mut hasher).map_err(unreadable)?;
+    Ok(Asset { source: source.into(), path: path.into(), sha256: hasher.finalize().into(), size })
+}

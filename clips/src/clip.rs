@@ -1,0 +1,57 @@
+//! A clip in memory.
+
+use crate::WalkerModel;
+
+/// One clip, whole: `T` frames, `dt` apart.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Clip {
+    /// The clip's name in its file, or a built-in clip's own name.
+    pub name: String,
+    /// The body it was made for.
+    pub model: WalkerModel,
+    /// Seconds between frames.
+    pub dt: f64,
+    /// Pose and velocity of root and joints.
+    pub motion: Motion,
+    /// What the task compares the body with; `None` for built-in clips, whose features follow by forward kinematics.
+    pub features: Option<Features>,
+}
+
+impl Clip {
+    /// T, the number of frames.
+    pub fn steps(&self) -> usize {
+        self.motion.position.len()
+    }
+}
+
+/// The humanoid's generalised coordinates and velocities, one entry per frame in each field.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Motion {
+    /// Position of the root, m, world frame, z up.
+    pub position: Vec<[f64; 3]>,
+    /// Orientation of the root, w x y z, world frame.
+    pub quaternion: Vec<[f64; 4]>,
+    /// Joint angles, rad, in the order of [`JOINTS`](crate::JOINTS).
+    pub joints: Vec<[f64; 56]>,
+    /// Linear velocity of the root, m/s, world frame.
+    pub velocity: Vec<[f64; 3]>,
+    /// Angular velocity of the root, rad/s, in the root's own frame.
+    pub angular_velocity: Vec<[f64; 3]>,
+    /// Joint velocities, rad/s, in the order of [`JOINTS`](crate::JOINTS).
+    pub joints_velocity: Vec<[f64; 56]>,
+}
+
+/// Quantities that follow from the pose, as the file has them; `B` is [`WalkerModel::bodies`].
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Features {
+    /// Centre of mass of the whole body, m, world frame, per frame.
+    pub center_of_mass: Vec<[f64; 3]>,
+    /// rradius, lradius, rfoot, lfoot relative to the root, m, root frame, per frame.
+    pub end_effectors: Vec<[f64; 12]>,
+    /// The same four and the head, per frame.
+    pub appendages: Vec<[f64; 15]>,
+    /// Positions of the tracking bodies, `[T, B, 3]`, m, world frame.
+    pub body_positions: Vec<f64>,
+    /// Orientations of the tracking bodies, `[T, B, 4]`, w x y z, world frame.
+    pub body_quaternions: Vec<f64>,
+}

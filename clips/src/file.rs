@@ -1,0 +1,251 @@
+//! An HDF5 file in the layout of dm_control's mocap files, read clip by clip.
+
+use std::{
+    ops::RangeInclusive,
+    panic::{AssertUnwindSafe, catch_unwind},
+    path::{Path, PathBuf},
+    sync::Arc,
+};
+
+use hdf5_reader::{FileStorage, Hdf5File, OpenOptions, Storage, error::Error as Hdf5Error, group::Group};
+
+use crate::{Clip, Error, Features, Motion, WalkerModel};
+
+/// Longest clip taken: 50 minutes at 0.03 s; the longest of CMU's has 6,371 frames. It bounds what a hostile
+/// `num_steps` can make us allocate (340 MB).
+const STEPS: RangeInclusive<u64> = 1..=100_000;
+/// Longest time step taken, s; dm_control's files have 0.03 and 0.05.
+const LONGEST_TIMESTEP: f64 = 1.0;
+/// How far a quaternion's norm may be from 1.
+const NORM_TOLERANCE: f64 = 1e-2;
+/// The largest dataset of the longest clip: 31 quaternions a frame.
+const LARGEST_READ: usize = 100_000 * 31 * 4 * size_of::<f64>();
+
+/// What a clip's attributes say.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Header {
+    pub(crate) steps: usize,
+    pub(crate) dt: f64,
+    pub(crate) model: WalkerModel,
+}
+
+/// An open file; reading needs no lock, and takes from the file only what it returns.
+pub(crate) struct ClipFile {
+    path: PathBuf,
+    /// Read by position, not mapped: a file cut short under a map would kill the process.
+    storage: Arc<dyn Storage>,
+    names: Vec<String>,
+}
+
+impl ClipFile {
+    /// Opens the file and lists its clips.
+    pub(crate) fn open(path: &Path) -> Result<Self, Error> {
+        let unreadable = |reason| Error::Unreadable { path: path.into(), reason };
+        let file = std::fs::File::open(path).map_err(unreadable)?;
+        if file.metadata().map_err(unreadable)?.is_dir() {
+            return Err(unreadable(std::io::ErrorKind::IsADirectory.into()));
+        }
+        let storage: Arc<dyn Storage> = Arc::new(guarded(path, "/", || FileStorage::from_file(file))?);
+        let mut names = guarded(path, "/", || Ok(hdf5(&storage)?.root_group()?.member_names()?.0))?;
+        names.sort_unstable();
+        Ok(Self { path: path.into(), storage, names })
+    }
+
+    /// Every clip of the file, sorted.
+    pub(crate) fn names(&self) -> &[String] {
+        &self.names
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Reads the attributes of these clips, none of their data.
+    pub(crate) fn headers(&self, names: &[String]) -> Result<Vec<Header>, Error> {
+        let root = self.root()?;
+        names.iter().map(|name| self.header(&root, name)).collect()
+    }
+
+    /// Reads the joint angles of a clip, rad, `[T][56]`.
+    pub(crate) fn joints(&self, name: &str) -> Result<Vec<[f64; 56]>, Error> {
+        let root = self.root()?;
+        let header = self.header(&root, name)?;
+        self.walker(&root, name, header)?.frames("joints")
+    }
+
+    /// Reads a whole clip.
+    pub(crate) fn load(&self, name: &str) -> Result<Clip, Error> {
+        let root = self.root()?;
+        let header = self.header(&root, name)?;
+        let walker = self.walker(&root, name, header)?;
+        let bodies = header.model.bodies();
+        let motion = Motion {
+            position: walker.frames("position")?,
+            quaternion: walker.frames("quaternion")?,
+            joints: walker.frames("joints")?,
+            velocity: walker.frames("velocity")?,
+            angular_velocity: walker.frames("angular_velocity")?,
+            joints_velocity: walker.frames("joints_velocity")?,
+        };
+        let features = Features {
+            center_of_mass: walker.frames("center_of_mass")?,
+            end_effectors: walker.frames("end_effectors")?,
+            appendages: walker.frames("appendages")?,
+            body_positions: walker.flat("body_positions", 3 * bodies)?,
+            body_quaternions: walker.flat("body_quaternions", 4 * bodies)?,
+        };
+        walker.check_quaternions("quaternion", motion.quaternion.as_flattened())?;
+        walker.check_quaternions("body_quaternions", &features.body_quaternions)?;
+        let Header { dt, model, .. } = header;
+        Ok(Clip { name: name.into(), model, dt, motion, features: Some(features) })
+    }
+
+    fn root(&self) -> Result<Group, Error> {
+        self.guarded("/", || hdf5(&self.storage)?.root_group())
+    }
+
+    fn walker<'a>(&'a self, root: &Group, name: &str, header: Header) -> Result<Walker<'a>, Error> {
+        let item = format!("/{name}/walkers/walker_0");
+        let group = self.guarded(&item, || root.group(name)?.group("walkers")?.group("walker_0"))?;
+        Ok(Walker { file: self, item, group, header })
+    }
+
+    fn header(&self, root: &Group, name: &str) -> Result<Header, Error> {
+        let clip = format!("/{name}");
+        let group = self.guarded(&clip, || root.group(name))?;
+        let dt = self.number(&group, &clip, "dt")?;
+        if !(dt > 0.0 && dt <= LONGEST_TIMESTEP) {
+            return Err(self.malformed(&format!("{clip}@dt"), format!("{dt} s is no time step; dm_control's is 0.03")));
+        }
+        let steps = self.whole(&group, &clip, "num_steps")?;
+        if !STEPS.contains(&steps) {
+            let reason = format!("{steps} frames; a clip has {} to {}", STEPS.start(), STEPS.end());
+            return Err(self.malformed(&format!("{clip}@num_steps"), reason));
+        }
+        let item = format!("{clip}/walkers/walker_0");
+        let walker = self.guarded(&item, || group.group("walkers")?.group("walker_0"))?;
+        let model = self.whole(&walker, &item, "model")?;
+        let model = WalkerModel::from_attribute(model).ok_or_else(|| {
+            let reason = format!("unknown body {model}; known are 1 (CMU humanoid V2019) and 4 (CMU humanoid V2020)");
+            self.malformed(&format!("{item}@model"), reason)
+        })?;
+        Ok(Header { steps: steps as usize, dt, model })
+    }
+
+    fn number(&self, group: &Group, item: &str, attribute: &str) -> Result<f64, Error> {
+        self.guarded(&format!("{item}@{attribute}"), || group.attribute(attribute)?.read_as_f64())
+    }
+
+    fn whole(&self, group: &Group, item: &str, attribute: &str) -> Result<u64, Error> {
+        let number = self.number(group, item, attribute)?;
+        // Every whole number that means anything here is far below 2^53.
+        if number.fract() == 0.0 && (0.0..=1e15).contains(&number) {
+            Ok(number as u64)
+        } else {
+            Err(self.malformed(&format!("{item}@{attribute}"), format!("{number} is no count")))
+        }
+    }
+
+    fn guarded<T>(&self, item: &str, read: impl FnOnce() -> Result<T, Hdf5Error>) -> Result<T, Error> {
+        guarded(&self.path, item, read)
+    }
+
+    fn malformed(&self, item: &str, reason: String) -> Error {
+        Error::Malformed { path: self.path.clone(), item: item.into(), reason }
+    }
+}
+
+/// The reader keeps what it has parsed for as long as it lives, so each call has its own.
+fn hdf5(storage: &Arc<dyn Storage>) -> Result<Hdf5File, Hdf5Error> {
+    let options = OpenOptions::default()
+        .with_chunk_cache_bytes(0)
+        .with_max_chunk_bytes(LARGEST_READ)
+        .with_max_read_bytes(LARGEST_READ)
+        .with_max_object_header_bytes(1 << 20);
+    Hdf5File::from_storage_with_options(storage.clone(), options)
+}
+
+/// Runs the HDF5 reader. It reports damage as errors; should a damaged file make it panic all the same, that is an
+/// error too.
+fn guarded<T>(path: &Path, item: &str, read: impl FnOnce() -> Result<T, Hdf5Error>) -> Result<T, Error> {
+    let reason = match catch_unwind(AssertUnwindSafe(read)) {
+        Ok(Ok(value)) => return Ok(value),
+        Ok(Err(error)) => reason(&error),
+        Err(_) => "damaged: the HDF5 reader gave up; get the file again".into(),
+    };
+    Err(Error::Malformed { path: path.into(), item: item.into(), reason })
+}
+
+fn reason(error: &Hdf5Error) -> String {
+    match error {
+        Hdf5Error::Context { source, .. } => reason(source),
+        Hdf5Error::GroupNotFound(_) | Hdf5Error::DatasetNotFound(_) | Hdf5Error::AttributeNotFound(_) => {
+            "missing; every clip of dm_control's layout has it".into()
+        }
+        Hdf5Error::InvalidMagic => "not an HDF5 file".into(),
+        error => error.to_string(),
+    }
+}
+
+/// The group that holds a clip's datasets.
+struct Walker<'a> {
+    file: &'a ClipFile,
+    item: String,
+    group: Group,
+    header: Header,
+}
+
+impl Walker<'_> {
+    /// A dataset `(N, T)` as T frames.
+    fn frames<const N: usize>(&self, field: &str) -> Result<Vec<[f64; N]>, Error> {
+        let rows = self.rows(field, N)?;
+        let steps = self.header.steps;
+        Ok((0..steps).map(|t| std::array::from_fn(|row| rows[row * steps + t])).collect())
+    }
+
+    /// A dataset `(width, T)` as `[T, width]`, flattened.
+    fn flat(&self, field: &str, width: usize) -> Result<Vec<f64>, Error> {
+        let rows = self.rows(field, width)?;
+        let steps = self.header.steps;
+        Ok((0..steps).flat_map(|t| rows.iter().skip(t).step_by(steps).copied()).collect())
+    }
+
+    /// A dataset as stored, `(width, T)` row by row, its shape and every number checked.
+    fn rows(&self, field: &str, width: usize) -> Result<Vec<f64>, Error> {
+        let item = format!("{}/{field}", self.item);
+        let steps = self.header.steps;
+        let dataset = self.file.guarded(&item, || self.group.dataset(field))?;
+        if dataset.shape() != [width as u64, steps as u64] {
+            let reason = format!(
+                "has shape {:?}, expected [{width}, {steps}]: {width} numbers for each of num_steps frames of the {}",
+                dataset.shape(),
+                self.header.model
+            );
+            return Err(self.file.malformed(&item, reason));
+        }
+        let rows = self.file.guarded(&item, || {
+            let mut rows = vec![0.0; width * steps];
+            dataset.read_into::<f64>(&mut rows)?;
+            Ok(rows)
+        })?;
+        match rows.iter().position(|number: &f64| !number.is_finite()) {
+            None => Ok(rows),
+            Some(place) => {
+                let reason = format!("{} in row {}, frame {}", rows[place], place / steps, place % steps);
+                Err(self.file.malformed(&item, format!("{reason}; every number must be finite")))
+            }
+        }
+    }
+
+    fn check_quaternions(&self, field: &str, quaternions: &[f64]) -> Result<(), Error> {
+        let per_frame = quaternions.len() / 4 / self.header.steps;
+        for (index, quaternion) in quaternions.chunks_exact(4).enumerate() {
+            let norm = quaternion.iter().map(|part| part * part).sum::<f64>().sqrt();
+            if !((norm - 1.0).abs() < NORM_TOLERANCE) {
+                let reason = format!("a quaternion of frame {} has norm {norm}, expected 1", index / per_frame);
+                return Err(self.file.malformed(&format!("{}/{field}", self.item), reason));
+            }
+        }
+        Ok(())
+    }
+}

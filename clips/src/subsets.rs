@@ -1,0 +1,36 @@
+//! dm_control's named subsets of the CMU clips.
+
+use crate::{Error, nearest::hint};
+
+/// Names of the subsets: 36, 50, 7, 316 and 836 clips.
+pub const SUBSETS: [&str; 5] = ["walk_tiny", "run_jump_tiny", "get_up", "locomotion_small", "all"];
+
+const TEXT: &str = include_str!("../data/subsets.txt");
+
+/// The clips of a subset, sorted by name (dm_control 1.0.49, `locomotion/tasks/reference_pose/cmu_subsets.py`).
+///
+/// # Errors
+/// [`Error::NoSuchSubset`] for a name that is none of [`SUBSETS`].
+pub fn subset(name: &str) -> Result<Vec<String>, Error> {
+    if !SUBSETS.contains(&name) {
+        return Err(Error::NoSuchSubset {
+            name: name.into(),
+            hint: hint(name, SUBSETS),
+            known: SUBSETS.join(", "),
+        });
+    }
+    let mut ids: Vec<String> = TEXT
+        .lines()
+        .filter(|line| !line.starts_with('#'))
+        .skip_while(|line| *line != name)
+        .skip(1)
+        .take_while(|line| line.starts_with(' '))
+        .flat_map(|line| {
+            let mut words = line.split_whitespace();
+            let subject = words.next().unwrap_or_default();
+            words.map(move |take| format!("CMU_{subject}_{take}"))
+        })
+        .collect();
+    ids.sort_unstable();
+    Ok(ids)
+}

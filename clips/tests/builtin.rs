@@ -1,0 +1,127 @@
+//! Clips that need no file.
+
+mod support;
+
+use comic_clips::{Catalogue, Clip, JOINT_RANGES, WalkerModel, builtin_names};
+use comic_experiment::ClipSource;
+use support::{names, refused, shared, with_ids};
+
+fn load(name: &str) -> Clip {
+    Catalogue::open(&[ClipSource::whole(format!("builtin:{name}"))]).unwrap().load(0).unwrap()
+}
+
+#[test]
+fn every_name_loads_a_v2020_clip_of_unit_quaternions_within_the_joint_ranges() {
+    for name in builtin_names() {
+        let clip = load(name);
+        assert_eq!((clip.model, clip.dt, clip.features.is_none()), (WalkerModel::Cmu2020, 0.03, true), "{name}");
+        assert!(clip.steps() >= 40, "{name}");
+        let motion = &clip.motion;
+        for quaternion in &motion.quaternion {
+            assert!((quaternion.iter().map(|part| part * part).sum::<f64>() - 1.0).abs() < 1e-12, "{name}");
+        }
+        for pose in &motion.joints {
+            for (angle, [low, high]) in pose.iter().zip(JOINT_RANGES) {
+                assert!((low..=high).contains(angle), "{name}: {angle} is not in [{low}, {high}]");
+            }
+        }
+        let lengths = [motion.quaternion.len(), motion.joints.len(), motion.velocity.len()];
+        assert_eq!(lengths, [clip.steps(); 3], "{name}");
+        assert_eq!([motion.angular_velocity.len(), motion.joints_velocity.len()], [clip.steps(); 2], "{name}");
+    }
+}
+
+#[test]
+fn there_are_walks_a_run_a_jump_squats_and_a_turn() {
+    for (alias, own) in [
+        ("walk", "CMU_007_01"),
+        ("brisk-walk", "CMU_002_02"),
+        ("run", "CMU_002_03"),
+        ("jump", "CMU_013_39"),
+        ("squat", "CMU_013_30"),
+        ("turn", "CMU_086_09_a"),
+    ] {
+        assert_eq!(load(alias), load(own));
+        let catalogue = Catalogue::open(&[ClipSource::whole(format!("builtin:{alias}"))]).unwrap();
+        assert_eq!(names(&catalogue), [own], "an alias is listed by the clip's own name");
+    }
+}
+
+#[test]
+fn motion_moves_as_its_name_says() {
+    let forward = |name: &str| {
+        let clip = load(name);
+        let (first, last) = (clip.motion.position[0], clip.motion.position[clip.steps() - 1]);
+        f64::hypot(last[0] - first[0], last[1] - first[1]) / (clip.dt * clip.steps() as f64)
+    };
+    assert!((0.8..2.0).contains(&forward("walk")), "{}", forward("walk"));
+    assert!(forward("run") > 2.0, "{}", forward("run"));
+    assert_eq!(forward("stand"), 0.0);
+    let lowest = load("squat").motion.position.iter().map(|root| root[2]).fold(f64::INFINITY, f64::min);
+    assert!(lowest < 0.8, "a squat lowers the root, here to {lowest}");
+}
+
+#[test]
+fn stand_is_motionless_and_upright() {
+    let clip = load("stand");
+    assert_eq!((clip.name.as_str(), clip.steps()), ("stand", 120));
+    let motion = &clip.motion;
+    assert!(motion.joints.windows(2).all(|pair| pair[0] == pair[1]));
+    assert!(motion.velocity.iter().chain(&motion.angular_velocity).flatten().all(|speed| *speed == 0.0));
+    assert!(motion.joints_velocity.iter().flatten().all(|speed| *speed == 0.0));
+    // The world z component of the root's y axis, which points up the spine.
+    let [w, x, y, z] = motion.quaternion[0];
+    let up = 2.0 * (y * z + w * x);
+    assert!((up - 4.0_f64.to_radians().cos()).abs() < 1e-12, "{up}");
+    let forward = 2.0 * (x * y - w * z);
+    assert!((forward - 4.0_f64.to_radians().sin()).abs() < 1e-12, "leans towards +x: {forward}");
+}
+
+#[test]
+fn recorded_motion_equals_the_file_it_came_from_exactly() {
+    let Some(file) = shared("clips/cmu_dev.h5") else { return };
+    let recorded: Vec<&str> = builtin_names().into_iter().filter(|name| name.starts_with("CMU_")).collect();
+    assert_eq!(recorded.len(), 11);
+    for name in recorded {
+        let original = Catalogue::open(&[with_ids(&file, &[name])]).unwrap().load(0).unwrap();
+        let builtin = load(name);
+        assert_eq!((builtin.motion, builtin.dt), (original.motion, original.dt), "{name}");
+    }
+}
+
+#[test]
+fn provenance_and_acknowledgement_lie_beside_the_data() {
+    let manifest = include_str!("../data/builtin.json");
+    for name in builtin_names().into_iter().filter(|name| name.starts_with("CMU_")) {
+        assert!(manifest.contains(&format!("\"key\": \"{name}\"")), "{name}");
+    }
+    let readme = include_str!("../data/README.md");
+    assert!(readme.contains(
+        "The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from \
+         NSF EIA-0196217."
+    ));
+    assert!(include_bytes!("../data/builtin.bin").len() < 3_000_000);
+}
+
+#[test]
+fn an_unknown_name_is_refused_with_the_nearest_and_all_names() {
+    let message = refused(ClipSource::whole("builtin:walking"));
+    assert!(message.starts_with("no built-in clip `walking` (did you mean `walk`?); built-in clips are stand, walk, "), "{message}");
+    let message = refused(ClipSource::whole("builtin:cmu_007_02"));
+    assert!(message.contains("did you mean `CMU_007_01`, `CMU_007_04` or `CMU_002_02`?"), "{message}");
+    let message = refused(ClipSource::whole("builtin:"));
+    assert!(message.starts_with("no built-in clip ``; built-in clips are stand, "), "{message}");
+}
+
+#[test]
+fn a_builtin_clip_takes_neither_subset_nor_ids() {
+    let source = ClipSource { subset: Some("walk_tiny".into()), ..ClipSource::whole("builtin:walk") };
+    assert_eq!(refused(source), "builtin:walk: a built-in clip is a single clip, so it takes neither subset nor ids");
+    let message = refused(with_ids("builtin:walk", &["CMU_007_01"]));
+    assert!(message.contains("neither subset nor ids"), "{message}");
+}
+
+#[test]
+fn a_builtin_clip_named_without_its_prefix_is_recognised() {
+    assert_eq!(refused(ClipSource::whole("walk")), "no clip file `walk` (did you mean `builtin:walk`?)");
+}

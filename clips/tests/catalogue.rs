@@ -1,0 +1,171 @@
+//! From sources to entries and clips.
+
+mod support;
+
+use comic_clips::{Catalogue, Features, WalkerModel, pose_to_action};
+use comic_experiment::ClipSource;
+use support::{defects, names, refused, shared, tiny, wheel_clips, whole, with_ids};
+
+#[test]
+fn a_whole_file_is_all_its_clips_sorted_by_name() {
+    let catalogue = Catalogue::open(&[whole(tiny())]).unwrap();
+    assert_eq!(names(&catalogue), ["TINY_001_01", "TINY_001_02"]);
+    let first = &catalogue.entries()[0];
+    assert_eq!((first.steps, first.dt, first.model), (12, 0.03, WalkerModel::Cmu2020));
+    assert_eq!((first.start_step, first.end_step, first.weight), (0, None, 1.0));
+}
+
+#[test]
+fn sources_keep_their_order_and_ids_are_sorted_within_one() {
+    let sources = [
+        with_ids(tiny(), &["TINY_001_02", "TINY_001_01"]),
+        ClipSource { weight: 2.5, start_step: 10, end_step: Some(40), ..ClipSource::whole("builtin:walk") },
+        ClipSource::whole("builtin:stand"),
+        with_ids(tiny(), &["TINY_001_02"]),
+    ];
+    let catalogue = Catalogue::open(&sources).unwrap();
+    assert_eq!(names(&catalogue), ["TINY_001_01", "TINY_001_02", "CMU_007_01", "stand", "TINY_001_02"]);
+    let walk = &catalogue.entries()[2];
+    assert_eq!((walk.steps, walk.start_step, walk.end_step, walk.weight), (87, 10, Some(40), 2.5));
+    assert_eq!(catalogue.load(1).unwrap(), catalogue.load(4).unwrap());
+    assert_eq!(catalogue.load(5).unwrap_err().to_string(), "no clip with index 5; the experiment has 5 clips");
+}
+
+#[test]
+fn a_clip_has_one_entry_per_frame_in_every_field() {
+    let clip = Catalogue::open(&[whole(tiny())]).unwrap().load(1).unwrap();
+    assert_eq!((clip.name.as_str(), clip.steps()), ("TINY_001_02", 9));
+    let motion = &clip.motion;
+    let lengths = [&motion.position, &motion.velocity, &motion.angular_velocity].map(Vec::len);
+    assert_eq!(lengths, [9; 3]);
+    assert_eq!([motion.quaternion.len(), motion.joints.len(), motion.joints_velocity.len()], [9; 3]);
+    let Features { center_of_mass, end_effectors, appendages, body_positions, body_quaternions } =
+        clip.features.unwrap();
+    assert_eq!([center_of_mass.len(), end_effectors.len(), appendages.len()], [9; 3]);
+    assert_eq!([body_positions.len(), body_quaternions.len()], [9 * 31 * 3, 9 * 31 * 4]);
+}
+
+/// The recorded clips are frame after frame, files are feature after feature: only a right transpose makes them equal.
+#[test]
+fn frames_of_a_file_are_its_columns() {
+    let Some(file) = shared("clips/cmu_dev.h5") else { return };
+    let clip = Catalogue::open(&[with_ids(file, &["CMU_007_01"])]).unwrap().load(0).unwrap();
+    let features = clip.features.as_ref().unwrap();
+    for step in 0..clip.steps() {
+        // The first tracking body, lhipjoint, hangs rigidly on the root.
+        let (root, body) = (clip.motion.position[step], &features.body_positions[step * 93..step * 93 + 3]);
+        let distance = root.iter().zip(body).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+        assert!(distance < 1e-6, "lhipjoint lies on the root: {distance} m apart in frame {step}");
+        assert_eq!(features.end_effectors[step], features.appendages[step][..12], "frame {step}");
+    }
+}
+
+#[test]
+fn files_of_dm_control_itself_open() {
+    if let Some(file) = wheel_clips() {
+        let catalogue = Catalogue::open(&[whole(file)]).unwrap();
+        assert_eq!(names(&catalogue), ["cmuv2019_001", "cmuv2019_002"]);
+        for (index, entry) in catalogue.entries().iter().enumerate() {
+            assert_eq!((entry.model, entry.dt, entry.steps), (WalkerModel::Cmu2019, 0.05, 10));
+            let features = catalogue.load(index).unwrap().features.unwrap();
+            assert_eq!((features.body_positions.len(), features.body_quaternions.len()), (900, 1200));
+        }
+    }
+    if let Some(file) = shared("golden/synthetic_v2020.h5") {
+        let catalogue = Catalogue::open(&[whole(file)]).unwrap();
+        assert_eq!(names(&catalogue), ["SYN_001_01", "SYN_002_01", "SYN_003_01", "SYN_004_01"]);
+        for index in 0..4 {
+            assert_eq!(catalogue.load(index).unwrap().steps(), 120);
+        }
+    }
+}
+
+#[test]
+fn opening_reads_the_chosen_clips_attributes_and_nothing_else() {
+    // Nearly every clip of this file is defective; what is not chosen, or not loaded, does not matter.
+    let catalogue = Catalogue::open(&[with_ids(defects(), &["sound", "joints_missing", "sound_2019"])]).unwrap();
+    assert_eq!(names(&catalogue), ["joints_missing", "sound", "sound_2019"]);
+    assert!(catalogue.load(0).is_err());
+    assert_eq!(catalogue.load(1).unwrap().steps(), 3);
+    assert_eq!(catalogue.load(2).unwrap().model, WalkerModel::Cmu2019);
+}
+
+#[test]
+fn a_subset_is_picked_from_a_file_and_what_is_missing_is_counted() {
+    let source = ClipSource { subset: Some("get_up".into()), ..whole(tiny()) };
+    assert_eq!(
+        refused(source),
+        format!(
+            "{}: 7 of the 7 clips of subset `get_up` are missing: CMU_139_16, CMU_139_17, CMU_139_18, CMU_140_01, \
+             CMU_140_02, …; list the ids you have, or get the whole file",
+            tiny()
+        )
+    );
+}
+
+#[test]
+fn ids_beside_a_subset_choose_from_it() {
+    let Some(file) = shared("clips/cmu_dev.h5") else { return };
+    let source = |subset: &str, id: &str| ClipSource { subset: Some(subset.into()), ..with_ids(&file, &[id]) };
+    assert_eq!(names(&Catalogue::open(&[source("all", "CMU_002_01")]).unwrap()), ["CMU_002_01"]);
+    let message = refused(source("get_up", "CMU_002_01"));
+    assert!(message.contains("clip `CMU_002_01` is not in subset `get_up`"), "{message}");
+}
+
+#[test]
+fn a_catalogue_finds_files_where_it_is_told() {
+    let sources = [with_ids("motion.h5", &["TINY_001_01"]), ClipSource::whole("builtin:stand")];
+    let catalogue = Catalogue::open_with(&sources, |source| (source == "motion.h5").then(|| tiny().into())).unwrap();
+    assert_eq!(names(&catalogue), ["TINY_001_01", "stand"]);
+    assert_eq!(catalogue.assets().unwrap()[0].source, "motion.h5");
+    let message = Catalogue::open_with(&sources, |_| None).unwrap_err().to_string();
+    assert_eq!(message, "no clip file `motion.h5`; there is no local copy of it");
+}
+
+#[test]
+fn assets_are_the_files_hashed_each_once() {
+    let sources =
+        [with_ids(tiny(), &["TINY_001_01"]), ClipSource::whole("builtin:walk"), with_ids(tiny(), &["TINY_001_02"])];
+    let assets = Catalogue::open(&sources).unwrap().assets().unwrap();
+    let bytes = std::fs::read(tiny()).unwrap();
+    assert_eq!(assets.len(), 1);
+    assert_eq!((assets[0].source.clone(), assets[0].size), (tiny(), bytes.len() as u64));
+    assert_eq!(assets[0].sha256[..], *<sha2::Sha256 as sha2::Digest>::digest(bytes));
+    assert!(Catalogue::open(&[ClipSource::whole("builtin:walk")]).unwrap().assets().unwrap().is_empty());
+}
+
+#[test]
+fn the_mean_action_is_the_mean_over_frames_in_use_by_weight() {
+    let source = |name: &str, weight, end| ClipSource {
+        weight,
+        start_step: 2,
+        end_step: Some(end),
+        ..with_ids(tiny(), &[name])
+    };
+    let catalogue = Catalogue::open(&[source("TINY_001_01", 3.0, 5), source("TINY_001_02", 1.0, 9)]).unwrap();
+    let mut expected = [0.0; 56];
+    // dm_control's slices: 2..=5 is four frames; 9 is the second clip's end, which leaves seven.
+    for (index, weight, frames) in [(0, 3.0, 2..6), (1, 1.0, 2..9)] {
+        for pose in &catalogue.load(index).unwrap().motion.joints[frames] {
+            for (sum, action) in expected.iter_mut().zip(pose_to_action(pose)) {
+                *sum += weight * action / (3.0 * 4.0 + 7.0);
+            }
+        }
+    }
+    for (mean, expected) in catalogue.mean_action().unwrap().iter().zip(expected) {
+        assert!((mean - expected).abs() < 1e-12);
+    }
+}
+
+#[test]
+fn a_catalogue_is_shared_between_threads() {
+    fn shared<T: Send + Sync>() {}
+    shared::<Catalogue>();
+    let catalogue = Catalogue::open(&[whole(tiny())]).unwrap();
+    let expected = catalogue.load(0).unwrap();
+    std::thread::scope(|scope| {
+        for _ in 0..4 {
+            scope.spawn(|| assert_eq!(catalogue.load(0).unwrap(), expected));
+        }
+    });
+}

@@ -1,0 +1,134 @@
+//! `cargo xtask bench`: the figures of the README, one JSON line each.
+
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, Result, bail};
+use serde::{Deserialize, Serialize};
+
+use crate::{python, setup, workspace};
+
+#[derive(clap::Args)]
+pub(crate) struct Options {
+    /// Which side
+    side: Side,
+    /// libtorch's threads in the learner's update, ours and PyTorch's
+    #[arg(long, default_value_t = 2)]
+    threads: u16,
+    /// Arguments for the program's own bench
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+    arguments: Vec<String>,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Side {
+    /// Environments, policies, threads, resets, the wire
+    Actor,
+    /// The update, against its matrix products and against PyTorch
+    Learner,
+}
+
+/// One figure; ratio = value / floor.
+#[derive(Clone, Debug, Deserialize, Serialize, PartialEq)]
+struct Figure {
+    figure: String,
+    value: f64,
+    unit: String,
+    floor: f64,
+    ratio: f64,
+}
+
+/// Rounds in which our update and PyTorch's take turns.
+const ROUNDS: usize = 3;
+
+/// Builds and measures.
+pub(crate) fn run(options: &Options) -> Result<()> {
+    setup::run(&setup::Options::default())?;
+    match options.side {
+        Side::Actor => {
+            workspace::build(&["comic-actor"])?;
+            show(&figures(Command::new(workspace::program("comic-actor")?).arg("bench").args(&options.arguments))?)
+        }
+        Side::Learner => {
+            workspace::build(&["comic-learner"])?;
+            learner(options.threads, &options.arguments)
+        }
+    }
+}
+
+/// Our update and the same update in Python PyTorch, by turns, so that a busy moment of the machine meets both.
+fn learner(threads: u16, arguments: &[String]) -> Result<()> {
+    let mut ours = Vec::new();
+    let mut theirs = Vec::new();
+    for _ in 0..ROUNDS {
+        let mut bench = Command::new(workspace::program("comic-learner")?);
+        ours.push(figures(bench.args(["bench", "--threads", &threads.to_string()]).args(arguments))?);
+        theirs.push(pytorch(threads)?);
+    }
+    let Some(first) = ours.first() else { return Ok(()) };
+    let mut lines = Vec::new();
+    for (index, figure) in first.iter().enumerate() {
+        let of_rounds = |part: fn(&Figure) -> f64| median(ours.iter().filter_map(|round| round.get(index)).map(part).collect());
+        let (value, floor) = (of_rounds(|figure| figure.value), of_rounds(|figure| figure.floor));
+        lines.push(Figure { value, floor, ratio: value / floor, ..figure.clone() });
+    }
+    let update = lines.iter().find(|figure| figure.figure == "learner.update");
+    let update = update.context("comic-learner bench printed no learner.update")?.clone();
+    let floor = median(theirs);
+    lines.push(Figure { figure: "learner.pytorch".into(), floor, ratio: update.value / floor, ..update });
+    show(&lines)
+}
+
+/// Milliseconds of the update written plainly in Python PyTorch, same shapes and threads.
+fn pytorch(threads: u16) -> Result<f64> {
+    #[derive(Deserialize)]
+    struct Answer {
+        milliseconds: f64,
+    }
+    let mut command = python::script_command("torch_vmpo_update.py", "requirements-torch.txt")?;
+    let lines = output(command.args(["--threads", &threads.to_string()]))?;
+    let answer = lines.lines().last().context("torch_vmpo_update.py printed nothing")?;
+    let answer: Answer = serde_json::from_str(answer).with_context(|| format!("unreadable answer: {answer}"))?;
+    Ok(answer.milliseconds)
+}
+
+fn figures(command: &mut Command) -> Result<Vec<Figure>> {
+    let text = output(command)?;
+    let lines = text.lines().filter(|line| line.starts_with('{'));
+    lines.map(|line| serde_json::from_str(line).with_context(|| format!("unreadable figure: {line}"))).collect()
+}
+
+fn output(command: &mut Command) -> Result<String> {
+    let output = command.stdin(Stdio::null()).stderr(Stdio::inherit()).output();
+    let output = output.with_context(|| format!("cannot start {}", workspace::describe(command)))?;
+    if !output.status.success() {
+        bail!("{} ended with {}", workspace::describe(command), output.status);
+    }
+    Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+fn show(figures: &[Figure]) -> Result<()> {
+    for figure in figures {
+        println!("{}", serde_json::to_string(figure)?);
+    }
+    Ok(())
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    match values.len() {
+        0 => f64::NAN,
+        length if length % 2 == 1 => values[length / 2],
+        length => (values[length / 2 - 1] + values[length / 2]) / 2.0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_median_stands_in_the_middle_whatever_the_order() {
+        assert_eq!(median(vec![3.0, 1.0, 2.0]), 2.0);
+        assert_eq!(median(vec![4.0, 1.0, 2.0, 3.0]), 2.5);
+    }
+}

@@ -1,0 +1,46 @@
+//! `cargo xtask test` and `cargo xtask lint`.
+
+use anyhow::Result;
+
+use crate::workspace::{cargo, cargo_has, run};
+use crate::{setup, workspace};
+
+#[derive(clap::Args)]
+pub(crate) struct TestOptions {
+    /// Arguments for the test runner, for instance a part of a test's name
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+    arguments: Vec<String>,
+}
+
+/// Sets up and runs every test: by cargo-nextest where it is installed, else by cargo itself.
+pub(crate) fn test(options: &TestOptions) -> Result<()> {
+    setup::run(&setup::Options::default())?;
+    // The whole-system tests start the programs, so these are built first.
+    workspace::build(&["comic-learner", "comic-actor"])?;
+    let mut command = cargo();
+    if cargo_has("nextest") {
+        command.args(["nextest", "run"]);
+    } else {
+        eprintln!("cargo-nextest is not installed: running the tests with `cargo test`");
+        command.arg("test");
+    }
+    command.args(["--release", "--workspace"]).args(&options.arguments);
+    eprintln!("running `{}`", workspace::describe(&command));
+    run(&mut command)
+}
+
+/// Formatting and clippy, as far as the toolchain has them.
+pub(crate) fn lint() -> Result<()> {
+    setup::run(&setup::Options::default())?;
+    if cargo_has("fmt") {
+        run(cargo().args(["fmt", "--all", "--check"]))?;
+    } else {
+        eprintln!("formatting is not checked: `rustup component add rustfmt`");
+    }
+    if cargo_has("clippy") {
+        run(cargo().args(["clippy", "--release", "--workspace", "--all-targets", "--", "--deny", "warnings"]))?;
+    } else {
+        eprintln!("clippy is not run: `rustup component add clippy`");
+    }
+    Ok(())
+}

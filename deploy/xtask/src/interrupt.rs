@@ -1,0 +1,42 @@
+//! Ctrl-C, SIGTERM and a closed terminal, as a flag to look at.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use anyhow::{Context, Result};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::iterator::Signals;
+use signal_hook::low_level::emulate_default_handler;
+
+/// How often this program has been asked to stop. While one lives the signals count and do not kill; when the last
+/// clone is gone they kill again.
+#[derive(Clone)]
+pub(crate) struct Interrupt(Arc<AtomicUsize>);
+
+impl Interrupt {
+    /// Takes the signals over.
+    pub(crate) fn install() -> Result<Self> {
+        let count = Arc::new(AtomicUsize::new(0));
+        let shared = Arc::downgrade(&count);
+        let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot take over signals")?;
+        std::thread::spawn(move || {
+            for signal in signals.forever() {
+                match shared.upgrade() {
+                    Some(count) => drop(count.fetch_add(1, Ordering::Relaxed)),
+                    None => drop(emulate_default_handler(signal)),
+                }
+            }
+        });
+        Ok(Self(count))
+    }
+
+    /// Requests to stop so far.
+    pub(crate) fn count(&self) -> usize {
+        self.0.load(Ordering::Relaxed)
+    }
+
+    /// Whether there was any.
+    pub(crate) fn requested(&self) -> bool {
+        self.count() > 0
+    }
+}

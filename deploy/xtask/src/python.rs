@@ -1,0 +1,85 @@
+//! Other people's code, for comparison: virtual environments in `.deps/python`, made only when asked for.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use anyhow::{Context, Result, bail};
+
+use crate::workspace;
+
+#[derive(clap::Args)]
+pub(crate) struct FixtureOptions {
+    /// Seed of everything the scripts draw
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Write below this directory instead of the repository's own fixtures
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+}
+
+/// The scripts that make fixtures: script, its requirements, the directory of its fixtures; all under `tests/`.
+const FIXTURES: [(&str, &str, &str); 2] = [
+    ("make_tracking_fixtures.py", "requirements-tracking.txt", "tracking"),
+    ("make_vmpo_fixtures.py", "requirements-vmpo.txt", "vmpo"),
+];
+
+/// Makes the tests' fixtures anew.
+pub(crate) fn fixtures(options: &FixtureOptions) -> Result<()> {
+    let tests = workspace::root().join("tests");
+    for (script, requirements, name) in FIXTURES {
+        let out = options.out.clone().unwrap_or_else(|| tests.join("fixtures")).join(name);
+        let out = std::path::absolute(&out).with_context(|| format!("no such path: {}", out.display()))?;
+        let mut command = script_command(script, requirements)?;
+        workspace::run(command.arg("--seed").arg(options.seed.to_string()).arg("--out").arg(out))?;
+    }
+    Ok(())
+}
+
+/// A command that runs `tests/python/SCRIPT` with what `tests/python/REQUIREMENTS` names.
+pub(crate) fn script_command(script: &str, requirements: &str) -> Result<Command> {
+    let directory = workspace::root().join("tests/python");
+    let script = directory.join(script);
+    if !script.exists() {
+        bail!("there is no {}", script.display());
+    }
+    let mut command = Command::new(environment(&directory.join(requirements))?);
+    command.arg(script).current_dir(workspace::root());
+    Ok(command)
+}
+
+/// The Python of the environment for `requirements`, made if it is not there or was made from others.
+fn environment(requirements: &Path) -> Result<PathBuf> {
+    let wanted = fs::read_to_string(requirements).with_context(|| format!("cannot read {}", requirements.display()))?;
+    let name = requirements.file_stem().unwrap_or_default();
+    let directory = workspace::dependencies().join("python").join(name);
+    let python = directory.join("bin/python");
+    let stamp = directory.join("requirements.txt");
+    if fs::read_to_string(&stamp).is_ok_and(|made| made == wanted) {
+        return Ok(python);
+    }
+    eprintln!("making a Python environment in {}", directory.display());
+    let _ = fs::remove_dir_all(&directory);
+    let made = workspace::run(Command::new("python3").args(["-m", "venv"]).arg(&directory));
+    made.context("python3 cannot make environments (Debian and Ubuntu: apt install python3-venv)")?;
+    install(&python, &directory, &wanted)?;
+    fs::write(&stamp, wanted).with_context(|| format!("cannot write {}", stamp.display()))?;
+    Ok(python)
+}
+
+/// torch comes as the one wheel PyPI has for Linux, CUDA's, without the gigabytes of CUDA beside it;
+/// `tests/python/bare_torch.py` makes it importable.
+fn install(python: &Path, directory: &Path, requirements: &str) -> Result<()> {
+    let pip = |arguments: &[&str]| {
+        let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"];
+        workspace::run(Command::new(python).args(pip).args(arguments))
+    };
+    let (torch, others): (Vec<&str>, Vec<&str>) = requirements.lines().partition(|line| line.starts_with("torch=="));
+    let list = directory.join("others.txt");
+    fs::write(&list, others.join("\n")).with_context(|| format!("cannot write {}", list.display()))?;
+    pip(&["--requirement", &list.to_string_lossy()])?;
+    let [torch] = torch[..] else { return Ok(()) };
+    pip(&["--no-deps", torch, "nvidia-cuda-runtime-cu12==12.8.90", "nvidia-cuda-cupti-cu12==12.8.90"])?;
+    pip(&["filelock", "typing_extensions", "sympy", "networkx", "jinja2", "fsspec"])?;
+    workspace::run(Command::new(python).arg(workspace::root().join("tests/python/bare_torch.py")))
+}

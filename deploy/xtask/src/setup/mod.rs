@@ -1,0 +1,149 @@
+//! `cargo xtask setup`: the native libraries and the humanoid, from pinned wheels into `.deps`.
+//!
+//! Each wheel is fetched, unpacked beside its place, moved into it, and stamped last; so set-up can be stopped at any
+//! moment and goes on at the first wheel that is not whole.
+
+mod download;
+mod extract;
+mod provided;
+mod stamp;
+mod wheels;
+
+use std::fs::{self, File};
+use std::path::Path;
+
+use anyhow::{Context, Result, bail};
+
+use crate::interrupt::Interrupt;
+use crate::workspace;
+use stamp::Stamp;
+use wheels::{Part, WHEELS, Wheel};
+
+#[derive(clap::Args, Default)]
+pub(crate) struct Options {
+    /// Keep all of libtorch, CUDA included (3.4 GB), instead of what a CPU needs (0.5 GB)
+    #[arg(long)]
+    cuda: bool,
+}
+
+/// Brings `.deps` to what the pins say; under a second when it is already.
+pub(crate) fn run(options: &Options) -> Result<()> {
+    let dependencies = workspace::dependencies();
+    fs::create_dir_all(&dependencies).with_context(|| format!("cannot make {}", dependencies.display()))?;
+    let _lock = lock(&dependencies)?;
+    let mut missing = Vec::new();
+    for wheel in &WHEELS {
+        match provided::directory(wheel.part, &dependencies, |name| std::env::var_os(name).map(Into::into))? {
+            Some(own) => announce(wheel, &own),
+            None if !is_whole(wheel, &dependencies, options.cuda) => missing.push(wheel),
+            None => {}
+        }
+    }
+    if missing.is_empty() {
+        return Ok(());
+    }
+    require_platform(&missing)?;
+    download::require_pip()?;
+    let interrupt = Interrupt::install()?;
+    for wheel in missing {
+        take(wheel, &dependencies, options.cuda, &interrupt)
+            .with_context(|| format!("set-up of {} {} in {}", wheel.name, wheel.version, dependencies.display()))?;
+    }
+    let _ = fs::remove_dir_all(dependencies.join("wheels"));
+    eprintln!("set-up is complete: {}", dependencies.display());
+    Ok(())
+}
+
+/// One set-up at a time; a second one waits and then finds the work done.
+fn lock(dependencies: &Path) -> Result<File> {
+    let path = dependencies.join("lock");
+    let file = File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
+    if file.try_lock().is_err() {
+        eprintln!("waiting for another set-up in {}", dependencies.display());
+        file.lock().with_context(|| format!("cannot lock {}", path.display()))?;
+    }
+    Ok(file)
+}
+
+fn announce(wheel: &Wheel, own: &Path) {
+    let first = WHEELS.iter().find(|other| other.part == wheel.part);
+    if first.is_some_and(|first| first.name == wheel.name) {
+        let what = match wheel.part {
+            Part::Mujoco => "MuJoCo",
+            Part::Libtorch => "libtorch",
+            Part::DmControl => "humanoid",
+        };
+        eprintln!("using your own {what}: {}", own.display());
+    }
+}
+
+/// A CUDA libtorch serves CPU runs too, so it is not trimmed by a later set-up without the flag.
+fn is_whole(wheel: &Wheel, dependencies: &Path, cuda: bool) -> bool {
+    Stamp::read(dependencies, wheel.name)
+        .is_some_and(|stamp| stamp.sha256 == wheel.sha256 && (stamp.cuda || !cuda) && stamp.agrees(dependencies))
+}
+
+fn require_platform(missing: &[&Wheel]) -> Result<()> {
+    let native: Vec<_> = missing.iter().filter(|wheel| wheel.native).map(|wheel| wheel.name).collect();
+    if native.is_empty() || cfg!(all(target_os = "linux", target_arch = "x86_64")) {
+        return Ok(());
+    }
+    bail!(
+        "set-up knows wheels for Linux on x86_64 only, and this is {} on {} ({} missing); provide MuJoCo 3.17.0 and libtorch \
+         2.9.0 yourself and name them by MUJOCO_DYNAMIC_LINK_DIR and LIBTORCH",
+        std::env::consts::OS,
+        std::env::consts::ARCH,
+        native.join(", ")
+    )
+}
+
+fn take(wheel: &Wheel, dependencies: &Path, cuda: bool, interrupt: &Interrupt) -> Result<()> {
+    if let Some(old) = Stamp::read(dependencies, wheel.name) {
+        old.remove(dependencies, wheel.name)?;
+    }
+    let directory = dependencies.join("wheels");
+    let archive = download::fetch(wheel, &directory, interrupt)?;
+    let files = extract::extract(wheel, &archive, dependencies, cuda, interrupt)?;
+    let stamp = Stamp { sha256: wheel.sha256.into(), cuda, files };
+    stamp.write(dependencies, wheel.name)?;
+    fs::remove_file(&archive).with_context(|| format!("cannot remove {}", archive.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stamped(cuda: bool) -> tempfile::TempDir {
+        let dependencies = tempfile::tempdir().unwrap();
+        fs::create_dir_all(dependencies.path().join("mujoco")).unwrap();
+        fs::write(dependencies.path().join("mujoco/a"), "abc").unwrap();
+        let stamp = Stamp { sha256: WHEELS[0].sha256.into(), cuda, files: [("mujoco/a".into(), 3)].into() };
+        stamp.write(dependencies.path(), WHEELS[0].name).unwrap();
+        dependencies
+    }
+
+    #[test]
+    fn a_wheel_is_whole_only_with_its_stamp_and_every_file_in_its_size() {
+        let dependencies = stamped(false);
+        assert!(is_whole(&WHEELS[0], dependencies.path(), false));
+        assert!(!is_whole(&WHEELS[1], dependencies.path(), false), "another wheel has no stamp");
+        fs::write(dependencies.path().join("mujoco/a"), "ab").unwrap();
+        assert!(!is_whole(&WHEELS[0], dependencies.path(), false), "a file was cut short");
+        fs::remove_file(dependencies.path().join("mujoco/a")).unwrap();
+        assert!(!is_whole(&WHEELS[0], dependencies.path(), false), "a file is gone");
+    }
+
+    #[test]
+    fn asking_for_cuda_after_a_trimmed_set_up_takes_the_wheel_again_and_not_the_other_way_round() {
+        assert!(!is_whole(&WHEELS[0], stamped(false).path(), true));
+        assert!(is_whole(&WHEELS[0], stamped(true).path(), false));
+    }
+
+    #[test]
+    fn what_was_stamped_goes_with_its_stamp() {
+        let dependencies = stamped(false);
+        Stamp::read(dependencies.path(), WHEELS[0].name).unwrap().remove(dependencies.path(), WHEELS[0].name).unwrap();
+        assert!(!dependencies.path().join("mujoco/a").exists());
+        assert!(Stamp::read(dependencies.path(), WHEELS[0].name).is_none());
+    }
+}

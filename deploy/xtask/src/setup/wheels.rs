@@ -1,0 +1,133 @@
+//! The wheels set-up fetches, pinned, and what is taken from each.
+
+use std::path::PathBuf;
+
+/// A wheel, pinned by version and hash.
+pub(crate) struct Wheel {
+    /// Its name on the package index.
+    pub(crate) name: &'static str,
+    /// Its version.
+    pub(crate) version: &'static str,
+    /// SHA-256 of the file, hexadecimal.
+    pub(crate) sha256: &'static str,
+    /// Size of the file in bytes.
+    pub(crate) size: u64,
+    /// Whether it holds programs for one kind of machine.
+    pub(crate) native: bool,
+    /// What it provides.
+    pub(crate) part: Part,
+    /// Where in `.deps` a file of the wheel goes; `None` leaves it out. The flag is `--cuda`.
+    pub(crate) place: fn(&str, bool) -> Option<PathBuf>,
+    /// Links made beside the files: (link in `.deps`, the name it points to).
+    pub(crate) links: &'static [(&'static str, &'static str)],
+}
+
+/// What wheels provide; a part the user provides already is not fetched.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Part {
+    /// libmujoco.
+    Mujoco,
+    /// libtorch and what it needs to run.
+    Libtorch,
+    /// The humanoid's XML and dm_control's test clips.
+    DmControl,
+}
+
+/// All of them, the small ones first.
+pub(crate) const WHEELS: [Wheel; 5] = [
+    Wheel {
+        name: "mujoco",
+        version: "3.17.0",
+        sha256: "d66928d86a2d1b601bbaa4dc11db50214d17d5301bb8afd84721313b67ff0874",
+        size: 26_482_984,
+        native: true,
+        part: Part::Mujoco,
+        place: |file, _| (file == "mujoco/libmujoco.so.3.17.0").then(|| "mujoco/lib/libmujoco.so.3.17.0".into()),
+        links: &[("mujoco/lib/libmujoco.so", "libmujoco.so.3.17.0")],
+    },
+    Wheel {
+        name: "dm_control",
+        version: "1.0.49",
+        sha256: "eb43ee7bb72179a5c0a5af42d10979c0f660a1194436b770151ed231c8eb8dda",
+        size: 56_452_238,
+        native: false,
+        part: Part::DmControl,
+        place: dm_control,
+        links: &[],
+    },
+    Wheel {
+        name: "nvidia-cuda-runtime-cu12",
+        version: "12.8.90",
+        sha256: "adade8dcbd0edf427b7204d480d6066d33902cab2a4707dcfc48a2d0fd44ab90",
+        size: 954_765,
+        native: true,
+        part: Part::Libtorch,
+        place: |file, _| {
+            (file == "nvidia/cuda_runtime/lib/libcudart.so.12").then(|| "libtorch/lib/libcudart.so.12".into())
+        },
+        links: &[],
+    },
+    Wheel {
+        name: "nvidia-cuda-cupti-cu12",
+        version: "12.8.90",
+        sha256: "ea0cb07ebda26bb9b29ba82cda34849e73c166c18162d3913575b0c9db9a6182",
+        size: 10_248_621,
+        native: true,
+        part: Part::Libtorch,
+        place: |file, _| {
+            (file == "nvidia/cuda_cupti/lib/libcupti.so.12").then(|| "libtorch/lib/libcupti.so.12".into())
+        },
+        links: &[],
+    },
+    Wheel {
+        name: "torch",
+        version: "2.9.0",
+        sha256: "51de31219c97c51cf4bf2be94d622e3deb5dcc526c6dc00e97c17eaec0fc1d67",
+        size: 899_815_990,
+        native: true,
+        part: Part::Libtorch,
+        place: torch,
+        links: &[],
+    },
+];
+
+fn dm_control(file: &str, _cuda: bool) -> Option<PathBuf> {
+    let wanted = [
+        "dm_control/composer/arena.xml",
+        "dm_control/locomotion/walkers/assets/humanoid_CMU_V2019.xml",
+        "dm_control/locomotion/walkers/assets/humanoid_CMU_V2020.xml",
+        "dm_control/locomotion/mocap/test_trajectories.h5",
+    ];
+    let name = file.rsplit('/').next()?;
+    wanted.contains(&file).then(|| format!("dm_control/{name}").into())
+}
+
+/// Without `libtorch_cuda.so` beside them torch-sys links no CUDA, so these four and the headers are a CPU libtorch.
+const CPU_LIBRARIES: [&str; 4] = ["libc10.so", "libtorch.so", "libtorch_cpu.so", "libgomp.so.1"];
+
+fn torch(file: &str, cuda: bool) -> Option<PathBuf> {
+    let inside = file.strip_prefix("torch/")?;
+    let on_cpu =
+        inside.starts_with("include/") || inside.strip_prefix("lib/").is_some_and(|name| CPU_LIBRARIES.contains(&name));
+    (cuda || on_cpu).then(|| format!("libtorch/{inside}").into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cpu_libtorch_has_no_cuda_library_and_a_cuda_one_keeps_everything() {
+        assert_eq!(torch("torch/lib/libtorch_cpu.so", false), Some("libtorch/lib/libtorch_cpu.so".into()));
+        assert_eq!(torch("torch/lib/libtorch_cuda.so", false), None);
+        assert_eq!(torch("torch/lib/libtorch_cuda.so", true), Some("libtorch/lib/libtorch_cuda.so".into()));
+        assert_eq!(torch("torch/include/ATen/ATen.h", false), Some("libtorch/include/ATen/ATen.h".into()));
+        assert_eq!(torch("functorch/dim.py", true), None);
+    }
+
+    #[test]
+    fn only_the_composers_arena_is_taken_from_dm_control() {
+        assert_eq!(dm_control("dm_control/composer/arena.xml", false), Some("dm_control/arena.xml".into()));
+        assert_eq!(dm_control("dm_control/mjcf/test_assets/arena.xml", false), None);
+    }
+}

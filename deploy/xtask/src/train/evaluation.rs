@@ -1,0 +1,154 @@
+//! What was learnt: the untrained policy and the trained one side by side.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, Result, bail};
+use serde::{Deserialize, Serialize};
+
+use super::Job;
+use crate::interrupt::Interrupt;
+use crate::workspace;
+
+/// What `comic-actor evaluate --json` prints, as far as the table shows it.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+struct Evaluation {
+    clips: Vec<ClipEvaluation>,
+    overall: ClipEvaluation,
+}
+
+/// Means over the episodes of one clip, or of all.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+struct ClipEvaluation {
+    clip: String,
+    episodes: u64,
+    return_mean: f64,
+    /// Return / (1.45 × the steps that were left in the clip at the episode's start).
+    normalised_reward: f64,
+    /// Reward per survived step / 1.45.
+    reward_per_step: f64,
+    fraction_survived: f64,
+    /// Per survived step.
+    reward_terms: BTreeMap<String, f64>,
+}
+
+/// Evaluates the run's policies without noise, prints them side by side and keeps them in `evaluation.json`.
+pub(super) fn compare(job: &Job, interrupt: &Interrupt) -> Result<()> {
+    let policies = job.directory.policies();
+    if policies.is_empty() {
+        eprintln!("nothing to compare: the run ended before its first checkpoint");
+        return Ok(());
+    }
+    let asked_before = interrupt.count();
+    let mut columns = Vec::new();
+    for (name, checkpoint) in policies {
+        eprintln!("evaluating the {name} policy ({})", checkpoint.display());
+        let evaluation = evaluate(&checkpoint, job.episodes);
+        if interrupt.count() > asked_before {
+            bail!("interrupted during the evaluation; the run is kept in {}", job.directory.path().display());
+        }
+        columns.push((name, evaluation?));
+    }
+    let path = job.directory.path().join("evaluation.json");
+    let record: BTreeMap<_, _> = columns.iter().cloned().collect();
+    fs::write(&path, serde_json::to_vec_pretty(&record)?).with_context(|| format!("cannot write {}", path.display()))?;
+    println!("{}", table(&columns));
+    println!("kept in {}", job.directory.path().display());
+    Ok(())
+}
+
+fn evaluate(checkpoint: &Path, episodes: Option<u32>) -> Result<Evaluation> {
+    let mut command = Command::new(workspace::program("comic-actor")?);
+    command.args(["evaluate", "--deterministic", "--json", "--checkpoint"]).arg(checkpoint);
+    if let Some(episodes) = episodes {
+        command.arg("--episodes").arg(episodes.to_string());
+    }
+    let output = command.stdin(Stdio::null()).stderr(Stdio::inherit()).output();
+    let output = output.with_context(|| format!("cannot start {}", workspace::describe(&command)))?;
+    if !output.status.success() {
+        bail!("{} ended with {}", workspace::describe(&command), output.status);
+    }
+    serde_json::from_slice(&output.stdout)
+        .with_context(|| format!("unreadable answer of {}", workspace::describe(&command)))
+}
+
+impl Evaluation {
+    /// The block of this name.
+    fn of(&self, clip: &str) -> Option<&ClipEvaluation> {
+        self.clips.iter().chain([&self.overall]).find(|evaluation| evaluation.clip == clip)
+    }
+}
+
+/// One block of rows per clip, one column per policy.
+fn table(columns: &[(&str, Evaluation)]) -> String {
+    let mut text = String::from("\nWhat was learnt (policies without noise)\n");
+    let Some((_, first)) = columns.first() else { return text };
+    // One clip is all clips.
+    let overall = (first.clips.len() > 1).then_some(&first.overall);
+    for clip in first.clips.iter().chain(overall) {
+        let of_clip: Vec<_> = columns.iter().map(|(_, evaluation)| evaluation.of(&clip.clip)).collect();
+        text += &format!("\n{:<28}", clip.clip);
+        for (name, _) in columns {
+            text += &format!("{name:>14}");
+        }
+        text.push('\n');
+        let mut row = |label: &str, value: &dyn Fn(&ClipEvaluation) -> Option<f64>| {
+            text += &format!("  {label:<26}");
+            for clip in &of_clip {
+                text += &clip.and_then(value).map_or_else(|| format!("{:>14}", "–"), |value| format!("{value:>14.3}"));
+            }
+            text.push('\n');
+        };
+        row("return", &|clip| Some(clip.return_mean));
+        row("normalised reward", &|clip| Some(clip.normalised_reward));
+        row("reward per step / 1.45", &|clip| Some(clip.reward_per_step));
+        row("fraction survived", &|clip| Some(clip.fraction_survived));
+        for term in clip.reward_terms.keys() {
+            row(&format!("{term}, per step"), &|clip| clip.reward_terms.get(term).copied());
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn of_clip(clip: &str, normalised_reward: f64) -> ClipEvaluation {
+        ClipEvaluation {
+            clip: clip.into(),
+            episodes: 3,
+            return_mean: 1.0,
+            normalised_reward,
+            reward_per_step: 0.5,
+            fraction_survived: 0.25,
+            reward_terms: [("com".to_owned(), 0.01)].into(),
+        }
+    }
+
+    fn evaluation(clips: &[&str], normalised_reward: f64) -> Evaluation {
+        Evaluation {
+            clips: clips.iter().map(|clip| of_clip(clip, normalised_reward)).collect(),
+            overall: of_clip("overall", normalised_reward),
+        }
+    }
+
+    #[test]
+    fn the_table_has_a_block_per_clip_and_a_column_per_policy() {
+        let table = table(&[("untrained", evaluation(&["CMU_007_01"], 0.03)), ("trained", evaluation(&["CMU_007_01"], 0.41))]);
+        assert!(table.contains("CMU_007_01                       untrained       trained\n"), "{table}");
+        assert!(table.contains("  normalised reward                  0.030         0.410\n"), "{table}");
+        assert!(table.contains("  com, per step                      0.010         0.010\n"), "{table}");
+        assert!(!table.contains("overall"), "one clip is all clips: {table}");
+    }
+
+    #[test]
+    fn several_clips_are_summed_up() {
+        let table = table(&[("trained", evaluation(&["walk", "run"], 0.5))]);
+        for block in ["\nwalk ", "\nrun ", "\noverall "] {
+            assert!(table.contains(block), "{table}");
+        }
+    }
+}

@@ -1,0 +1,69 @@
+//! One line of `metrics.jsonl`, as the learner writes it; baselines' lines are read too.
+
+use std::collections::BTreeMap;
+
+use serde::Deserialize;
+
+/// What a run's curve and display need of a line. A share of nothing is absent.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(default)]
+pub(crate) struct Line {
+    /// Wall clock since the first unroll, seconds, cumulative over restarts.
+    pub(crate) seconds: f64,
+    #[serde(alias = "env_steps")]
+    pub(crate) environment_steps: u64,
+    pub(crate) updates: u64,
+    pub(crate) version: u64,
+    pub(crate) steps_per_second: Option<f64>,
+    /// Reward per survived step, not divided by its maximum.
+    pub(crate) reward_per_step: Option<f64>,
+    /// Steps.
+    #[serde(alias = "length")]
+    pub(crate) episode_length: Option<f64>,
+    pub(crate) episode_return: Option<f64>,
+    /// Return / (1.45 × the steps that were left in the clip at the episode's start).
+    pub(crate) normalised_reward: Option<f64>,
+    pub(crate) fraction_survived: Option<f64>,
+    /// Versions between the parameters that acted and those that were trained.
+    pub(crate) unroll_age: Option<f64>,
+    pub(crate) books: Option<Books>,
+    /// Whatever the learner minimises, by name.
+    pub(crate) losses: BTreeMap<String, serde_json::Value>,
+}
+
+/// produced = trained + dropped + in flight.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(default)]
+pub(crate) struct Books {
+    pub(crate) produced: u64,
+    pub(crate) trained: u64,
+    pub(crate) dropped: BTreeMap<String, u64>,
+    pub(crate) in_flight: u64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_learners_line_is_read_with_its_absent_shares() {
+        let line: Line = serde_json::from_str(
+            r#"{"seconds":5.0,"environment_steps":4096,"updates":1,"version":1,"episode_length":null,
+                "reward_terms":{"com":null},"losses":{"policy":0.1},
+                "books":{"produced":3,"trained":2,"dropped":{"stale":1},"in_flight":0}}"#,
+        )
+        .unwrap();
+        assert_eq!(line.environment_steps, 4096);
+        assert!(line.episode_length.is_none());
+        assert_eq!(line.books.unwrap().dropped["stale"], 1);
+    }
+
+    #[test]
+    fn a_baselines_line_is_read() {
+        let line: Line = serde_json::from_str(
+            r#"{"seconds": 30, "env_steps": 8030, "episode_return": 1.084, "length": 6.32, "normalised": 0.1183}"#,
+        )
+        .unwrap();
+        assert_eq!((line.seconds, line.environment_steps, line.episode_return), (30.0, 8030, Some(1.084)));
+    }
+}

@@ -1,0 +1,159 @@
+//! A child process with a log file.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result};
+use rustix::process::{Pid, Signal, kill_process};
+
+/// A running learner or actor. It stays in this program's process group, so a closed terminal reaches it too.
+pub(super) struct Process {
+    pub(super) name: String,
+    log: PathBuf,
+    /// Where in the log this process began.
+    log_start: u64,
+    child: Child,
+    started: Instant,
+}
+
+impl Process {
+    /// Starts `command`; both its outputs are appended to `log`.
+    pub(super) fn start(name: impl Into<String>, command: &mut Command, log: PathBuf) -> Result<Self> {
+        let name = name.into();
+        let output = OpenOptions::new().create(true).append(true).open(&log);
+        let output = output.with_context(|| format!("cannot write {}", log.display()))?;
+        let log_start = output.metadata().map_or(0, |metadata| metadata.len());
+        let child = command
+            .stdin(Stdio::null())
+            .stdout(output.try_clone().context("cannot share a log")?)
+            .stderr(output)
+            .spawn()
+            .with_context(|| format!("cannot start {name} ({})", Path::new(command.get_program()).display()))?;
+        Ok(Self { name, log, log_start, child, started: Instant::now() })
+    }
+
+    /// How it ended, if it has.
+    pub(super) fn ended(&mut self) -> Result<Option<ExitStatus>> {
+        self.child.try_wait().with_context(|| format!("cannot wait for {}", self.name))
+    }
+
+    /// How long it has been there.
+    pub(super) fn age(&self) -> Duration {
+        self.started.elapsed()
+    }
+
+    /// What this process has written.
+    pub(super) fn output(&self) -> String {
+        let mut text = Vec::new();
+        if let Ok(mut file) = File::open(&self.log) {
+            let _ = file.seek(SeekFrom::Start(self.log_start)).and_then(|_| file.read_to_end(&mut text));
+        }
+        String::from_utf8_lossy(&text).into_owned()
+    }
+
+    /// The last lines it wrote and where the rest is.
+    pub(super) fn last_words(&self) -> String {
+        let output = self.output();
+        let lines: Vec<&str> = output.lines().collect();
+        let last = lines[lines.len().saturating_sub(12)..].join("\n  ");
+        format!("the end of {}:\n  {last}", self.log.display())
+    }
+
+    /// Asks it to leave.
+    pub(super) fn terminate(&self) {
+        if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {
+            // It may be gone already, which is what is wanted.
+            let _ = kill_process(pid, Signal::TERM);
+        }
+    }
+
+    /// Waits until it has left, and ends it by force after `limit`; whether it left by itself.
+    pub(super) fn wait(&mut self, limit: Duration) -> bool {
+        let deadline = Instant::now() + limit;
+        while Instant::now() < deadline {
+            if !matches!(self.child.try_wait(), Ok(None)) {
+                return true;
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        false
+    }
+}
+
+impl Drop for Process {
+    /// Leaves no process behind, whatever way this program ends on an error.
+    fn drop(&mut self) {
+        if matches!(self.child.try_wait(), Ok(None)) {
+            self.terminate();
+            self.wait(Duration::from_secs(10));
+        }
+    }
+}
+
+/// Reads a file that grows, line by line.
+pub(super) struct Tail {
+    path: PathBuf,
+    position: u64,
+}
+
+impl Tail {
+    /// Begins at the file's present end.
+    pub(super) fn new(path: PathBuf) -> Self {
+        let position = fs::metadata(&path).map_or(0, |metadata| metadata.len());
+        Self { path, position }
+    }
+
+    /// The whole lines that came since the last call.
+    pub(super) fn lines(&mut self) -> Vec<String> {
+        let Ok(mut file) = File::open(&self.path) else { return Vec::new() };
+        let mut text = String::new();
+        if file.seek(SeekFrom::Start(self.position)).is_err() || file.read_to_string(&mut text).is_err() {
+            return Vec::new();
+        }
+        let whole = text.rfind('\n').map_or(0, |end| end + 1);
+        self.position += whole as u64;
+        text[..whole].lines().map(str::to_owned).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    #[test]
+    fn a_tail_gives_whole_lines_once_and_nothing_that_was_there_before() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("metrics.jsonl");
+        fs::write(&path, "old\n").unwrap();
+        let mut tail = Tail::new(path.clone());
+        let mut file = OpenOptions::new().append(true).open(&path).unwrap();
+        file.write_all(b"one\ntwo\nthr").unwrap();
+        assert_eq!(tail.lines(), ["one", "two"]);
+        file.write_all(b"ee\n").unwrap();
+        assert_eq!(tail.lines(), ["three"]);
+        assert!(tail.lines().is_empty());
+    }
+
+    #[test]
+    fn a_process_that_is_asked_to_leave_leaves_and_its_words_are_kept() {
+        let directory = tempfile::tempdir().unwrap();
+        let log = directory.path().join("child.log");
+        let mut command = Command::new("sh");
+        command.args(["-c", "trap 'echo bye; exit 0' TERM; echo hello; while :; do sleep 0.01; done"]);
+        let mut process = Process::start("child", &mut command, log).unwrap();
+        let deadline = Instant::now() + Duration::from_secs(20);
+        while !process.output().contains("hello") && Instant::now() < deadline {
+            std::thread::yield_now();
+        }
+        process.terminate();
+        assert!(process.wait(Duration::from_secs(20)));
+        assert!(process.last_words().ends_with("hello\n  bye"), "{}", process.last_words());
+    }
+}

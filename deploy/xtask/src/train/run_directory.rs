@@ -1,0 +1,108 @@
+//! Where a run keeps what it makes.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+
+use crate::workspace;
+
+/// A run's directory: checkpoints, metrics.jsonl, logs, the evaluation and the curve.
+pub(super) struct RunDirectory(PathBuf);
+
+impl RunDirectory {
+    /// The directory asked for, or the preset's next one (its newest one to resume).
+    pub(super) fn choose(asked: Option<PathBuf>, preset: &str, resume: bool) -> Result<Self> {
+        Self::choose_below(&workspace::root().join("runs"), asked, preset, resume)
+    }
+
+    fn choose_below(runs: &Path, asked: Option<PathBuf>, preset: &str, resume: bool) -> Result<Self> {
+        let numbered = |number: usize| runs.join(format!("{preset}-{number}"));
+        let next = (1..).find(|number| !numbered(*number).exists()).unwrap_or(1);
+        let directory = match asked {
+            Some(path) => std::path::absolute(&path).with_context(|| format!("no such path: {}", path.display()))?,
+            None if resume && next == 1 => bail!("there is no run of {preset} to resume in {}", runs.display()),
+            None if resume => numbered(next - 1),
+            None => numbered(next),
+        };
+        let has_run = directory.join("checkpoints").is_dir();
+        match (resume, has_run) {
+            (true, false) => bail!("there is no run to resume in {}: it holds no checkpoints", directory.display()),
+            (false, true) => bail!(
+                "{} holds a run already: --resume goes on with it, another --run begins a new one",
+                directory.display()
+            ),
+            _ => Ok(Self(directory)),
+        }
+    }
+
+    pub(super) fn make(&self) -> Result<()> {
+        fs::create_dir_all(&self.0).with_context(|| format!("cannot make {}", self.0.display()))
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.0
+    }
+
+    pub(super) fn metrics(&self) -> PathBuf {
+        self.0.join("metrics.jsonl")
+    }
+
+    pub(super) fn log(&self, name: &str) -> PathBuf {
+        self.0.join(format!("{name}.log"))
+    }
+
+    /// The policies there are to compare, each with what it is called.
+    pub(super) fn policies(&self) -> Vec<(&'static str, PathBuf)> {
+        let checkpoints = self.0.join("checkpoints");
+        let mut policies = vec![
+            ("untrained", checkpoints.join("initial")),
+            ("warm-started", checkpoints.join("warm-started")),
+        ];
+        let newest = fs::read_dir(&checkpoints).into_iter().flatten().flatten().map(|entry| entry.path());
+        let newest = newest
+            .filter(|path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("checkpoint-")))
+            .max();
+        policies.extend(newest.map(|path| ("trained", path)));
+        policies.retain(|(_, path)| path.is_dir());
+        policies
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_gets_the_next_free_number_and_resuming_takes_the_newest() {
+        let runs = tempfile::tempdir().unwrap();
+        for number in [1, 2] {
+            fs::create_dir_all(runs.path().join(format!("quickstart-{number}/checkpoints"))).unwrap();
+        }
+        let new = RunDirectory::choose_below(runs.path(), None, "quickstart", false).unwrap();
+        assert!(new.path().ends_with("quickstart-3"));
+        let resumed = RunDirectory::choose_below(runs.path(), None, "quickstart", true).unwrap();
+        assert!(resumed.path().ends_with("quickstart-2"));
+    }
+
+    #[test]
+    fn a_run_is_neither_overwritten_nor_resumed_from_nothing() {
+        let runs = tempfile::tempdir().unwrap();
+        let used = runs.path().join("used");
+        fs::create_dir_all(used.join("checkpoints")).unwrap();
+        assert!(RunDirectory::choose_below(runs.path(), Some(used), "p", false).is_err());
+        assert!(RunDirectory::choose_below(runs.path(), Some(runs.path().join("new")), "p", true).is_err());
+        assert!(RunDirectory::choose_below(runs.path(), None, "p", true).is_err());
+    }
+
+    #[test]
+    fn the_trained_policy_is_the_newest_checkpoint() {
+        let runs = tempfile::tempdir().unwrap();
+        for name in ["initial", "checkpoint-0000000009", "checkpoint-0000000010"] {
+            fs::create_dir_all(runs.path().join("checkpoints").join(name)).unwrap();
+        }
+        let policies = RunDirectory(runs.path().into()).policies();
+        assert_eq!(policies.iter().map(|(name, _)| *name).collect::<Vec<_>>(), ["untrained", "trained"]);
+        assert!(policies[1].1.ends_with("checkpoint-0000000010"));
+    }
+}

@@ -1,0 +1,213 @@
+//! Adam (Kingma & Ba, 2015), with a state that can be saved and restored bit for bit.
+//!
+//! libtorch's own optimiser keeps its moments where no checkpoint reaches them. Here they are plain tensors, one pair a
+//! parameter, updated in place; the update is written so that a parameter takes seven passes over memory.
+
+use std::collections::HashMap;
+
+use comic_experiment::Optimiser;
+use tch::{Kind, Tensor};
+
+/// What can go wrong when a state is restored.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum StateError {
+    /// A tensor of the state is absent.
+    #[error("state has no `{name}`; it was saved by another experiment or version")]
+    Missing {
+        /// The tensor's name.
+        name: String,
+    },
+    /// A tensor that does not belong to the state.
+    #[error("state has an unknown `{name}`; it was saved by another experiment or version")]
+    Unknown {
+        /// The tensor's name.
+        name: String,
+    },
+    /// A tensor of another shape or element type.
+    #[error("`{name}` is {found} in the state where {expected} is needed")]
+    Mismatch {
+        /// The tensor's name.
+        name: String,
+        /// Shape and element type needed.
+        expected: String,
+        /// Shape and element type found.
+        found: String,
+    },
+    /// libtorch refused an operation.
+    #[error("libtorch: {0}")]
+    Torch(#[from] tch::TchError),
+}
+
+/// Parameters that share a learning rate and are stepped together.
+#[derive(Debug)]
+struct Group {
+    name: String,
+    names: Vec<String>,
+    parameters: Vec<Tensor>,
+    /// m, the mean of the gradient.
+    first: Vec<Tensor>,
+    /// v, the mean of the squared gradient.
+    second: Vec<Tensor>,
+    /// Steps taken, int64, a tensor so that it is saved like everything else.
+    steps: Tensor,
+    /// Float64, for the same reason.
+    learning_rate: Tensor,
+}
+
+/// Adam over groups of parameters.
+#[derive(Debug)]
+pub struct Adam {
+    groups: Vec<Group>,
+    beta1: f64,
+    beta2: f64,
+    epsilon: f64,
+}
+
+impl Adam {
+    /// No groups yet; β₁, β₂ and ε are `config`'s.
+    pub fn new(config: &Optimiser) -> Self {
+        Self { groups: Vec::new(), beta1: config.beta1, beta2: config.beta2, epsilon: config.epsilon }
+    }
+
+    /// Adds named parameters that share `learning_rate`, and returns the group's index. Names must be unique over all
+    /// groups: they name the moments in the state.
+    pub fn add_group(&mut self, name: &str, parameters: Vec<(String, Tensor)>, learning_rate: f64) -> usize {
+        let (names, parameters): (Vec<_>, Vec<_>) = parameters.into_iter().unzip();
+        let zeros = || parameters.iter().map(|parameter| parameter.detach().zeros_like()).collect::<Vec<_>>();
+        self.groups.push(Group {
+            name: name.to_string(),
+            first: zeros(),
+            second: zeros(),
+            names,
+            parameters,
+            steps: Tensor::from(0i64),
+            learning_rate: Tensor::from(learning_rate),
+        });
+        self.groups.len() - 1
+    }
+
+    /// The parameters of a group, in the order in which [`Adam::step`] takes their gradients.
+    pub fn parameters(&self, group: usize) -> &[Tensor] {
+        self.groups.get(group).map_or(&[], |group| &group.parameters)
+    }
+
+    /// The learning rate of a group.
+    pub fn learning_rate(&self, group: usize) -> f64 {
+        self.groups.get(group).map_or(0.0, |group| group.learning_rate.double_value(&[]))
+    }
+
+    /// Sets the learning rate of a group.
+    pub fn set_learning_rate(&mut self, group: usize, learning_rate: f64) {
+        if let Some(group) = self.groups.get_mut(group) {
+            group.learning_rate = Tensor::from(learning_rate);
+        }
+    }
+
+    /// Forgets moments and step counts, and keeps the learning rates.
+    pub fn reset(&mut self) {
+        for group in &mut self.groups {
+            for moment in group.first.iter_mut().chain(&mut group.second) {
+                let _ = moment.zero_();
+            }
+            group.steps = Tensor::from(0i64);
+        }
+    }
+
+    /// One step of a group: θ ← θ − lr · m̂ / (√v̂ + ε), with gradients in the order of [`Adam::parameters`].
+    pub fn step(&mut self, group: usize, gradients: &[Tensor]) {
+        let (beta1, beta2, epsilon) = (self.beta1, self.beta2, self.epsilon);
+        let Some(group) = self.groups.get_mut(group) else { return };
+        let steps = group.steps.int64_value(&[]) + 1;
+        group.steps = Tensor::from(steps);
+        let bias1 = 1.0 - beta1.powf(steps as f64);
+        let bias2_root = (1.0 - beta2.powf(steps as f64)).sqrt();
+        // lr · (m / bias1) / (√v / bias2_root + ε) with both corrections moved into two scalars.
+        let step_size = group.learning_rate.double_value(&[]) * bias2_root / bias1;
+        let epsilon = epsilon * bias2_root;
+        tch::no_grad(|| {
+            let moments = group.first.iter_mut().zip(&mut group.second);
+            for ((parameter, gradient), (first, second)) in group.parameters.iter_mut().zip(gradients).zip(moments) {
+                let _ = first.lerp_(gradient, 1.0 - beta1);
+                let _ = second.lerp_(&gradient.square(), 1.0 - beta2);
+                let mut divisor = second.sqrt();
+                let _ = divisor.g_add_scalar_(epsilon);
+                let _ = divisor.g_mul_scalar_(-1.0 / step_size);
+                let _ = parameter.addcdiv_(first, &divisor);
+            }
+        });
+    }
+
+    /// Everything that changes future steps, by name. The tensors are copies.
+    pub fn state(&self) -> Vec<(String, Tensor)> {
+        self.entries().into_iter().map(|(name, tensor)| (name, tensor.copy())).collect()
+    }
+
+    /// Names and tensors of the state, sharing memory with it.
+    pub(crate) fn entries(&self) -> Vec<(String, Tensor)> {
+        let mut entries = Vec::new();
+        for group in &self.groups {
+            entries.push((format!("adam.{}.steps", group.name), group.steps.shallow_clone()));
+            entries.push((format!("adam.{}.learning_rate", group.name), group.learning_rate.shallow_clone()));
+            for ((name, first), second) in group.names.iter().zip(&group.first).zip(&group.second) {
+                entries.push((format!("adam.first.{name}"), first.shallow_clone()));
+                entries.push((format!("adam.second.{name}"), second.shallow_clone()));
+            }
+        }
+        entries
+    }
+
+    /// Restores what [`Adam::state`] gave.
+    ///
+    /// # Errors
+    /// [`StateError`] when names, shapes or element types differ; nothing is changed then.
+    pub fn load_state(&mut self, state: &[(String, Tensor)]) -> Result<(), StateError> {
+        restore(self.entries(), state)
+    }
+}
+
+/// Copies `state` into `entries`, all or nothing.
+pub(crate) fn restore(entries: Vec<(String, Tensor)>, state: &[(String, Tensor)]) -> Result<(), StateError> {
+    let saved: HashMap<&str, &Tensor> = state.iter().map(|(name, tensor)| (name.as_str(), tensor)).collect();
+    for (name, entry) in &entries {
+        let found = saved.get(name.as_str()).ok_or_else(|| StateError::Missing { name: name.clone() })?;
+        if describe(found) != describe(entry) {
+            return Err(StateError::Mismatch {
+                name: name.clone(),
+                expected: describe(entry),
+                found: describe(found),
+            });
+        }
+    }
+    if entries.len() != state.len() {
+        let known: std::collections::HashSet<&str> = entries.iter().map(|(name, _)| name.as_str()).collect();
+        let unknown = state.iter().find(|(name, _)| !known.contains(name.as_str()));
+        let name = unknown.map_or_else(|| "duplicate".to_string(), |(name, _)| name.clone());
+        return Err(StateError::Unknown { name });
+    }
+    for (name, mut entry) in entries {
+        if let Some(found) = saved.get(name.as_str()) {
+            tch::no_grad(|| entry.f_copy_(found)).map(drop)?;
+        }
+    }
+    Ok(())
+}
+
+fn describe(tensor: &Tensor) -> String {
+    let kind: Kind = tensor.kind();
+    format!("{kind:?} {:?}", tensor.size())
+}
+
+/// The Euclidean norm of all gradients together, a scalar tensor.
+pub fn global_norm(gradients: &[Tensor]) -> Tensor {
+    let norms: Vec<Tensor> = gradients.iter().map(Tensor::norm).collect();
+    Tensor::stack(&norms, 0).norm()
+}
+
+/// Scales `gradients` in place so that their global norm, `norm`, becomes at most `limit`.
+pub fn clip_by_global_norm(gradients: &mut [Tensor], norm: &Tensor, limit: f64) {
+    let scale = (norm.clamp_min(limit).reciprocal() * limit).detach();
+    for gradient in gradients {
+        let _ = gradient.g_mul_(&scale);
+    }
+}

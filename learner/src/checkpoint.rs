@@ -1,0 +1,219 @@
+//! The checkpoint directory; no other module touches it.
+//!
+//! A checkpoint is a directory `checkpoint-NNNNNNNNNN` (the number of updates) with one file per part and a
+//! `MANIFEST.json` that holds each part's SHA-256. It is written beside its final name, synced, renamed, and the parent
+//! synced, so that a crash leaves either the whole checkpoint or none. Two more, `initial` and `warm-started`, are kept
+//! for comparison.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, Result, bail};
+use sha2::{Digest as _, Sha256};
+
+const MANIFEST: &str = "MANIFEST.json";
+const EPOCH: &str = "epoch";
+
+/// A host snapshot of everything that changes the future: file names and their bytes.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Snapshot {
+    /// Parts by file name.
+    pub parts: BTreeMap<String, Vec<u8>>,
+}
+
+impl Snapshot {
+    /// One part.
+    ///
+    /// # Errors
+    /// When the snapshot has no part of this name.
+    pub fn part(&self, name: &str) -> Result<&[u8]> {
+        self.parts.get(name).map(Vec::as_slice).with_context(|| format!("the checkpoint has no part `{name}`"))
+    }
+
+    /// One part that is text.
+    ///
+    /// # Errors
+    /// When it is absent or not UTF-8.
+    pub fn text(&self, name: &str) -> Result<&str> {
+        std::str::from_utf8(self.part(name)?).with_context(|| format!("checkpoint part `{name}` is not UTF-8"))
+    }
+}
+
+/// What a checkpoint is called.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Name {
+    /// Before any learning; kept.
+    Initial,
+    /// After the warm start, before V-MPO; kept.
+    WarmStarted,
+    /// After so many updates; the newest few are kept.
+    Updates(u64),
+}
+
+impl std::fmt::Display for Name {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Initial => f.write_str("initial"),
+            Self::WarmStarted => f.write_str("warm-started"),
+            Self::Updates(updates) => write!(f, "checkpoint-{updates:010}"),
+        }
+    }
+}
+
+/// A run's checkpoint directory.
+#[derive(Debug)]
+pub struct Store {
+    directory: PathBuf,
+    kept: usize,
+}
+
+impl Store {
+    /// Opens (and makes) `RUN/checkpoints`.
+    ///
+    /// # Errors
+    /// When the directory cannot be made.
+    pub fn open(run: &Path, kept: usize) -> Result<Self> {
+        let directory = run.join("checkpoints");
+        fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
+        Ok(Self { directory, kept: kept.max(1) })
+    }
+
+    /// Begins a new life of the learner: an epoch larger than every earlier one, on disk before it is returned.
+    ///
+    /// # Errors
+    /// When the epoch file is unreadable or cannot be written.
+    pub fn begin_life(&self) -> Result<u64> {
+        let path = self.directory.join(EPOCH);
+        let last = match fs::read_to_string(&path) {
+            Ok(text) => text
+                .trim()
+                .parse::<u64>()
+                .with_context(|| format!("{} is damaged: write the number of earlier starts into it", path.display()))?,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => 0,
+            Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),
+        };
+        let epoch = last.checked_add(1).context("the learner epoch is exhausted")?;
+        let temporary = self.directory.join(".epoch");
+        write_synced(&temporary, epoch.to_string().as_bytes())?;
+        self.put(&temporary, &path)?;
+        Ok(epoch)
+    }
+
+    /// Writes a checkpoint whole, and forgets the oldest beyond the number kept.
+    ///
+    /// # Errors
+    /// When the disk refuses; earlier checkpoints stay as they were.
+    pub fn write(&self, name: Name, snapshot: &Snapshot) -> Result<PathBuf> {
+        let path = self.directory.join(name.to_string());
+        let temporary = self.directory.join(format!(".{name}"));
+        remove_if_there(&temporary)?;
+        fs::create_dir(&temporary).with_context(|| format!("cannot make {}", temporary.display()))?;
+        let mut manifest = BTreeMap::new();
+        for (part, bytes) in &snapshot.parts {
+            write_synced(&temporary.join(part), bytes)?;
+            manifest.insert(part, hex(&Sha256::digest(bytes)));
+        }
+        write_synced(&temporary.join(MANIFEST), &serde_json::to_vec_pretty(&manifest)?)?;
+        sync_directory(&temporary)?;
+        remove_if_there(&path)?;
+        self.put(&temporary, &path)?;
+        self.forget_oldest()?;
+        Ok(path)
+    }
+
+    /// The newest checkpoint whose every part verifies; damaged ones are skipped with a warning.
+    ///
+    /// # Errors
+    /// When the directory cannot be listed.
+    pub fn newest(&self) -> Result<Option<(PathBuf, Snapshot)>> {
+        for path in self.numbered()?.into_iter().rev() {
+            match read(&path) {
+                Ok(snapshot) => return Ok(Some((path, snapshot))),
+                Err(error) => tracing::warn!(checkpoint = %path.display(), "skipped a damaged checkpoint: {error:#}"),
+            }
+        }
+        Ok(None)
+    }
+
+    /// Whether a checkpoint of this name is there.
+    pub fn has(&self, name: Name) -> bool {
+        self.directory.join(name.to_string()).is_dir()
+    }
+
+    /// Numbered checkpoints, oldest first.
+    fn numbered(&self) -> Result<Vec<PathBuf>> {
+        let mut found = Vec::new();
+        for entry in
+            fs::read_dir(&self.directory).with_context(|| format!("cannot list {}", self.directory.display()))?
+        {
+            let path = entry?.path();
+            if path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("checkpoint-")) {
+                found.push(path);
+            }
+        }
+        found.sort();
+        Ok(found)
+    }
+
+    fn forget_oldest(&self) -> Result<()> {
+        let numbered = self.numbered()?;
+        for path in &numbered[..numbered.len().saturating_sub(self.kept)] {
+            remove_if_there(path)?;
+        }
+        Ok(())
+    }
+
+    #[allow(clippy::disallowed_methods, reason = "the one durable rename: contents synced before, directory after")]
+    fn put(&self, temporary: &Path, path: &Path) -> Result<()> {
+        fs::rename(temporary, path).with_context(|| format!("cannot put {} in place", path.display()))?;
+        sync_directory(&self.directory)
+    }
+}
+
+/// Reads one checkpoint directory, verifying every part.
+///
+/// # Errors
+/// A part that is missing, or is not what the manifest says.
+pub fn read(path: &Path) -> Result<Snapshot> {
+    let file = path.join(MANIFEST);
+    let text = fs::read(&file).with_context(|| format!("cannot read {}", file.display()))?;
+    let manifest: BTreeMap<String, String> =
+        serde_json::from_slice(&text).with_context(|| format!("{} is damaged", file.display()))?;
+    let mut snapshot = Snapshot::default();
+    for (part, expected) in manifest {
+        if part.contains(['/', '\\']) || part.starts_with('.') {
+            bail!("{}: `{part}` is no part's name", file.display());
+        }
+        let file = path.join(&part);
+        let bytes = fs::read(&file).with_context(|| format!("cannot read {}", file.display()))?;
+        if hex(&Sha256::digest(&bytes)) != expected {
+            bail!("{} is not what the manifest says: its SHA-256 differs", file.display());
+        }
+        snapshot.parts.insert(part, bytes);
+    }
+    Ok(snapshot)
+}
+
+fn write_synced(path: &Path, bytes: &[u8]) -> Result<()> {
+    let mut file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+    file.write_all(bytes).and_then(|()| file.sync_all()).with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn sync_directory(path: &Path) -> Result<()> {
+    File::open(path).and_then(|file| file.sync_all()).with_context(|| format!("cannot sync {}", path.display()))
+}
+
+fn remove_if_there(path: &Path) -> Result<()> {
+    match fs::remove_dir_all(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(error).with_context(|| format!("cannot remove {}", path.display()))
+        }
+        _ => Ok(()),
+    }
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}

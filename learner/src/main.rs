@@ -1,0 +1,36 @@
+//! The program `comic-learner`.
+
+use std::io::IsTerminal as _;
+use std::process::ExitCode;
+
+use clap::Parser as _;
+use comic_learner::options::{Command, LogFormat, Options};
+use tracing_subscriber::EnvFilter;
+
+fn main() -> ExitCode {
+    let options = Options::parse();
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
+    let log = tracing_subscriber::fmt()
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_env_filter(filter);
+    match options.log_format {
+        LogFormat::Text => log.init(),
+        LogFormat::Json => log.json().init(),
+    }
+    let ended = match &options.command {
+        Some(Command::Bench { threads, repeats }) => comic_learner::bench::run(*threads, *repeats),
+        None => comic_learner::run::run(&options),
+    };
+    match ended {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("comic-learner: {error:#}");
+            // A configuration that is wrong stays wrong: 2 tells whoever restarts processes not to try again.
+            let configuration = error.chain().any(|cause| {
+                cause.is::<comic_experiment::Error>() || cause.is::<comic_clips::Error>()
+            });
+            ExitCode::from(if configuration { 2 } else { 1 })
+        }
+    }
+}

@@ -1,0 +1,133 @@
+//! What a person sees of a run: one JSON line every few seconds in `RUN/metrics.jsonl`, the newest one as the status.
+
+use std::fs::{File, OpenOptions};
+use std::io::Write as _;
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::{Context as _, Result};
+use comic_experiment::{TRACKING_MAX_REWARD, TaskSpec};
+use comic_proto::v1::{EpisodeEnd, UnrollHeader};
+use serde_json::{Map, Value, json};
+
+/// Sums since the last line.
+#[derive(Debug, Default)]
+struct Window {
+    episodes: u64,
+    steps: u64,
+    possible_steps: u64,
+    diverged: u64,
+    returns: Vec<f64>,
+    environment_steps: u64,
+    unrolls: u64,
+    age: u64,
+    updates: u64,
+}
+
+/// Collects and writes metrics.
+#[derive(Debug)]
+pub struct Metrics {
+    terms: Vec<String>,
+    file: File,
+    window: Window,
+    since: Instant,
+}
+
+/// Where the run stands, for the line's head.
+#[derive(Clone, Copy, Debug)]
+pub struct Position {
+    /// Wall-clock seconds since the first unroll, earlier lives included.
+    pub seconds: f64,
+    /// Environment steps trained on, over the run's whole life.
+    pub environment_steps: u64,
+    /// Batches trained on, over the run's whole life.
+    pub updates: u64,
+    /// Newest published version.
+    pub version: u64,
+    /// This life of the learner.
+    pub epoch: u64,
+}
+
+impl Metrics {
+    /// Appends to `RUN/metrics.jsonl`.
+    ///
+    /// # Errors
+    /// When the file cannot be opened.
+    pub fn open(run: &Path, spec: &TaskSpec) -> Result<Self> {
+        let path = run.join("metrics.jsonl");
+        let file = OpenOptions::new()
+            .create(true)
+            .append(true)
+            .open(&path)
+            .with_context(|| format!("cannot write {}", path.display()))?;
+        Ok(Self { terms: spec.reward_terms.clone(), file, window: Window::default(), since: Instant::now() })
+    }
+
+    /// Seconds since the last line.
+    pub fn elapsed(&self) -> f64 {
+        self.since.elapsed().as_secs_f64()
+    }
+
+    /// Counts one trained batch.
+    pub fn absorb(&mut self, headers: &[UnrollHeader], environment_steps: u64, version: u64) {
+        let window = &mut self.window;
+        window.updates += 1;
+        window.environment_steps += environment_steps;
+        window.returns.resize(self.terms.len(), 0.0);
+        for header in headers {
+            window.unrolls += 1;
+            window.age += version.saturating_sub(header.version);
+            for episode in &header.episodes {
+                window.episodes += 1;
+                window.steps += u64::from(episode.steps);
+                window.possible_steps += u64::from(episode.steps_left_at_start);
+                window.diverged += u64::from(episode.end == EpisodeEnd::Diverged as i32);
+                for (sum, value) in window.returns.iter_mut().zip(&episode.returns) {
+                    *sum += f64::from(*value);
+                }
+            }
+        }
+    }
+
+    /// Writes the line, starts a new window, and returns the line for the status.
+    ///
+    /// # Errors
+    /// When the file refuses.
+    pub fn write(&mut self, position: Position, books: Value, losses: Map<String, Value>) -> Result<String> {
+        let seconds = self.since.elapsed().as_secs_f64().max(1e-9);
+        let window = std::mem::take(&mut self.window);
+        self.since = Instant::now();
+        let total: f64 = window.returns.iter().sum();
+        // Shares of nothing are absent, not 0.
+        let per = |value: f64, count: u64| if count == 0 { Value::Null } else { json!(value / count as f64) };
+        let terms: Map<String, Value> = self
+            .terms
+            .iter()
+            .zip(&window.returns)
+            .map(|(name, sum)| (name.clone(), per(*sum, window.steps)))
+            .collect();
+        let line = json!({
+            "seconds": position.seconds,
+            "learner_epoch": position.epoch,
+            "environment_steps": position.environment_steps,
+            "updates": position.updates,
+            "version": position.version,
+            "steps_per_second": window.environment_steps as f64 / seconds,
+            "updates_per_second": window.updates as f64 / seconds,
+            "unroll_age": per(window.age as f64, window.unrolls),
+            "episodes": window.episodes,
+            "diverged": window.diverged,
+            "episode_length": per(window.steps as f64, window.episodes),
+            "episode_return": per(total, window.episodes),
+            "reward_per_step": per(total, window.steps),
+            "normalised_reward": per(total / TRACKING_MAX_REWARD, window.possible_steps),
+            "fraction_survived": per(window.steps as f64, window.possible_steps),
+            "reward_terms": terms,
+            "losses": losses,
+            "books": books,
+        })
+        .to_string();
+        writeln!(self.file, "{line}").context("cannot write metrics.jsonl")?;
+        Ok(line)
+    }
+}

@@ -1,0 +1,87 @@
+//! The command line.
+
+use std::path::PathBuf;
+
+use anyhow::{Context as _, Result};
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use comic_experiment::{ClipSource, Experiment};
+
+/// Learns reusable motor skills from the experience that comic-actor processes stream to it.
+#[derive(Debug, Parser)]
+#[command(name = "comic-learner", version, about)]
+pub struct Options {
+    /// What else than serving.
+    #[command(subcommand)]
+    pub command: Option<Command>,
+    /// What to learn.
+    #[command(flatten)]
+    pub document: Document,
+    /// Port to serve on; 0 lets the system choose.
+    #[arg(long, default_value_t = 7070)]
+    pub port: u16,
+    /// Address to serve on.
+    #[arg(long, default_value = "0.0.0.0")]
+    pub address: std::net::IpAddr,
+    /// The run's directory: checkpoints, metrics.jsonl, the resolved experiment. A directory that holds checkpoints is
+    /// resumed.
+    #[arg(long, value_name = "DIR", default_value = "runs/default")]
+    pub run: PathBuf,
+    /// Print the resolved experiment and leave.
+    #[arg(long)]
+    pub print: bool,
+    /// Form of the log on stderr.
+    #[arg(long, value_enum, default_value_t = LogFormat::Text, global = true)]
+    pub log_format: LogFormat,
+}
+
+/// The experiment and what changes it.
+#[derive(Clone, Debug, Args)]
+pub struct Document {
+    /// A preset's name (quickstart, tracking-mlp) or the path of an experiment file.
+    #[arg(long, value_name = "NAME|FILE", default_value = "tracking-mlp", global = true)]
+    pub preset: String,
+    /// Clips to track instead of the experiment's: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP.
+    #[arg(long, value_name = "SOURCE", num_args = 1.., global = true)]
+    pub clips: Vec<String>,
+    /// Override any field, for instance --set vmpo.epsilon_eta=0.2.
+    #[arg(long = "set", value_name = "FIELD=VALUE", global = true)]
+    pub overrides: Vec<String>,
+}
+
+impl Document {
+    /// The resolved experiment.
+    ///
+    /// # Errors
+    /// Names the file, field and remedy.
+    pub fn resolve(&self) -> Result<Experiment> {
+        let mut experiment = comic_experiment::resolve(&self.preset, &self.overrides)
+            .with_context(|| format!("the experiment `{}` is not usable", self.preset))?;
+        if !self.clips.is_empty() {
+            experiment.clips = self.clips.iter().map(|source| ClipSource::parse(source)).collect();
+        }
+        Ok(experiment)
+    }
+}
+
+/// What else than serving.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Time the update against its bare matrix products; one JSON line per figure.
+    Bench {
+        /// libtorch's threads.
+        #[arg(long, default_value_t = 2)]
+        threads: usize,
+        /// Interleaved repeats, of which the median is taken.
+        #[arg(long, default_value_t = 15)]
+        repeats: usize,
+    },
+}
+
+/// Form of the log.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum LogFormat {
+    /// For a person.
+    Text,
+    /// One JSON object a line.
+    Json,
+}

@@ -1,0 +1,166 @@
+//! A learner's life: resume or begin, serve and train, end.
+
+use std::net::SocketAddr;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, anyhow, bail};
+use comic_clips::Catalogue;
+use comic_experiment::{Experiment, InitialPose, TaskSpec};
+use comic_proto::v1::Behaviour;
+use comic_proto::{UnrollLayout, UnrollShape};
+use comic_replay::{Batcher, Config, Ledger, Phase};
+use tokio::net::TcpListener;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::oneshot;
+
+use crate::checkpoint::{Snapshot, Store};
+use crate::options::Options;
+use crate::publish::Publisher;
+use crate::service::{self, Shared};
+use crate::trainer::{Ending, Setup, Trainer};
+
+/// How long actors are given to hear that the run is over.
+const FAREWELL: Duration = Duration::from_millis(1500);
+
+/// Serves and trains until the budget is used up or a signal comes. Prints one JSON line to stdout once it listens.
+///
+/// # Errors
+/// A wrong experiment, unusable clips, a run directory of another experiment, an address in use, a disk that refuses.
+pub fn run(options: &Options) -> Result<()> {
+    let experiment = options.document.resolve()?;
+    if options.print {
+        print!("{}", experiment.to_toml()?);
+        return Ok(());
+    }
+    tch::set_num_threads(experiment.learner.threads as i32);
+    let workers = std::thread::available_parallelism().map_or(2, usize::from).clamp(1, 4);
+    tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(workers)
+        .enable_all()
+        .build()
+        .context("cannot start tokio")?
+        .block_on(live(options, experiment))
+}
+
+async fn live(options: &Options, experiment: Experiment) -> Result<()> {
+    // Both signals count from the first moment on.
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
+    let address = SocketAddr::new(options.address, options.port);
+    let listener = TcpListener::bind(address)
+        .await
+        .with_context(|| format!("cannot listen on {address}: choose another --port, or 0 for any free one"))?;
+    let (setup, shared) = prepare(options, experiment)?;
+    let (batcher, publisher, epoch) = (setup.batcher.clone(), setup.publisher.clone(), setup.epoch);
+    let mut training = start_trainer(setup)?;
+    let (stop_serving, stopped) = oneshot::channel::<()>();
+    let address = listener.local_addr()?;
+    let serving = tokio::spawn(service::serve(listener, shared, async {
+        let _ = stopped.await;
+    }));
+    println!("{}", serde_json::json!({ "listening": address.to_string(), "learner_epoch": epoch, "run": options.run }));
+    tracing::info!(%address, epoch, run = %options.run.display(), "serving");
+    let ending = tokio::select! {
+        ending = &mut training => ending,
+        _ = interrupt.recv() => stop(&batcher, training).await,
+        _ = terminate.recv() => stop(&batcher, training).await,
+    };
+    if let Ok(Ok(Ending::Budget)) = &ending
+        && let Some(newest) = publisher.newest()
+    {
+        publisher.publish(newest.version, Behaviour::Leave, newest.payload.clone());
+        tokio::time::sleep(FAREWELL).await;
+    }
+    batcher.close();
+    let _ = stop_serving.send(());
+    serving.await.context("the server failed")??;
+    let ending = ending.context("the trainer's thread is gone")??;
+    tracing::info!(books = ?batcher.books(), "{}", match ending {
+        Ending::Budget => "the budget is used up",
+        Ending::Stopped => "stopped; start again with the same --run to go on",
+    });
+    Ok(())
+}
+
+type Training = oneshot::Receiver<Result<Ending>>;
+
+async fn stop(batcher: &Batcher, training: Training) -> Result<Result<Ending>, oneshot::error::RecvError> {
+    tracing::info!("stopping after this update; a checkpoint follows");
+    batcher.close();
+    training.await
+}
+
+fn start_trainer(setup: Setup) -> Result<Training> {
+    let (ended, training) = oneshot::channel();
+    std::thread::Builder::new()
+        .name("trainer".into())
+        .spawn(move || {
+            let ending = catch_unwind(AssertUnwindSafe(|| Trainer::new(setup)?.run()));
+            let _ = ended.send(ending.unwrap_or_else(|_| Err(anyhow!("the trainer panicked; the log says where"))));
+        })
+        .context("cannot start the trainer's thread")?;
+    Ok(training)
+}
+
+fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shared>)> {
+    let catalogue = Catalogue::open(&experiment.clips)?;
+    let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
+    let spec = TaskSpec::tracking(&experiment.task, names)
+        .map_err(|name| anyhow!("task.observations: the tracking task has no observation `{name}`"))?;
+    let pose = match experiment.network.initial_pose {
+        InitialPose::MidRange => vec![0.0; spec.action],
+        InitialPose::ReferenceMean => catalogue.mean_action()?.iter().map(|action| *action as f32).collect(),
+    };
+    let store = Store::open(&options.run, experiment.learner.checkpoints_kept)?;
+    let resume = store.newest()?;
+    if let Some((path, snapshot)) = &resume {
+        check_same_experiment(&experiment, snapshot)
+            .with_context(|| format!("{} cannot be resumed", options.run.display()))?;
+        tracing::info!(checkpoint = %path.display(), "resuming");
+    }
+    let resume = resume.map(|(_, snapshot)| snapshot);
+    let epoch = store.begin_life()?;
+    std::fs::write(options.run.join("experiment.toml"), experiment.to_toml()?)
+        .with_context(|| format!("cannot write into {}", options.run.display()))?;
+    let ledger = match &resume {
+        Some(snapshot) => Ledger::restore(&serde_json::from_slice(snapshot.part("books.json")?)?)?,
+        None => Ledger::new(),
+    };
+    let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
+    let config = Config { unrolls: experiment.unroll.batch, max_staleness: experiment.unroll.max_staleness };
+    let batcher = Batcher::new(layout, config, Phase { epoch, ..Phase::default() }, ledger);
+    let publisher = Publisher::new(epoch);
+    let shared = Shared::new(service::Setup {
+        experiment: experiment.clone(),
+        spec: spec.clone(),
+        assets: catalogue.assets()?,
+        batcher: batcher.clone(),
+        publisher: publisher.clone(),
+    })?;
+    let run = options.run.clone();
+    let setup =
+        Setup { experiment, spec, pose, run, epoch, resume, batcher, publisher, shared: shared.clone() };
+    Ok((setup, shared))
+}
+
+/// A run goes on only as the experiment it was; how long, how often and with how many threads may change.
+fn check_same_experiment(now: &Experiment, snapshot: &Snapshot) -> Result<()> {
+    let then = Experiment::from_toml("experiment.toml of the checkpoint", snapshot.text("experiment.toml")?)?;
+    let comparable = |experiment: &Experiment| {
+        let mut experiment = experiment.clone();
+        experiment.budget = then.budget.clone();
+        experiment.learner = then.learner.clone();
+        experiment.actor = then.actor.clone();
+        experiment.to_toml()
+    };
+    let (now, then) = (comparable(now)?, then.to_toml()?);
+    if let Some((new, old)) = now.lines().zip(then.lines()).find(|(new, old)| new != old) {
+        bail!("it was made with `{old}` where the experiment now says `{new}`: give another --run, or the old value");
+    }
+    if now != then {
+        bail!("it was made by an experiment with other clips or fields: give another --run");
+    }
+    Ok(())
+}

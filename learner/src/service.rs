@@ -1,0 +1,208 @@
+//! The learner as actors see it: gRPC over tokio.
+//!
+//! # Layout
+//! - [`Shared`] is what all calls have in common: the experiment, the batcher, the publisher.
+//! - [`serve`] is the server, up to its graceful end.
+//! - `calls` answers each call; `unrolls` and `assets` are the two streams with a life of their own, and
+//!   [`publish`](crate::publish) the third. `complaints` keeps the log readable when an actor sends rubbish.
+//!
+//! Streams are pulled: nothing is read from an actor until the unroll before it has a slot in a batch, so HTTP/2 flow
+//! control carries the batcher's back-pressure to the actor, and no queue lies in between.
+
+mod assets;
+mod calls;
+mod complaints;
+mod unrolls;
+
+use std::collections::VecDeque;
+use std::future::Future;
+use std::pin::pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, ensure};
+use comic_clips::Asset;
+use comic_experiment::{Experiment, TaskSpec};
+use comic_proto::UnrollShape;
+use comic_proto::v1::learner_server::LearnerServer;
+use comic_replay::Batcher;
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tonic::transport::Server;
+use tonic::transport::server::TcpIncoming;
+
+use crate::publish::Publisher;
+use calls::Calls;
+use complaints::Complaints;
+
+/// A peer that answers no ping for [`KEEPALIVE_TIMEOUT`] is gone; without pings a half-open one is never noticed.
+const KEEPALIVE: Duration = Duration::from_secs(15);
+/// See [`KEEPALIVE`].
+const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
+/// A call has to be answered, or its stream begun, in this time. A stream that has begun is not limited.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
+/// Bytes an unread stream may have under way: the memory a waiting actor costs the learner, with one unroll.
+const STREAM_WINDOW: u32 = 256 * 1024;
+/// Bytes an unread connection may have under way. Above the stream's, or a full unroll stream would stall every other
+/// call of its actor.
+const CONNECTION_WINDOW: u32 = 1024 * 1024;
+/// Streams a connection may have open; an actor needs three.
+const MAX_STREAMS: u32 = 64;
+/// The decoding limit when unrolls are smaller than that: a report on many clips is JSON of some hundred KB.
+const MIN_MESSAGE_LIMIT: usize = 1024 * 1024;
+/// Streams end themselves on the signal; a connection whose peer reads nothing is left behind after this time.
+const GRACE: Duration = Duration::from_secs(1);
+/// Evaluations that may wait for the trainer.
+const EVALUATIONS: usize = 16;
+
+/// What the service is made of.
+#[derive(Debug)]
+pub struct Setup {
+    /// The resolved experiment, handed to every actor.
+    pub experiment: Experiment,
+    /// The task's sizes and names, handed to every actor.
+    pub spec: TaskSpec,
+    /// Files actors may lack.
+    pub assets: Vec<Asset>,
+    /// Where unrolls go.
+    pub batcher: Batcher,
+    /// Where parameters come from; its epoch is the service's.
+    pub publisher: Publisher,
+}
+
+/// An evaluation that an actor reported.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Evaluation {
+    /// The life of the learner whose parameters were evaluated.
+    pub epoch: u64,
+    /// Their version.
+    pub version: u64,
+    /// As `comic-actor evaluate --json` prints it.
+    pub json: String,
+}
+
+/// What all calls, and the trainer, have in common.
+#[derive(Debug)]
+pub struct Shared {
+    experiment: String,
+    task_spec: String,
+    seed: u64,
+    clips: usize,
+    assets: Vec<Asset>,
+    batcher: Batcher,
+    publisher: Publisher,
+    metrics: Mutex<String>,
+    evaluations: Mutex<VecDeque<Evaluation>>,
+    complaints: Complaints,
+    closing: watch::Sender<bool>,
+}
+
+impl Shared {
+    /// Everything ready to serve.
+    ///
+    /// # Errors
+    /// When the batcher's layout or epoch are not those of the rest, or experiment or spec cannot be written as TOML.
+    pub fn new(setup: Setup) -> Result<Arc<Self>> {
+        let Setup { experiment, spec, assets, batcher, publisher } = setup;
+        let shape = UnrollShape::new(&spec, &experiment);
+        let found = *batcher.layout().shape();
+        ensure!(shape == found, "the batcher takes unrolls of {found:?}, the experiment makes {shape:?}");
+        let (epoch, found) = (publisher.epoch(), batcher.phase().epoch);
+        ensure!(epoch == found, "the batcher is in learner epoch {found}, the publisher in {epoch}");
+        Ok(Arc::new(Self {
+            task_spec: toml::to_string(&spec).context("the task's spec cannot be written as TOML")?,
+            seed: experiment.seed,
+            experiment: experiment.to_toml()?,
+            clips: spec.clips.len(),
+            assets,
+            batcher,
+            publisher,
+            metrics: Mutex::new(String::from("{}")),
+            evaluations: Mutex::new(VecDeque::new()),
+            complaints: Complaints::default(),
+            closing: watch::Sender::new(false),
+        }))
+    }
+
+    /// Replaces the metrics that `GetStatus` answers with, JSON.
+    pub fn set_metrics(&self, json: String) {
+        *lock(&self.metrics) = json;
+    }
+
+    /// Takes the evaluations reported since the last time, oldest first.
+    pub fn take_evaluations(&self) -> Vec<Evaluation> {
+        lock(&self.evaluations).drain(..).collect()
+    }
+
+    /// False when too many wait already.
+    fn keep_evaluation(&self, evaluation: Evaluation) -> bool {
+        let mut waiting = lock(&self.evaluations);
+        let room = waiting.len() < EVALUATIONS;
+        if room {
+            waiting.push_back(evaluation);
+        }
+        room
+    }
+
+    fn closing(&self) -> Closing {
+        Closing(self.closing.subscribe())
+    }
+}
+
+/// The signal on which streams end themselves.
+#[derive(Clone, Debug)]
+struct Closing(watch::Receiver<bool>);
+
+impl Closing {
+    /// Waits for the signal, for ever if need be. Cancel-safe.
+    async fn begun(&mut self) {
+        // An error means that `Shared` is gone, and the server with it.
+        let _ = self.0.wait_for(|closing| *closing).await;
+    }
+
+    fn has_begun(&self) -> bool {
+        *self.0.borrow()
+    }
+}
+
+/// Nothing panics while it holds one of these locks, and none guards more than one value.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Serves actors on this listener until `shutdown`, then ends every stream and returns, after a second at most.
+///
+/// `Shared` is served once: after `shutdown` its streams stay ended.
+///
+/// # Errors
+/// When the server cannot go on accepting connections.
+pub async fn serve(listener: TcpListener, shared: Arc<Shared>, shutdown: impl Future<Output = ()>) -> Result<()> {
+    let message_limit = shared.batcher.layout().message_limit().max(MIN_MESSAGE_LIMIT);
+    let calls = LearnerServer::new(Calls::new(shared.clone())).max_decoding_message_size(message_limit);
+    let mut closing = shared.closing();
+    let server = Server::builder()
+        .http2_keepalive_interval(Some(KEEPALIVE))
+        .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
+        .initial_stream_window_size(STREAM_WINDOW)
+        .initial_connection_window_size(CONNECTION_WINDOW)
+        .max_concurrent_streams(MAX_STREAMS)
+        .timeout(ANSWER_TIMEOUT)
+        .add_service(calls)
+        // The builder's own TCP settings do not reach a listener that is handed in.
+        .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), async move {
+            closing.begun().await;
+        });
+    let mut server = pin!(server);
+    tokio::select! {
+        served = &mut server => return served.context("the server stopped accepting connections"),
+        () = shutdown => {}
+    }
+    shared.closing.send_replace(true);
+    match tokio::time::timeout(GRACE, server).await {
+        Ok(served) => served.context("the server did not close cleanly"),
+        Err(_) => {
+            tracing::warn!("some actors did not read to the end of their streams; their connections are abandoned");
+            Ok(())
+        }
+    }
+}

@@ -1,0 +1,76 @@
+//! Files that actors lack.
+
+use std::fs::File;
+use std::os::unix::fs::FileExt as _;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use comic_clips::Asset;
+use comic_proto::v1::{self, AssetChunk};
+use futures::stream::{self, Stream};
+use tonic::Status;
+
+use super::{Closing, Shared};
+
+/// Bytes of a piece.
+const CHUNK: u64 = 256 * 1024;
+
+/// An asset as `Join` announces it.
+pub(super) fn described(asset: &Asset) -> v1::Asset {
+    v1::Asset { source: asset.source.clone(), sha256: asset.sha256.to_vec(), size: asset.size }
+}
+
+/// The asset with this hash, piece by piece, read as the actor takes it.
+pub(super) async fn open(
+    shared: &Shared,
+    sha256: &[u8],
+) -> Result<impl Stream<Item = Result<AssetChunk, Status>> + use<>, Status> {
+    let Some(asset) = shared.assets.iter().find(|asset| asset.sha256 == sha256).cloned() else {
+        let hash: String = sha256.iter().take(32).map(|byte| format!("{byte:02x}")).collect();
+        return Err(Status::not_found(format!("this learner has no asset with the SHA-256 {hash}")));
+    };
+    let path = asset.path.clone();
+    let file = blocking(move || File::open(path)).await.map_err(|error| unreadable(&asset, &error))?;
+    let reading = Reading { asset, file: Arc::new(file), offset: 0, closing: shared.closing() };
+    Ok(stream::try_unfold(reading, Reading::next))
+}
+
+struct Reading {
+    asset: Asset,
+    file: Arc<File>,
+    offset: u64,
+    closing: Closing,
+}
+
+impl Reading {
+    async fn next(mut self) -> Result<Option<(AssetChunk, Self)>, Status> {
+        let size = CHUNK.min(self.asset.size - self.offset);
+        if size == 0 {
+            return Ok(None);
+        }
+        if self.closing.has_begun() {
+            return Err(Status::unavailable("the learner is going down: fetch the asset again from the next one"));
+        }
+        let (file, offset) = (self.file.clone(), self.offset);
+        let data = blocking(move || {
+            let mut data = vec![0; size as usize];
+            file.read_exact_at(&mut data, offset)?;
+            Ok(Bytes::from(data))
+        })
+        .await
+        .map_err(|error| unreadable(&self.asset, &error))?;
+        self.offset += size;
+        Ok(Some((AssetChunk { data }, self)))
+    }
+}
+
+async fn blocking<T: Send + 'static>(
+    read: impl FnOnce() -> std::io::Result<T> + Send + 'static,
+) -> std::io::Result<T> {
+    tokio::task::spawn_blocking(read).await.unwrap_or_else(|stopped| Err(std::io::Error::other(stopped)))
+}
+
+fn unreadable(asset: &Asset, error: &std::io::Error) -> Status {
+    tracing::error!(asset = %asset.path.display(), %error, "asset cannot be read; did it change since the start?");
+    Status::data_loss(format!("the learner cannot read its asset {}: {error}", asset.source))
+}

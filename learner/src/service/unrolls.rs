@@ -1,0 +1,113 @@
+//! Unrolls up, acknowledgements down.
+
+use std::error::Error as _;
+use std::sync::Arc;
+
+use comic_proto::v1::{UnrollAck, UnrollHeader, UnrollMessage, Verdict};
+use comic_proto::{Expected, Invalid, validate};
+use comic_replay::Outcome;
+use tonic::{Code, Status, Streaming};
+
+use super::{Closing, Shared};
+
+/// One actor's stream. The next unroll is read when the acknowledgement of the last one has been taken, and that
+/// comes when the unroll has a slot in a batch.
+pub(super) struct UnrollStream {
+    shared: Arc<Shared>,
+    incoming: Streaming<UnrollMessage>,
+    closing: Closing,
+    over: bool,
+}
+
+impl UnrollStream {
+    pub(super) fn new(shared: Arc<Shared>, incoming: Streaming<UnrollMessage>) -> Self {
+        Self { closing: shared.closing(), shared, incoming, over: false }
+    }
+
+    /// Takes one unroll and answers it. `None` when the actor has no more, or the server closes; an unroll that was
+    /// not answered then is the actor's to send again.
+    pub(super) async fn next(mut self) -> Option<(Result<UnrollAck, Status>, Self)> {
+        if self.over {
+            return None;
+        }
+        let answer = tokio::select! {
+            biased;
+            () = self.closing.begun() => None,
+            // Giving this up half-way is safe: the batcher records nothing before it takes the unroll.
+            answer = answer(&self.shared, &mut self.incoming) => answer,
+        }?;
+        self.over = answer.is_err();
+        Some((answer, self))
+    }
+}
+
+async fn answer(shared: &Shared, incoming: &mut Streaming<UnrollMessage>) -> Option<Result<UnrollAck, Status>> {
+    match incoming.message().await {
+        Ok(Some(message)) => take(shared, message).await.transpose(),
+        Ok(None) => None,
+        Err(broken) => {
+            // Undecodable or too large; what has a source is a connection that broke, and costs nothing.
+            if broken.source().is_none() && matches!(broken.code(), Code::Internal | Code::OutOfRange) {
+                shared.batcher.refuse_unattributed();
+                tracing::warn!(reason = broken.message(), "unroll stream ended: not a message of this protocol");
+            }
+            Some(Err(broken))
+        }
+    }
+}
+
+/// Checks an unroll and puts it into a batch. `None` when the batcher is closed.
+async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAck>, Status> {
+    let UnrollMessage { header, payload } = message;
+    let Some(header) = header else {
+        shared.batcher.refuse_unattributed();
+        return Ok(Some(ack(0, Verdict::Invalid, Invalid::Header.to_string())));
+    };
+    let expected = Expected {
+        clips: shared.clips,
+        epoch: shared.publisher.epoch(),
+        newest_version: shared.publisher.newest_version(),
+    };
+    // An unroll of an earlier life of the learner may have had another layout: it is superseded, whatever it holds.
+    let earlier = header.learner_epoch < expected.epoch;
+    let valid = if earlier { Ok(()) } else { validate(shared.batcher.layout(), &header, &payload, &expected) };
+    let (outcome, invalid) = match valid {
+        Ok(()) => (shared.batcher.insert(&header, payload).await, None),
+        Err(invalid) => (shared.batcher.refuse_invalid(&header), Some(invalid)),
+    };
+    let sequence = header.sequence;
+    Ok(Some(match outcome {
+        Outcome::Taken => ack(sequence, Verdict::Taken, String::new()),
+        Outcome::Duplicate => ack(sequence, Verdict::Duplicate, String::new()),
+        Outcome::Superseded => ack(sequence, Verdict::Superseded, superseded(&header, shared)),
+        Outcome::Stale => {
+            let newest = shared.batcher.phase().version;
+            ack(sequence, Verdict::Stale, format!("version {} is too old, the newest is {newest}", header.version))
+        }
+        Outcome::Invalid => {
+            let reason = invalid.map_or_else(|| "its numbers fit no account".into(), |invalid| invalid.to_string());
+            shared.complaints.about(header.actor, sequence, &reason);
+            ack(sequence, Verdict::Invalid, reason)
+        }
+        Outcome::NotJoined => {
+            return Err(Status::failed_precondition(format!(
+                "actor {}, incarnation {:016x}, has no account with this learner: join first",
+                header.actor, header.incarnation
+            )));
+        }
+        Outcome::Closed => return Ok(None),
+    }))
+}
+
+fn superseded(header: &UnrollHeader, shared: &Shared) -> String {
+    let epoch = shared.publisher.epoch();
+    if header.learner_epoch != epoch {
+        return format!("made in learner epoch {}, this is {epoch}", header.learner_epoch);
+    }
+    let wanted = if shared.batcher.phase().demonstration { "demonstrations" } else { "the policy's own unrolls" };
+    format!("the learner wants {wanted} now")
+}
+
+fn ack(sequence: u64, verdict: Verdict, detail: String) -> UnrollAck {
+    UnrollAck { sequence, verdict: verdict.into(), detail }
+}

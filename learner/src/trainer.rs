@@ -1,0 +1,420 @@
+//! The trainer: one OS thread that owns the device. Batches in, parameters out.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Instant;
+
+use anyhow::{Context as _, Result, bail};
+use bytes::Bytes;
+use comic_experiment::{Experiment, TaskSpec};
+use comic_networks::{NormaliserStatistics, to_safetensors};
+use comic_proto::v1::Behaviour;
+use comic_proto::{Field, UnrollShape};
+use comic_replay::{Batch, Batcher, Next, Phase};
+use rand::SeedableRng as _;
+use rand::seq::SliceRandom as _;
+use rand_pcg::Pcg64;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+use tch::{Device, Tensor};
+
+use crate::checkpoint::{Name, Snapshot, Store};
+use crate::metrics::{Metrics, Position};
+use crate::publish::Publisher;
+use crate::service::Shared;
+use crate::statistics::Statistics;
+use crate::vmpo::{self, Losses, MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
+use crate::writer::Writer;
+
+/// How often a trainer without batches looks at the clock.
+const PATIENCE: std::time::Duration = std::time::Duration::from_millis(500);
+
+/// What a trainer is made of.
+#[derive(Debug)]
+pub struct Setup {
+    /// The resolved experiment.
+    pub experiment: Experiment,
+    /// The task's sizes and names.
+    pub spec: TaskSpec,
+    /// Where the policy's mean starts, `[A]`.
+    pub pose: Vec<f32>,
+    /// The run's directory.
+    pub run: PathBuf,
+    /// This life of the learner.
+    pub epoch: u64,
+    /// A checkpoint to go on from.
+    pub resume: Option<Snapshot>,
+    /// Where batches come from.
+    pub batcher: Batcher,
+    /// Where parameters go.
+    pub publisher: Publisher,
+    /// Where the newest metrics are shown.
+    pub shared: Arc<Shared>,
+}
+
+/// Why training ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ending {
+    /// The experiment's budget is used up.
+    Budget,
+    /// The batcher was closed: somebody asked the learner to stop.
+    Stopped,
+}
+
+/// Everything that counts, in checkpoints as `progress.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Progress {
+    updates: u64,
+    environment_steps: u64,
+    seconds: f64,
+    version: u64,
+    pub(crate) warm_started: bool,
+    /// Decides the minibatches.
+    pub(crate) random: Pcg64,
+}
+
+/// Learns from batches until the budget is used up or the batcher closed.
+#[derive(Debug)]
+pub struct Trainer {
+    pub(crate) experiment: Experiment,
+    spec: TaskSpec,
+    epoch: u64,
+    pub(crate) learner: VmpoLearner,
+    /// Of the observations, for the normaliser: proprioception and task.
+    statistics: [Statistics; 2],
+    /// The parameters actors act with, as published.
+    target: Bytes,
+    pub(crate) progress: Progress,
+    /// Since when this life counts time, and what had been counted then.
+    clock: Option<(Instant, f64)>,
+    losses: Map<String, Value>,
+    pub(crate) batcher: Batcher,
+    publisher: Publisher,
+    shared: Arc<Shared>,
+    metrics: Metrics,
+    pub(crate) writer: Writer,
+    checkpointed: Instant,
+}
+
+impl Trainer {
+    /// A trainer at its beginning, or where its checkpoint left it. Fresh runs write their `initial` checkpoint.
+    ///
+    /// # Errors
+    /// A checkpoint that does not fit the experiment; a disk that refuses.
+    pub fn new(setup: Setup) -> Result<Self> {
+        let Setup { experiment, spec, pose, run, epoch, resume, batcher, publisher, shared } = setup;
+        tch::manual_seed(experiment.seed as i64);
+        let learner = VmpoLearner::new(&spec, &experiment, &pose, Device::Cpu)?;
+        let store = Store::open(&run, experiment.learner.checkpoints_kept)?;
+        let mut trainer = Self {
+            statistics: [spec.proprioception, spec.task].map(|width| Statistics::new(width as i64)),
+            target: Bytes::from(to_safetensors(learner.policy_store())?),
+            progress: Progress {
+                updates: 0,
+                environment_steps: 0,
+                seconds: 0.0,
+                version: 0,
+                warm_started: experiment.warm_start.steps == 0,
+                random: Pcg64::seed_from_u64(experiment.seed),
+            },
+            clock: None,
+            losses: Map::new(),
+            metrics: Metrics::open(&run, &spec)?,
+            writer: Writer::start(store)?,
+            checkpointed: Instant::now(),
+            experiment,
+            spec,
+            epoch,
+            learner,
+            batcher,
+            publisher,
+            shared,
+        };
+        match resume {
+            Some(snapshot) => trainer.restore(&snapshot)?,
+            None => trainer.writer.write(Name::Initial, trainer.snapshot()?)?,
+        }
+        Ok(trainer)
+    }
+
+    /// Demonstrations and regression if the experiment wants them, then V-MPO, then a last checkpoint.
+    ///
+    /// # Errors
+    /// When a number is no longer finite, or the disk refuses.
+    pub fn run(mut self) -> Result<Ending> {
+        let ending = self.train()?;
+        self.write_metrics()?;
+        self.checkpoint(true)?;
+        self.writer.finish()?;
+        Ok(ending)
+    }
+
+    fn train(&mut self) -> Result<Ending> {
+        if !self.progress.warm_started && self.warm_start()?.is_none() {
+            return Ok(Ending::Stopped);
+        }
+        self.publish(Behaviour::Policy)?;
+        while !self.budget_used_up() {
+            match self.next_batch()? {
+                Wait::Batch(batch) => self.learn(batch)?,
+                Wait::Nothing => {}
+                Wait::Closed => return Ok(Ending::Stopped),
+            }
+        }
+        Ok(Ending::Budget)
+    }
+
+    /// One batch: gradient steps on it, its books, and new parameters when they are due.
+    fn learn(&mut self, batch: Batch) -> Result<()> {
+        let tensors = self.tensors(&batch)?;
+        if self.normalises_still() {
+            let unseen = self.statistics[0].count() == 0.0;
+            self.absorb(&batch);
+            self.set_normaliser()?;
+            if unseen {
+                // Numbers of any size would teach the networks nothing: the first batch only sets the scale.
+                self.book(batch);
+                return self.publish(Behaviour::Policy);
+            }
+        }
+        self.schedule_learning_rate();
+        let mut losses = Vec::new();
+        for minibatch in self.minibatches(&tensors) {
+            losses.push(self.learner.step(&minibatch)?);
+        }
+        if let Some(losses) = Losses::mean(&losses) {
+            self.report(&losses.to_metrics())?;
+        }
+        self.progress.updates += 1;
+        self.book(batch);
+        if self.progress.updates.is_multiple_of(self.experiment.vmpo.target_period) {
+            self.publish(Behaviour::Policy)?;
+        }
+        self.after_update()
+    }
+}
+
+/// What waiting for a batch led to.
+pub(crate) enum Wait {
+    Batch(Batch),
+    Nothing,
+    Closed,
+}
+
+impl Trainer {
+    pub(crate) fn next_batch(&mut self) -> Result<Wait> {
+        let next = self.batcher.next_batch_within(PATIENCE);
+        if self.metrics.elapsed() >= self.experiment.learner.metrics_seconds {
+            self.write_metrics()?;
+        }
+        Ok(match next {
+            Next::Batch(batch) => {
+                let seconds = self.progress.seconds;
+                self.clock.get_or_insert_with(|| (Instant::now(), seconds));
+                Wait::Batch(batch)
+            }
+            Next::Elapsed => Wait::Nothing,
+            Next::Closed => Wait::Closed,
+        })
+    }
+
+    /// The batch on the device, `[B, T(+1), …]`.
+    pub(crate) fn tensors(&self, batch: &Batch) -> Result<MinibatchTensors> {
+        let UnrollShape { length, proprioception, task, action, latent, reward_terms } = *batch.layout.shape();
+        let shape =
+            MinibatchShape { unrolls: batch.unrolls, length, proprioception, task, action, latent, reward_terms };
+        let source = MinibatchSource {
+            proprioception: batch.f32(Field::Proprioception),
+            task: batch.f32(Field::Task),
+            previous_latent: batch.f32(Field::PreviousLatent),
+            latent_noise: batch.f32(Field::LatentNoise),
+            action: batch.f32(Field::Action),
+            mean: batch.f32(Field::Mean),
+            std: batch.f32(Field::Std),
+            reward: batch.f32(Field::Reward),
+            discount: batch.f32(Field::Discount),
+            valid: batch.f32(Field::Valid),
+            first: batch.f32(Field::First),
+            clip: batch.clip(),
+        };
+        Ok(MinibatchTensors::new(&source, &shape, self.learner.device())?)
+    }
+
+    /// The gradient steps' minibatches: every unroll once before any comes again.
+    fn minibatches<'a>(
+        &mut self,
+        tensors: &'a MinibatchTensors,
+    ) -> impl Iterator<Item = MinibatchTensors> + use<'a> {
+        let unrolls = self.experiment.unroll.batch;
+        let size = self.experiment.vmpo.minibatch_unrolls;
+        let steps = self.experiment.vmpo.gradient_steps;
+        let mut order: Vec<i64> = Vec::new();
+        while order.len() < steps * size {
+            let mut pass: Vec<i64> = (0..unrolls as i64).collect();
+            // With the whole batch in each step, order means nothing; keep it, so that sums are those of the batch.
+            if size < unrolls {
+                pass.shuffle(&mut self.progress.random);
+            }
+            order.extend(pass);
+        }
+        (0..steps).map(move |step| tensors.select(&Tensor::from_slice(&order[step * size..(step + 1) * size])))
+    }
+
+    /// Counts a batch's steps and episodes, and gives its memory back.
+    pub(crate) fn book(&mut self, batch: Batch) {
+        let steps = batch.f32(Field::Valid).iter().filter(|valid| **valid > 0.5).count() as u64;
+        self.progress.environment_steps += steps;
+        self.metrics.absorb(batch.headers(), steps, self.progress.version);
+        self.batcher.trained(batch);
+    }
+
+    /// Publishes the online policy as the next version: from now on it is the target network, with which actors act.
+    pub(crate) fn publish(&mut self, behaviour: Behaviour) -> Result<()> {
+        self.target = Bytes::from(to_safetensors(self.learner.policy_store())?);
+        self.progress.version += 1;
+        let version = self.progress.version;
+        let demonstration = behaviour == Behaviour::Demonstrate;
+        self.batcher.set_phase(Phase { epoch: self.epoch, version, demonstration });
+        self.publisher.publish(version, behaviour, self.target.clone());
+        Ok(())
+    }
+
+    fn normalises_still(&self) -> bool {
+        // A count of rows, not of steps: the difference is one row in an unroll.
+        self.statistics[0].count() < self.experiment.network.normaliser_steps as f64
+    }
+
+    pub(crate) fn absorb(&mut self, batch: &Batch) {
+        for (statistics, field) in self.statistics.iter_mut().zip([Field::Proprioception, Field::Task]) {
+            statistics.absorb(&Tensor::from_slice(batch.f32(field)));
+        }
+    }
+
+    pub(crate) fn set_normaliser(&mut self) -> Result<()> {
+        let floats = |tensor: Tensor| Vec::<f32>::try_from(tensor).context("cannot read the statistics");
+        let [proprioception, task] = &self.statistics;
+        let ((proprioception_mean, proprioception_std), (task_mean, task_std)) =
+            (proprioception.mean_and_std(), task.mean_and_std());
+        Ok(self.learner.set_normaliser(&NormaliserStatistics {
+            proprioception_mean: floats(proprioception_mean)?,
+            proprioception_std: floats(proprioception_std)?,
+            task_mean: floats(task_mean)?,
+            task_std: floats(task_std)?,
+        })?)
+    }
+
+    /// Keeps the newest losses for the metrics, and refuses to go on with numbers that are none.
+    pub(crate) fn report(&mut self, losses: &vmpo::Metrics) -> Result<()> {
+        if !losses.is_finite() {
+            bail!(
+                "update {}: a loss is not finite ({losses:?}); the last checkpoint is from before, a lower learning \
+                 rate or vmpo.epsilon_mean is the usual remedy",
+                self.progress.updates
+            );
+        }
+        self.losses = losses.entries().into_iter().map(|(name, value)| (name.to_string(), json!(value))).collect();
+        Ok(())
+    }
+
+    fn seconds(&self) -> f64 {
+        self.clock.map_or(self.progress.seconds, |(start, before)| before + start.elapsed().as_secs_f64())
+    }
+
+    /// Share of the budget that is used up, by whichever limit is nearest.
+    fn share_used(&self) -> f64 {
+        let budget = &self.experiment.budget;
+        [
+            (self.seconds() / 60.0, budget.minutes),
+            (self.progress.environment_steps as f64, budget.environment_steps as f64),
+            (self.progress.updates as f64, budget.updates as f64),
+        ]
+        .into_iter()
+        .filter(|(_, limit)| *limit > 0.0)
+        .map(|(used, limit)| used / limit)
+        .fold(0.0, f64::max)
+    }
+
+    fn budget_used_up(&self) -> bool {
+        self.share_used() >= 1.0
+    }
+
+    fn schedule_learning_rate(&mut self) {
+        let optimiser = &self.experiment.optimiser;
+        let share = 1.0 - (1.0 - optimiser.final_learning_rate_share) * self.share_used().min(1.0);
+        self.learner.set_learning_rates(optimiser.learning_rate * share, optimiser.multiplier_learning_rate);
+    }
+
+    pub(crate) fn after_update(&mut self) -> Result<()> {
+        if self.metrics.elapsed() >= self.experiment.learner.metrics_seconds {
+            self.write_metrics()?;
+        }
+        if self.checkpointed.elapsed().as_secs_f64() >= self.experiment.learner.checkpoint_seconds {
+            self.checkpoint(false)?;
+        }
+        Ok(())
+    }
+
+    fn write_metrics(&mut self) -> Result<()> {
+        let position = Position {
+            seconds: self.seconds(),
+            environment_steps: self.progress.environment_steps,
+            updates: self.progress.updates,
+            version: self.progress.version,
+            epoch: self.epoch,
+        };
+        let books = serde_json::to_value(self.batcher.books())?;
+        let line = self.metrics.write(position, books, self.losses.clone())?;
+        tracing::info!(target: "metrics", "{line}");
+        self.shared.set_metrics(line);
+        Ok(())
+    }
+
+    /// Hands a snapshot to the writer; while it is still busy with the last one, only a `final_one` waits.
+    fn checkpoint(&mut self, final_one: bool) -> Result<()> {
+        if !final_one && self.writer.is_busy() {
+            return Ok(());
+        }
+        self.writer.write(Name::Updates(self.progress.updates), self.snapshot()?)?;
+        self.checkpointed = Instant::now();
+        Ok(())
+    }
+
+    pub(crate) fn snapshot(&self) -> Result<Snapshot> {
+        let mut tensors = self.learner.state();
+        for (statistics, name) in self.statistics.iter().zip(STATISTICS) {
+            tensors.extend(statistics.state(name));
+        }
+        let progress = Progress { seconds: self.seconds(), ..self.progress.clone() };
+        let mut snapshot = Snapshot::default();
+        for (name, bytes) in [
+            ("experiment.toml", self.experiment.to_toml()?.into_bytes()),
+            ("task.json", serde_json::to_vec_pretty(&self.spec)?),
+            ("policy.safetensors", to_safetensors(self.learner.policy_store())?),
+            ("target.safetensors", self.target.to_vec()),
+            ("learner.safetensors", crate::tensors::to_bytes(&tensors)?),
+            ("progress.json", serde_json::to_vec_pretty(&progress)?),
+            ("books.json", serde_json::to_vec_pretty(&self.batcher.snapshot())?),
+        ] {
+            snapshot.parts.insert(name.to_string(), bytes);
+        }
+        Ok(snapshot)
+    }
+
+    fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let mut tensors = crate::tensors::from_bytes(snapshot.part("learner.safetensors")?)?;
+        for (statistics, name) in self.statistics.iter_mut().zip(STATISTICS) {
+            let find = |wanted: &str| tensors.iter().find(|(name, _)| name == wanted).map(|(_, tensor)| tensor.copy());
+            statistics.restore(name, find).with_context(|| format!("the checkpoint's {name} do not fit the task"))?;
+        }
+        tensors.retain(|(name, _)| !STATISTICS.iter().any(|prefix| name.starts_with(prefix)));
+        self.learner.load_state(&tensors).context("the checkpoint does not fit the experiment's networks")?;
+        self.target = Bytes::copy_from_slice(snapshot.part("target.safetensors")?);
+        self.progress =
+            serde_json::from_slice(snapshot.part("progress.json")?).context("the checkpoint's progress is damaged")?;
+        Ok(())
+    }
+}
+
+/// The statistics' names in a checkpoint.
+const STATISTICS: [&str; 2] = ["statistics.proprioception", "statistics.task"];

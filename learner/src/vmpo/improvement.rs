@@ -1,0 +1,120 @@
+//! The policy improvement losses.
+
+use comic_experiment::Vmpo;
+use tch::{Kind, Tensor};
+
+use super::Multipliers;
+
+/// What the losses are made of: one number a step, every tensor of the same shape.
+#[derive(Debug)]
+pub struct Evidence<'a> {
+    /// ln π(a|s), of the unclipped action, under the current parameters.
+    pub log_prob: &'a Tensor,
+    /// A, without gradient.
+    pub advantage: &'a Tensor,
+    /// KL_μ to the behaviour policy, summed over dimensions.
+    pub kl_mean: &'a Tensor,
+    /// KL_Σ to the behaviour policy, summed over dimensions.
+    pub kl_std: &'a Tensor,
+    /// 1 where the step is a transition; a step with 0 has no influence, whatever its other numbers are.
+    pub valid: &'a Tensor,
+}
+
+/// V-MPO's limits.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Limits {
+    /// ε_η.
+    pub epsilon_eta: f64,
+    /// ε_μ.
+    pub epsilon_mean: f64,
+    /// ε_Σ.
+    pub epsilon_std: f64,
+    /// Share of the valid steps in D̃.
+    pub top_fraction: f64,
+}
+
+impl From<&Vmpo> for Limits {
+    fn from(config: &Vmpo) -> Self {
+        Self {
+            epsilon_eta: config.epsilon_eta,
+            epsilon_mean: config.epsilon_mean,
+            epsilon_std: config.epsilon_std,
+            top_fraction: config.top_fraction,
+        }
+    }
+}
+
+/// The losses, scalars that carry gradient, and the mean KLs they were made from.
+#[derive(Debug)]
+pub struct Improvement {
+    /// L_π.
+    pub policy: Tensor,
+    /// L_η.
+    pub temperature: Tensor,
+    /// L_α, both constraints: the multipliers' own loss and the penalty on the policy.
+    pub alpha: Tensor,
+    /// Mean KL_μ over the valid steps, without gradient.
+    pub kl_mean: Tensor,
+    /// Mean KL_Σ over the valid steps, without gradient.
+    pub kl_std: Tensor,
+}
+
+impl Improvement {
+    /// L_π + L_η + L_α.
+    pub fn total(&self) -> Tensor {
+        &self.policy + &self.temperature + &self.alpha
+    }
+}
+
+/// L_π, L_η and L_α.
+///
+/// - D̃ holds the ⌊`top_fraction` · valid steps⌋ (at least one) largest advantages of the valid steps, and steps that tie
+///   with the smallest of them, so that the order of the batch does not matter.
+/// - L_π = −Σ_{D̃} ψ ln π(a|s), ψ = softmax over D̃ of A/η, without gradient.
+/// - L_η = η ε_η + η ln(1/|D̃| Σ_{D̃} exp(A/η)).
+/// - L_α = Σ_k α_k (ε_k − sg KL_k) + sg(α_k) KL_k, KL_k the mean over all valid steps.
+pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits: &Limits) -> Improvement {
+    let mask = evidence.valid.gt(0.5);
+    let (policy, temperature) = expectation_step(evidence, &mask, &multipliers.temperature(), limits);
+    let kl_mean = masked_mean(evidence.kl_mean, evidence.valid);
+    let kl_std = masked_mean(evidence.kl_std, evidence.valid);
+    let alpha = constraint(&kl_mean, &multipliers.alpha_mean(), limits.epsilon_mean)
+        + constraint(&kl_std, &multipliers.alpha_std(), limits.epsilon_std);
+    Improvement { policy, temperature, alpha, kl_mean: kl_mean.detach(), kl_std: kl_std.detach() }
+}
+
+fn expectation_step(evidence: &Evidence, mask: &Tensor, eta: &Tensor, limits: &Limits) -> (Tensor, Tensor) {
+    let advantage = evidence.advantage.detach();
+    let selected = top(&advantage, mask, limits.top_fraction);
+    let scaled = &advantage / eta;
+    // Subtracting the maximum is what makes this a log-sum-exp. It is 0 only where no step is valid.
+    let maximum = scaled.detach().where_scalarother(&selected, f64::NEG_INFINITY).max();
+    let maximum = maximum.where_scalarother(&maximum.isfinite(), 0.0);
+    let exponentials = (&scaled - &maximum).where_scalarother(&selected, f64::NEG_INFINITY).exp();
+    // The largest term is exp(0), so the floor binds only where no step is valid.
+    let sum = exponentials.sum(Kind::Float).clamp_min(1.0);
+    let count = selected.sum(Kind::Float).clamp_min(1.0);
+    let temperature = eta * (sum.log() + &maximum - count.log() + limits.epsilon_eta);
+    let weights = (&exponentials / &sum).detach();
+    let log_prob = evidence.log_prob.where_scalarother(&selected, 0.0);
+    (-(weights * log_prob).sum(Kind::Float), temperature)
+}
+
+/// The mask of D̃, by a threshold: no shape depends on how many steps are valid.
+fn top(advantage: &Tensor, mask: &Tensor, fraction: f64) -> Tensor {
+    let candidates = advantage.where_scalarother(mask, f64::NEG_INFINITY).flatten(0, -1);
+    let (sorted, _) = candidates.sort(0, true);
+    // A scalar in double precision, so that ⌊fraction · n⌋ is what the same product gives elsewhere.
+    let rank = (mask.sum(Kind::Double) * fraction).floor().clamp_min(1.0).to_kind(Kind::Int64) - 1;
+    let threshold = sorted.index_select(0, &rank.reshape([1]));
+    advantage.ge_tensor(&threshold).logical_and(mask)
+}
+
+fn constraint(kl: &Tensor, alpha: &Tensor, epsilon: f64) -> Tensor {
+    alpha * (epsilon - kl.detach()) + alpha.detach() * kl
+}
+
+/// The mean of `values` over the steps where `valid` is 1; 0 where there is none.
+pub fn masked_mean(values: &Tensor, valid: &Tensor) -> Tensor {
+    values.where_scalarother(&valid.gt(0.5), 0.0).sum(Kind::Float) / valid.sum(Kind::Float).clamp_min(1.0)
+}

@@ -1,0 +1,371 @@
+//! Networks, multipliers and optimiser, stepped together.
+
+use comic_experiment::{Experiment, Network, Optimiser, Prior, TaskSpec, Vmpo};
+use comic_networks::{Acting, DiagonalGaussian, NormaliserStatistics, Policy, Value};
+use tch::{Device, Kind, Tensor, nn};
+
+use super::{
+    Evidence, Improvement, Limits, Losses, MinibatchShape, MinibatchTensors, Multipliers, masked_mean,
+    policy_improvement, returns,
+};
+use crate::adam::{self, Adam, StateError};
+
+/// Errors of the learner.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A field of a batch has the wrong length.
+    #[error("batch field `{field}` has {found} elements where its shape needs {expected}")]
+    Length {
+        /// The field's name.
+        field: &'static str,
+        /// Elements needed.
+        expected: usize,
+        /// Elements found.
+        found: usize,
+    },
+    /// A batch that was made for another task or network.
+    #[error("batch is {found:?} with clips below {clips} where the networks take {expected:?} and {known} clips")]
+    Shape {
+        /// The networks' sizes; unrolls and length are the batch's own.
+        expected: MinibatchShape,
+        /// The batch's sizes.
+        found: MinibatchShape,
+        /// One more than the largest clip index of the batch.
+        clips: usize,
+        /// Clips the value function knows.
+        known: usize,
+    },
+    /// The networks refused their parameters or sizes.
+    #[error(transparent)]
+    Networks(#[from] comic_networks::Error),
+    /// The state does not fit.
+    #[error(transparent)]
+    State(#[from] StateError),
+    /// libtorch refused an operation.
+    #[error("libtorch: {0}")]
+    Torch(#[from] tch::TchError),
+}
+
+/// The online networks, the multipliers and Adam.
+///
+/// Nothing here is random after construction: the latent's noise comes with the unrolls. So state and minibatches decide
+/// every later parameter, bit for bit on a CPU with the same number of threads.
+#[derive(Debug)]
+pub struct VmpoLearner {
+    spec: TaskSpec,
+    network: Network,
+    vmpo: Vmpo,
+    optimiser: Optimiser,
+    limits: Limits,
+    policy_store: nn::VarStore,
+    value_store: nn::VarStore,
+    policy: Policy,
+    value: Value,
+    multipliers: Multipliers,
+    adam: Adam,
+    networks_group: usize,
+    multipliers_group: usize,
+}
+
+/// One forward pass over a minibatch; N = B·T rows.
+struct Pass {
+    acting: Acting,
+    /// N(stored mean, stored std), over `[N, A]`.
+    behaviour: DiagonalGaussian,
+    /// V(s_t), `[N, R]`, with gradient.
+    values: Tensor,
+    /// G_t, `[N, R]`.
+    targets: Tensor,
+    /// `[N]`.
+    valid: Tensor,
+    /// ½ mean (V − G)², summed over the reward terms.
+    value_loss: Tensor,
+    /// Mean KL to the prior, nats a step.
+    latent_kl: Tensor,
+}
+
+impl VmpoLearner {
+    /// New networks on `device`, from libtorch's generator: call `tch::manual_seed` first. `pose` is the action at which
+    /// the policy's mean starts, A entries.
+    ///
+    /// # Errors
+    /// [`Error::Networks`] when `pose` is no action of this task.
+    pub fn new(spec: &TaskSpec, experiment: &Experiment, pose: &[f32], device: Device) -> Result<Self, Error> {
+        let Experiment { network, vmpo, optimiser, .. } = experiment;
+        let policy_store = nn::VarStore::new(device);
+        let value_store = nn::VarStore::new(device);
+        let policy = Policy::new(&policy_store.root(), spec, network, pose)?;
+        let value = Value::new(&value_store.root(), spec, network);
+        let multipliers = Multipliers::initial(vmpo, device);
+        let mut adam = Adam::new(optimiser);
+        let mut parameters = trainable("policy", &policy_store);
+        parameters.extend(trainable("value", &value_store));
+        let networks_group = adam.add_group("networks", parameters, optimiser.learning_rate);
+        let multiplier = vec![("multipliers".to_string(), multipliers.parameter().shallow_clone())];
+        let multipliers_group = adam.add_group("multipliers", multiplier, optimiser.multiplier_learning_rate);
+        Ok(Self {
+            spec: spec.clone(),
+            network: network.clone(),
+            vmpo: vmpo.clone(),
+            optimiser: optimiser.clone(),
+            limits: Limits::from(vmpo),
+            policy_store,
+            value_store,
+            policy,
+            value,
+            multipliers,
+            adam,
+            networks_group,
+            multipliers_group,
+        })
+    }
+
+    /// The online policy's parameters: what actors need.
+    pub fn policy_store(&self) -> &nn::VarStore {
+        &self.policy_store
+    }
+
+    /// The online policy.
+    pub fn policy(&self) -> &Policy {
+        &self.policy
+    }
+
+    /// η, α_μ, α_Σ.
+    pub fn multipliers(&self) -> &Multipliers {
+        &self.multipliers
+    }
+
+    /// The device everything lives on.
+    pub fn device(&self) -> Device {
+        self.policy_store.device()
+    }
+
+    /// Fixes the statistics by which observations are normalised.
+    ///
+    /// # Errors
+    /// [`Error::Networks`] when they do not fit the task.
+    pub fn set_normaliser(&mut self, statistics: &NormaliserStatistics) -> Result<(), Error> {
+        Ok(self.policy.set_normaliser(statistics)?)
+    }
+
+    /// Sets the learning rates of the networks and of the multipliers, until they are set again.
+    pub fn set_learning_rates(&mut self, networks: f64, multipliers: f64) {
+        self.adam.set_learning_rate(self.networks_group, networks);
+        self.adam.set_learning_rate(self.multipliers_group, multipliers);
+    }
+
+    /// Forgets Adam's moments, as between a warm start and V-MPO.
+    pub fn reset_optimiser(&mut self) {
+        self.adam.reset();
+    }
+
+    /// One gradient step of V-MPO.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] when the minibatch is another task's; nothing is changed then.
+    pub fn step(&mut self, minibatch: &MinibatchTensors) -> Result<Losses, Error> {
+        self.check(minibatch)?;
+        let pass = self.forward(minibatch);
+        let advantage = (&pass.targets - pass.values.detach()).sum_dim_intlist(-1i64, false, Kind::Float);
+        let action = rows(&minibatch.action);
+        let evidence = Evidence {
+            log_prob: &pass.acting.action.log_prob(&action),
+            advantage: &advantage,
+            kl_mean: &pass.acting.action.kl_mean(&pass.behaviour),
+            kl_std: &pass.acting.action.kl_std(&pass.behaviour),
+            valid: &pass.valid,
+        };
+        let improvement = policy_improvement(&evidence, &self.multipliers, &self.limits);
+        let mut total = improvement.total()
+            + &pass.value_loss * self.vmpo.value_weight
+            + &pass.latent_kl * self.network.latent.beta;
+        if self.vmpo.entropy != 0.0 {
+            total = total - masked_mean(&pass.acting.action.entropy(), &pass.valid) * self.vmpo.entropy;
+        }
+        let networks = self.adam.parameters(self.networks_group);
+        let inputs: Vec<&Tensor> = networks.iter().chain([self.multipliers.parameter()]).collect();
+        let mut gradients = Tensor::f_run_backward(&[&total], &inputs, false, false)?;
+        let multipliers = gradients.split_off(networks.len());
+        let norm = self.descend(gradients);
+        self.adam.step(self.multipliers_group, &multipliers);
+        self.multipliers.project();
+        Ok(self.report(&total, &pass, Some(&improvement), None, &norm))
+    }
+
+    /// One gradient step of the warm start: the policy's mean towards the stored mean,
+    /// mean over valid steps of Σ ½ ((μ_θ − μ_stored) / initial_std)², with β times the latent's KL; the value function
+    /// as in [`VmpoLearner::step`]. The policy's standard deviation gets no gradient. Returns the report and the latents
+    /// z_t, `[B, T, Z]`, with which [`MinibatchTensors::refresh_previous_latent`] keeps the demonstrations' z_{t−1}
+    /// those of this encoder.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] when the minibatch is another task's; nothing is changed then.
+    pub fn regress(&mut self, minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error> {
+        self.check(minibatch)?;
+        let pass = self.forward(minibatch);
+        let deviation = (&pass.acting.action.mean - &pass.behaviour.mean) / self.network.initial_std;
+        let squares = deviation.square().sum_dim_intlist(-1i64, false, Kind::Float) * 0.5;
+        let regression = masked_mean(&squares, &pass.valid);
+        let total = &regression
+            + &pass.value_loss * self.vmpo.value_weight
+            + &pass.latent_kl * self.network.latent.beta;
+        let gradients = Tensor::f_run_backward(&[&total], self.adam.parameters(self.networks_group), false, false)?;
+        let norm = self.descend(gradients);
+        let shape = minibatch.shape();
+        let latents = pass.acting.latent.detach().reshape([shape.unrolls as i64, shape.length as i64, -1]);
+        let losses = self.report(&total, &pass, None, Some(&regression), &norm);
+        Ok((losses, latents))
+    }
+
+    /// Everything that changes future steps, by name: both networks, the multipliers and Adam. The tensors are copies on
+    /// the CPU, so another thread can write them while the next step runs.
+    pub fn state(&self) -> Vec<(String, Tensor)> {
+        self.entries().into_iter().map(|(name, tensor)| (name, tensor.detach().to_device(Device::Cpu).copy())).collect()
+    }
+
+    /// Restores what [`VmpoLearner::state`] gave.
+    ///
+    /// # Errors
+    /// [`Error::State`] when names, shapes or element types differ; nothing is changed then.
+    pub fn load_state(&mut self, state: &[(String, Tensor)]) -> Result<(), Error> {
+        Ok(adam::restore(self.entries(), state)?)
+    }
+
+    fn entries(&self) -> Vec<(String, Tensor)> {
+        let mut entries = named("policy", &self.policy_store);
+        entries.extend(named("value", &self.value_store));
+        entries.push(("multipliers".to_string(), self.multipliers.parameter().shallow_clone()));
+        entries.extend(self.adam.entries());
+        entries
+    }
+
+    fn check(&self, minibatch: &MinibatchTensors) -> Result<(), Error> {
+        let found = minibatch.shape();
+        let expected = MinibatchShape {
+            unrolls: found.unrolls,
+            length: found.length,
+            proprioception: self.spec.proprioception,
+            task: self.spec.task,
+            action: self.spec.action,
+            latent: self.network.latent.size,
+            reward_terms: self.spec.reward_terms.len(),
+        };
+        let known = self.spec.clips.len();
+        if found == expected && minibatch.clips <= known {
+            return Ok(());
+        }
+        Err(Error::Shape { expected, found, clips: minibatch.clips, known })
+    }
+
+    fn forward(&self, minibatch: &MinibatchTensors) -> Pass {
+        let shape = minibatch.shape();
+        let (unrolls, length) = (shape.unrolls as i64, shape.length as i64);
+        let observation = self.policy.normalise(&minibatch.proprioception, &minibatch.task);
+        let values = self.value.forward(&observation, &minibatch.clip).reshape([unrolls, length + 1, -1]);
+        let acting = self.policy.act_normalised(
+            &observation.first_steps(length),
+            &minibatch.previous_latent,
+            &minibatch.latent_noise,
+        );
+        let MinibatchTensors { reward, discount, valid, first, .. } = minibatch;
+        let targets = returns(reward, discount, valid, &values, self.vmpo.discount, self.vmpo.lambda);
+        let (targets, values) = (rows(&targets), rows(&values.narrow(1, 0, length)));
+        let valid = valid.reshape([-1]);
+        let errors = (&values - &targets).square().sum_dim_intlist(-1i64, false, Kind::Float) * 0.5;
+        let first = first.narrow(1, 0, length).reshape([-1]);
+        let prior: &Prior = &self.network.latent.prior;
+        let latent_kl = acting.latent_posterior.kl_to_prior(prior, &rows(&minibatch.previous_latent), &first);
+        Pass {
+            behaviour: DiagonalGaussian { mean: rows(&minibatch.mean), std: rows(&minibatch.std) },
+            value_loss: masked_mean(&errors, &valid),
+            latent_kl: masked_mean(&latent_kl, &valid),
+            acting,
+            values,
+            targets,
+            valid,
+        }
+    }
+
+    /// Clips where asked to, steps the networks and returns the gradient's norm before clipping.
+    fn descend(&mut self, mut gradients: Vec<Tensor>) -> Tensor {
+        // A parameter that a loss does not reach has no gradient at all.
+        for (gradient, parameter) in gradients.iter_mut().zip(self.adam.parameters(self.networks_group)) {
+            if !gradient.defined() {
+                *gradient = parameter.detach().zeros_like();
+            }
+        }
+        let norm = adam::global_norm(&gradients);
+        if self.optimiser.max_gradient_norm > 0.0 {
+            adam::clip_by_global_norm(&mut gradients, &norm, self.optimiser.max_gradient_norm);
+        }
+        self.adam.step(self.networks_group, &gradients);
+        norm
+    }
+
+    /// Packs the report of a V-MPO step (`improvement`) or of a regression step (`regression`).
+    fn report(
+        &self,
+        total: &Tensor,
+        pass: &Pass,
+        improvement: Option<&Improvement>,
+        regression: Option<&Tensor>,
+        norm: &Tensor,
+    ) -> Losses {
+        tch::no_grad(|| {
+            let zero = Tensor::zeros([1], (Kind::Float, self.device()));
+            let of = |entry: fn(&Improvement) -> &Tensor| improvement.map_or(&zero, entry);
+            let [temperature, alpha_mean, alpha_std] =
+                [self.multipliers.temperature(), self.multipliers.alpha_mean(), self.multipliers.alpha_std()];
+            let std = pass.acting.action.std.mean_dim(-1i64, false, Kind::Float);
+            Losses::pack([
+                total,
+                of(|improvement| &improvement.policy),
+                of(|improvement| &improvement.temperature),
+                of(|improvement| &improvement.alpha),
+                &pass.value_loss,
+                regression.unwrap_or(&zero),
+                &pass.latent_kl,
+                of(|improvement| &improvement.kl_mean),
+                of(|improvement| &improvement.kl_std),
+                &temperature,
+                &alpha_mean,
+                &alpha_std,
+                &masked_mean(&std, &pass.valid),
+                norm,
+                &variance_explained(pass),
+                &pass.valid.mean(Kind::Float),
+            ])
+        })
+    }
+}
+
+/// 1 − Var(G − V) / Var(G) over the valid steps, of the return summed over its terms.
+fn variance_explained(pass: &Pass) -> Tensor {
+    let variance = |terms: &Tensor| {
+        let total = terms.sum_dim_intlist(-1i64, false, Kind::Float);
+        let mean = masked_mean(&total, &pass.valid);
+        masked_mean(&(total - mean).square(), &pass.valid)
+    };
+    let unexplained = variance(&(&pass.targets - &pass.values));
+    // The floor keeps a batch whose returns are all the same finite.
+    1.0 - unexplained / variance(&pass.targets).clamp_min(1e-12)
+}
+
+/// `[B, T, D]` as rows `[B·T, D]`.
+fn rows(tensor: &Tensor) -> Tensor {
+    tensor.flatten(0, 1)
+}
+
+/// The parameters of `store`, trained or not, as `prefix.name`, sorted by name.
+fn named(prefix: &str, store: &nn::VarStore) -> Vec<(String, Tensor)> {
+    let mut variables: Vec<(String, Tensor)> =
+        store.variables().into_iter().map(|(name, tensor)| (format!("{prefix}.{name}"), tensor)).collect();
+    variables.sort_by(|a, b| a.0.cmp(&b.0));
+    variables
+}
+
+/// [`named`], without what is not trained.
+fn trainable(prefix: &str, store: &nn::VarStore) -> Vec<(String, Tensor)> {
+    named(prefix, store).into_iter().filter(|(_, tensor)| tensor.requires_grad()).collect()
+}

@@ -1,0 +1,138 @@
+//! What a gradient step reports.
+
+use tch::{Device, Kind, Tensor};
+
+/// Entries of the packed tensor.
+const COUNT: usize = 16;
+
+/// One gradient step's report, still on the device: nothing waits for it until [`Losses::to_metrics`].
+#[derive(Debug)]
+pub struct Losses {
+    packed: Tensor,
+}
+
+impl Losses {
+    /// Packs scalars in the order of [`Metrics`]' fields.
+    pub(crate) fn pack(entries: [&Tensor; COUNT]) -> Self {
+        let entries = entries.map(|entry| entry.detach().reshape([1]).to_kind(Kind::Float));
+        Self { packed: Tensor::cat(&entries, 0) }
+    }
+
+    /// The mean over several gradient steps, such as those on one batch; `None` of nothing.
+    pub fn mean(steps: &[Losses]) -> Option<Losses> {
+        if steps.is_empty() {
+            return None;
+        }
+        let packed: Vec<&Tensor> = steps.iter().map(|losses| &losses.packed).collect();
+        Some(Self { packed: Tensor::stack(&packed, 0).mean_dim(0i64, false, Kind::Float) })
+    }
+
+    /// Reads the report from the device, in one transfer.
+    pub fn to_metrics(&self) -> Metrics {
+        let mut values = [f32::NAN; COUNT];
+        // A failed transfer leaves NaN, which `Metrics::is_finite` reports.
+        let _ = self.packed.to_device(Device::Cpu).f_copy_data(&mut values, COUNT);
+        let [
+            total_loss,
+            policy_loss,
+            temperature_loss,
+            alpha_loss,
+            value_loss,
+            regression_loss,
+            latent_kl,
+            kl_mean,
+            kl_std,
+            temperature,
+            alpha_mean,
+            alpha_std,
+            policy_std,
+            gradient_norm,
+            variance_explained,
+            valid_share,
+        ] = values;
+        Metrics {
+            total_loss,
+            policy_loss,
+            temperature_loss,
+            alpha_loss,
+            value_loss,
+            regression_loss,
+            latent_kl,
+            kl_mean,
+            kl_std,
+            temperature,
+            alpha_mean,
+            alpha_std,
+            policy_std,
+            gradient_norm,
+            variance_explained,
+            valid_share,
+        }
+    }
+}
+
+/// A gradient step in numbers.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Metrics {
+    /// The loss that was differentiated.
+    pub total_loss: f32,
+    /// L_π.
+    pub policy_loss: f32,
+    /// L_η.
+    pub temperature_loss: f32,
+    /// L_α.
+    pub alpha_loss: f32,
+    /// ½ (V − G)², mean over valid steps, summed over reward terms.
+    pub value_loss: f32,
+    /// The regression's loss; 0 in a V-MPO step.
+    pub regression_loss: f32,
+    /// KL of the latent to its prior, nats a step.
+    pub latent_kl: f32,
+    /// Mean KL_μ to the behaviour policy, nats a step.
+    pub kl_mean: f32,
+    /// Mean KL_Σ to the behaviour policy, nats a step.
+    pub kl_std: f32,
+    /// η after the step.
+    pub temperature: f32,
+    /// α_μ after the step.
+    pub alpha_mean: f32,
+    /// α_Σ after the step.
+    pub alpha_std: f32,
+    /// Mean standard deviation of the policy over valid steps and action dimensions.
+    pub policy_std: f32,
+    /// Global norm of the networks' gradients, before any clipping.
+    pub gradient_norm: f32,
+    /// 1 − Var(G − V) / Var(G), of the return summed over reward terms.
+    pub variance_explained: f32,
+    /// Share of the rows that are transitions.
+    pub valid_share: f32,
+}
+
+impl Metrics {
+    /// Names and numbers, for a log line.
+    pub fn entries(&self) -> [(&'static str, f32); COUNT] {
+        [
+            ("total_loss", self.total_loss),
+            ("policy_loss", self.policy_loss),
+            ("temperature_loss", self.temperature_loss),
+            ("alpha_loss", self.alpha_loss),
+            ("value_loss", self.value_loss),
+            ("regression_loss", self.regression_loss),
+            ("latent_kl", self.latent_kl),
+            ("kl_mean", self.kl_mean),
+            ("kl_std", self.kl_std),
+            ("temperature", self.temperature),
+            ("alpha_mean", self.alpha_mean),
+            ("alpha_std", self.alpha_std),
+            ("policy_std", self.policy_std),
+            ("gradient_norm", self.gradient_norm),
+            ("variance_explained", self.variance_explained),
+            ("valid_share", self.valid_share),
+        ]
+    }
+
+    /// Whether every number is finite; where not, the parameters are lost and training must stop.
+    pub fn is_finite(&self) -> bool {
+        self.entries().iter().all(|(_, value)| value.is_finite())
+    }
+}

@@ -1,0 +1,171 @@
+//! Unrolls as tensors.
+
+use tch::{Device, Tensor};
+
+use super::Error;
+
+/// Sizes of a minibatch.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MinibatchShape {
+    /// B, unrolls.
+    pub unrolls: usize,
+    /// T, transitions an unroll; observations are T + 1.
+    pub length: usize,
+    /// P, entries of proprioception.
+    pub proprioception: usize,
+    /// X, entries of the task observation.
+    pub task: usize,
+    /// A, entries of the action.
+    pub action: usize,
+    /// Z, entries of the latent.
+    pub latent: usize,
+    /// R, reward terms.
+    pub reward_terms: usize,
+}
+
+/// The fields of a batch as contiguous slices, `[B, rows, width]` each, in the wire's own element types.
+#[derive(Clone, Copy, Debug)]
+pub struct MinibatchSource<'a> {
+    /// s, `[B, T+1, P]`.
+    pub proprioception: &'a [f32],
+    /// x, `[B, T+1, X]`.
+    pub task: &'a [f32],
+    /// The sampled z_{t−1}, `[B, T, Z]`; zeros at an episode's start.
+    pub previous_latent: &'a [f32],
+    /// The standard-normal noise that made z_t, `[B, T, Z]`.
+    pub latent_noise: &'a [f32],
+    /// The sampled action, unclipped, `[B, T, A]`.
+    pub action: &'a [f32],
+    /// The behaviour policy's mean, `[B, T, A]`.
+    pub mean: &'a [f32],
+    /// The behaviour policy's standard deviation, `[B, T, A]`.
+    pub std: &'a [f32],
+    /// Reward terms, `[B, T, R]`.
+    pub reward: &'a [f32],
+    /// 0 where the episode terminated, `[B, T]`.
+    pub discount: &'a [f32],
+    /// 1 where the row is a transition, `[B, T]`.
+    pub valid: &'a [f32],
+    /// 1 at an episode's first observation, `[B, T+1]`.
+    pub first: &'a [f32],
+    /// The clip's index, `[B, T+1]`.
+    pub clip: &'a [u32],
+}
+
+/// A minibatch of unrolls, batch first, float32 except `clip`.
+///
+/// What belongs to a row that is no transition (its action, distribution, reward, latent) is blanked when the tensors
+/// are made, so no formula can see it; its observation stays, since a truncated episode is bootstrapped there.
+#[derive(Debug)]
+pub struct MinibatchTensors {
+    pub(super) proprioception: Tensor,
+    pub(super) task: Tensor,
+    pub(super) previous_latent: Tensor,
+    pub(super) latent_noise: Tensor,
+    pub(super) action: Tensor,
+    pub(super) mean: Tensor,
+    pub(super) std: Tensor,
+    pub(super) reward: Tensor,
+    pub(super) discount: Tensor,
+    pub(super) valid: Tensor,
+    pub(super) first: Tensor,
+    pub(super) clip: Tensor,
+    /// One more than the largest clip index: known on the host, so no step has to ask the device.
+    pub(super) clips: usize,
+}
+
+impl MinibatchTensors {
+    /// Copies the fields onto `device`.
+    ///
+    /// # Errors
+    /// [`Error::Length`] when a slice is not as long as `shape` says.
+    pub fn new(source: &MinibatchSource, shape: &MinibatchShape, device: Device) -> Result<Self, Error> {
+        let rows = [shape.length, shape.length + 1];
+        let tensor = |name, values: &[f32], row: usize, width: usize| {
+            let size = [shape.unrolls, rows[row], width];
+            check(name, values.len(), &size)?;
+            let tensor = Tensor::from_slice(values).f_reshape(size.map(|size| size as i64))?;
+            Ok::<Tensor, Error>(tensor.f_to_device(device)?)
+        };
+        let flag = |name, values, row| Ok::<Tensor, Error>(tensor(name, values, row, 1)?.f_squeeze_dim(-1)?);
+        let valid = flag("valid", source.valid, 0)?;
+        let mask = valid.gt(0.5).unsqueeze(-1);
+        let blanked = |name, values, width, blank: f64| {
+            Ok::<Tensor, Error>(tensor(name, values, 0, width)?.f_where_scalarother(&mask, blank)?)
+        };
+        check("clip", source.clip.len(), &[shape.unrolls, rows[1]])?;
+        let clip: Vec<i64> = source.clip.iter().map(|clip| i64::from(*clip)).collect();
+        Ok(Self {
+            proprioception: tensor("proprioception", source.proprioception, 1, shape.proprioception)?,
+            task: tensor("task", source.task, 1, shape.task)?,
+            previous_latent: blanked("previous_latent", source.previous_latent, shape.latent, 0.0)?,
+            latent_noise: blanked("latent_noise", source.latent_noise, shape.latent, 0.0)?,
+            action: blanked("action", source.action, shape.action, 0.0)?,
+            mean: blanked("mean", source.mean, shape.action, 0.0)?,
+            std: blanked("std", source.std, shape.action, 1.0)?,
+            reward: blanked("reward", source.reward, shape.reward_terms, 0.0)?,
+            discount: flag("discount", source.discount, 0)? * &valid,
+            first: flag("first", source.first, 1)?,
+            clip: Tensor::from_slice(&clip)
+                .f_reshape([shape.unrolls as i64, rows[1] as i64])?
+                .f_to_device(device)?,
+            clips: source.clip.iter().max().map_or(0, |clip| *clip as usize + 1),
+            valid,
+        })
+    }
+
+    /// The sizes of this minibatch.
+    pub fn shape(&self) -> MinibatchShape {
+        let width = |tensor: &Tensor, dimension: i64| tensor.size()[dimension as usize] as usize;
+        MinibatchShape {
+            unrolls: width(&self.valid, 0),
+            length: width(&self.valid, 1),
+            proprioception: width(&self.proprioception, 2),
+            task: width(&self.task, 2),
+            action: width(&self.action, 2),
+            latent: width(&self.latent_noise, 2),
+            reward_terms: width(&self.reward, 2),
+        }
+    }
+
+    /// The unrolls at `indices`, `[M]` int64 below B, copied.
+    pub fn select(&self, indices: &Tensor) -> Self {
+        let take = |tensor: &Tensor| tensor.index_select(0, indices);
+        Self {
+            proprioception: take(&self.proprioception),
+            task: take(&self.task),
+            previous_latent: take(&self.previous_latent),
+            latent_noise: take(&self.latent_noise),
+            action: take(&self.action),
+            mean: take(&self.mean),
+            std: take(&self.std),
+            reward: take(&self.reward),
+            discount: take(&self.discount),
+            valid: take(&self.valid),
+            first: take(&self.first),
+            clip: take(&self.clip),
+            clips: self.clips,
+        }
+    }
+
+    /// Replaces z_{t−1} of the unrolls at `indices` (`[M]` int64) by `latents`, z_t as recomputed for them,
+    /// `[M, T, Z]`: row t takes z_{t−1}, an episode's first row zeros, and row 0 keeps what it has, since the step
+    /// before it is not here.
+    pub fn refresh_previous_latent(&mut self, indices: &Tensor, latents: &Tensor) {
+        tch::no_grad(|| {
+            let steps = latents.size()[1] - 1;
+            let stored = self.previous_latent.index_select(0, indices);
+            let within = 1.0 - self.first.index_select(0, indices).narrow(1, 1, steps);
+            let valid = self.valid.index_select(0, indices).narrow(1, 1, steps);
+            let kept: Tensor = within * valid;
+            let moved = latents.narrow(1, 0, steps) * kept.unsqueeze(-1);
+            let refreshed = Tensor::cat(&[stored.narrow(1, 0, 1), moved], 1);
+            let _ = self.previous_latent.index_copy_(0, indices, &refreshed);
+        });
+    }
+}
+
+fn check(field: &'static str, found: usize, size: &[usize]) -> Result<(), Error> {
+    let expected = size.iter().product();
+    if found == expected { Ok(()) } else { Err(Error::Length { field, expected, found }) }
+}

@@ -1,0 +1,72 @@
+//! The warm start: regression towards the servo action on demonstrations that actors make.
+
+use anyhow::Result;
+use comic_proto::v1::Behaviour;
+use rand::Rng as _;
+use rand::seq::index::sample;
+use tch::Tensor;
+
+use crate::checkpoint::Name;
+use crate::trainer::{Trainer, Wait};
+use crate::vmpo::MinibatchTensors;
+
+impl Trainer {
+    /// Gathers demonstrations, regresses on them, and leaves the checkpoint `warm-started`. `None` when the learner was
+    /// asked to stop meanwhile; the warm start then begins anew next time.
+    pub(crate) fn warm_start(&mut self) -> Result<Option<()>> {
+        self.publish(Behaviour::Demonstrate)?;
+        tracing::info!(steps = self.experiment.warm_start.demonstration_steps, "gathering demonstrations");
+        let Some(mut demonstrations) = self.gather()? else { return Ok(None) };
+        if self.experiment.network.normaliser_steps > 0 {
+            self.set_normaliser()?;
+        }
+        let config = self.experiment.warm_start.clone();
+        tracing::info!(steps = config.steps, "regressing on them");
+        self.learner.set_learning_rates(config.learning_rate, self.experiment.optimiser.multiplier_learning_rate);
+        for step in 0..config.steps {
+            let losses = self.regress(&mut demonstrations, config.minibatch_unrolls)?;
+            if step % 50 == 0 || step + 1 == config.steps {
+                let losses = losses.to_metrics();
+                self.report(&losses)?;
+                tracing::info!(step, regression = losses.regression_loss, latent_kl = losses.latent_kl, "regressing");
+            }
+        }
+        self.learner.reset_optimiser();
+        self.progress.warm_started = true;
+        self.writer.write(Name::WarmStarted, self.snapshot()?)?;
+        Ok(Some(()))
+    }
+
+    /// At least `demonstration_steps` rows of the servo's rollouts, batch by batch.
+    fn gather(&mut self) -> Result<Option<Vec<MinibatchTensors>>> {
+        let unroll = &self.experiment.unroll;
+        let rows = (unroll.batch * unroll.length) as u64;
+        let wanted = self.experiment.warm_start.demonstration_steps.div_ceil(rows).max(1);
+        let mut demonstrations = Vec::new();
+        while (demonstrations.len() as u64) < wanted {
+            match self.next_batch()? {
+                Wait::Batch(batch) => {
+                    demonstrations.push(self.tensors(&batch)?);
+                    self.absorb(&batch);
+                    self.book(batch);
+                }
+                Wait::Nothing => {}
+                Wait::Closed => return Ok(None),
+            }
+        }
+        Ok(Some(demonstrations))
+    }
+
+    /// One step on some unrolls of one batch. The demonstrator has no latent, so z_{t−1} is this encoder's own: what it
+    /// gave when it last saw these unrolls.
+    fn regress(&mut self, demonstrations: &mut [MinibatchTensors], unrolls: usize) -> Result<crate::vmpo::Losses> {
+        let random = &mut self.progress.random;
+        let batch = &mut demonstrations[random.random_range(0..demonstrations.len())];
+        let of = batch.shape().unrolls;
+        let chosen: Vec<i64> = sample(random, of, unrolls.min(of)).into_iter().map(|index| index as i64).collect();
+        let indices = Tensor::from_slice(&chosen);
+        let (losses, latents) = self.learner.regress(&batch.select(&indices))?;
+        batch.refresh_previous_latent(&indices, &latents);
+        Ok(losses)
+    }
+}

@@ -1,0 +1,102 @@
+//! Observations brought to mean 0 and standard deviation 1 by fixed statistics.
+
+use tch::{Tensor, nn};
+
+use crate::Error;
+
+/// Normalised observations are clamped to ± this many standard deviations (D).
+pub const NORMALISED_LIMIT: f64 = 10.0;
+/// Standard deviations are floored at this, so an observation that never moved is not blown up when it does (D).
+pub const NORMALISER_MIN_STD: f32 = 1e-2;
+
+/// Mean and standard deviation of every observation entry, as measured on the first environment steps.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NormaliserStatistics {
+    /// Mean of proprioception, P entries.
+    pub proprioception_mean: Vec<f32>,
+    /// Standard deviation of proprioception, P entries.
+    pub proprioception_std: Vec<f32>,
+    /// Mean of the task observation, X entries.
+    pub task_mean: Vec<f32>,
+    /// Standard deviation of the task observation, X entries.
+    pub task_std: Vec<f32>,
+}
+
+/// Observations a policy has normalised; the only thing a [`crate::Value`] reads, so policy and value can never
+/// disagree about the scale.
+#[derive(Debug)]
+pub struct NormalisedObservation {
+    pub(crate) proprioception: Tensor,
+    pub(crate) task: Tensor,
+}
+
+impl NormalisedObservation {
+    /// The first `steps` of observations `[B, T, ·]`: views `[B, steps, ·]`, no copy.
+    pub fn first_steps(&self, steps: i64) -> Self {
+        Self { proprioception: self.proprioception.narrow(1, 0, steps), task: self.task.narrow(1, 0, steps) }
+    }
+}
+
+/// The statistics as parameters that travel but are not trained. The identity until they are set.
+#[derive(Debug)]
+pub(crate) struct Normaliser {
+    /// Off when the experiment takes raw observations: then no arithmetic is done at all.
+    active: bool,
+    proprioception_mean: Tensor,
+    proprioception_std: Tensor,
+    task_mean: Tensor,
+    task_std: Tensor,
+}
+
+impl Normaliser {
+    pub(crate) fn new(path: &nn::Path, proprioception: i64, task: i64, active: bool) -> Self {
+        Self {
+            active,
+            proprioception_mean: path.zeros_no_train("proprioception_mean", &[proprioception]),
+            proprioception_std: path.ones_no_train("proprioception_std", &[proprioception]),
+            task_mean: path.zeros_no_train("task_mean", &[task]),
+            task_std: path.ones_no_train("task_std", &[task]),
+        }
+    }
+
+    pub(crate) fn forward(&self, proprioception: &Tensor, task: &Tensor) -> NormalisedObservation {
+        if !self.active {
+            return NormalisedObservation { proprioception: proprioception.shallow_clone(), task: task.shallow_clone() };
+        }
+        NormalisedObservation {
+            proprioception: normalise(proprioception, &self.proprioception_mean, &self.proprioception_std),
+            task: normalise(task, &self.task_mean, &self.task_std),
+        }
+    }
+
+    pub(crate) fn set(&self, statistics: &NormaliserStatistics) -> Result<(), Error> {
+        let NormaliserStatistics { proprioception_mean, proprioception_std, task_mean, task_std } = statistics;
+        let entries = [
+            ("normaliser.proprioception_mean", proprioception_mean, &self.proprioception_mean, false),
+            ("normaliser.proprioception_std", proprioception_std, &self.proprioception_std, true),
+            ("normaliser.task_mean", task_mean, &self.task_mean, false),
+            ("normaliser.task_std", task_std, &self.task_std, true),
+        ];
+        for (name, values, buffer, is_std) in &entries {
+            let expected = buffer.numel();
+            if values.len() != expected {
+                return Err(Error::Length { name, expected, found: values.len() });
+            }
+            if !values.iter().all(|value| value.is_finite() && (!is_std || *value >= 0.0)) {
+                return Err(Error::Number { name: (*name).into(), what: "a number that is no mean or deviation" });
+            }
+        }
+        for (_, values, buffer, is_std) in entries {
+            let mut values = Tensor::from_slice(values);
+            if is_std {
+                values = values.clamp_min(f64::from(NORMALISER_MIN_STD));
+            }
+            tch::no_grad(|| buffer.shallow_clone().f_copy_(&values)).map(drop)?;
+        }
+        Ok(())
+    }
+}
+
+fn normalise(observation: &Tensor, mean: &Tensor, std: &Tensor) -> Tensor {
+    (observation - mean).divide_(std).clamp_(-NORMALISED_LIMIT, NORMALISED_LIMIT)
+}

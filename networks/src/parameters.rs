@@ -1,0 +1,75 @@
+//! Parameters in and out, as safetensors documents of float32.
+
+use std::collections::HashMap;
+
+use safetensors::tensor::TensorView;
+use safetensors::{Dtype, SafeTensors};
+use tch::{Device, Kind, Tensor, nn};
+
+use crate::Error;
+
+/// Every parameter of `store`, the untrained ones included. The same parameters give the same bytes.
+///
+/// # Errors
+/// [`Error::Torch`] when a parameter cannot be read back from its device.
+pub fn to_safetensors(store: &nn::VarStore) -> Result<Vec<u8>, Error> {
+    let mut parameters = Vec::new();
+    for (name, tensor) in store.variables() {
+        let shape: Vec<usize> = tensor.size().iter().map(|size| *size as usize).collect();
+        let mut values = vec![0f32; tensor.numel()];
+        let host = tensor.detach().f_to_device(Device::Cpu)?.f_to_kind(Kind::Float)?.f_contiguous()?;
+        host.f_copy_data(&mut values, tensor.numel())?;
+        let bytes: Vec<u8> = values.into_iter().flat_map(f32::to_le_bytes).collect();
+        parameters.push((name, shape, bytes));
+    }
+    parameters.sort_by(|a, b| a.0.cmp(&b.0));
+    let views = parameters
+        .iter()
+        .map(|(name, shape, bytes)| Ok((name.as_str(), TensorView::new(Dtype::F32, shape.clone(), bytes)?)))
+        .collect::<Result<Vec<_>, safetensors::SafeTensorError>>()?;
+    Ok(safetensors::serialize(views, None)?)
+}
+
+/// Sets every parameter of `store` from `bytes`, which may come from anywhere: every name, shape and element type is
+/// checked and every number must be finite before the first parameter changes.
+///
+/// # Errors
+/// What is wrong with the document, by the parameter's name; `store` is untouched then.
+pub fn from_safetensors(store: &mut nn::VarStore, bytes: &[u8]) -> Result<(), Error> {
+    let document = SafeTensors::deserialize(bytes)?;
+    let variables = store.variables();
+    if let Some(name) = document.names().into_iter().find(|name| !variables.contains_key(*name)) {
+        return Err(Error::Unknown { name: name.to_string() });
+    }
+    let mut checked: HashMap<&str, Tensor> = HashMap::new();
+    for (name, variable) in &variables {
+        let view = document.tensor(name).map_err(|_| Error::Missing { name: name.clone() })?;
+        checked.insert(name, check(name, &variable.size(), &view)?);
+    }
+    for (name, variable) in &variables {
+        if let Some(values) = checked.get(name.as_str()) {
+            tch::no_grad(|| variable.shallow_clone().f_copy_(values)).map(drop)?;
+        }
+    }
+    Ok(())
+}
+
+fn check(name: &str, expected: &[i64], view: &TensorView) -> Result<Tensor, Error> {
+    if view.dtype() != Dtype::F32 {
+        return Err(Error::Kind { name: name.to_string(), found: format!("{:?}", view.dtype()) });
+    }
+    let found: Vec<i64> = view.shape().iter().map(|size| i64::try_from(*size).unwrap_or(i64::MAX)).collect();
+    if found != expected {
+        return Err(Error::Shape { name: name.to_string(), expected: expected.to_vec(), found });
+    }
+    let (chunks, _) = view.data().as_chunks::<4>();
+    let values: Vec<f32> = chunks.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+    if !values.iter().all(|value| value.is_finite()) {
+        return Err(Error::Number { name: name.to_string(), what: "an infinity or a NaN" });
+    }
+    // A normaliser divides by its deviations.
+    if name.starts_with("normaliser.") && name.ends_with("_std") && !values.iter().all(|value| *value > 0.0) {
+        return Err(Error::Number { name: name.to_string(), what: "a standard deviation that is not positive" });
+    }
+    Ok(Tensor::from_slice(&values).f_reshape(expected)?)
+}

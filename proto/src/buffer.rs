@@ -1,0 +1,114 @@
+//! An unroll under construction.
+
+use bytes::Bytes;
+
+use crate::{Field, Invalid, UnrollLayout};
+
+/// An unroll that an actor writes row by row and sends as one payload.
+///
+/// Memory is a `Vec<u32>`, so every row is aligned whatever the layout.
+#[derive(Clone, Debug)]
+pub struct UnrollBuffer {
+    layout: UnrollLayout,
+    words: Vec<u32>,
+}
+
+impl UnrollBuffer {
+    /// An unroll of zeros, except that standard deviations are 1, so that a row nobody acts in is valid as it stands.
+    pub fn new(layout: &UnrollLayout) -> Self {
+        let mut buffer = Self { layout: layout.clone(), words: vec![0; layout.size() / size_of::<u32>()] };
+        buffer.clear();
+        buffer
+    }
+
+    /// Back to the state of a new buffer, keeping its memory.
+    pub fn clear(&mut self) {
+        self.words.fill(0);
+        let std = self.words(Field::Std);
+        self.words[std].fill(1.0f32.to_bits());
+    }
+
+    /// The layout it follows.
+    pub fn layout(&self) -> &UnrollLayout {
+        &self.layout
+    }
+
+    /// Row `t` of a field of `f32`. (For [`Field::Clip`], which holds `u32`, use [`set_clip`](Self::set_clip).)
+    ///
+    /// # Panics
+    /// When the field has no row `t`.
+    pub fn row_mut(&mut self, field: Field, t: usize) -> &mut [f32] {
+        let range = self.row_words(field, t);
+        bytemuck::cast_slice_mut(&mut self.words[range])
+    }
+
+    /// Row `t` of a field of `f32`.
+    ///
+    /// # Panics
+    /// When the field has no row `t`.
+    pub fn row(&self, field: Field, t: usize) -> &[f32] {
+        bytemuck::cast_slice(&self.words[self.row_words(field, t)])
+    }
+
+    /// Sets the clip of row `t`.
+    ///
+    /// # Panics
+    /// When there is no row `t`.
+    pub fn set_clip(&mut self, t: usize, clip: u32) {
+        let range = self.row_words(Field::Clip, t);
+        self.words[range].fill(clip);
+    }
+
+    /// The clip of row `t`.
+    ///
+    /// # Panics
+    /// When there is no row `t`.
+    pub fn clip(&self, t: usize) -> u32 {
+        self.words[self.row_words(Field::Clip, t).start]
+    }
+
+    /// The payload, copied: the buffer can be written again at once.
+    pub fn to_bytes(&self) -> Bytes {
+        Bytes::copy_from_slice(bytemuck::cast_slice(&self.words))
+    }
+
+    /// The payload, without a copy.
+    pub fn into_bytes(self) -> Bytes {
+        Bytes::from_owner(Payload(self.words))
+    }
+
+    /// The unroll that lies in a payload.
+    ///
+    /// # Errors
+    /// [`Invalid::Length`] when the payload is no unroll of this layout. Contents are not checked: that is
+    /// [`validate`](crate::validate)'s job.
+    pub fn from_payload(layout: &UnrollLayout, payload: &[u8]) -> Result<Self, Invalid> {
+        if payload.len() != layout.size() {
+            return Err(Invalid::Length { found: payload.len(), expected: layout.size() });
+        }
+        let mut buffer = Self { layout: layout.clone(), words: vec![0; layout.size() / size_of::<u32>()] };
+        bytemuck::cast_slice_mut(&mut buffer.words).copy_from_slice(payload);
+        Ok(buffer)
+    }
+
+    fn words(&self, field: Field) -> std::ops::Range<usize> {
+        let bytes = self.layout.range(field);
+        bytes.start / size_of::<u32>()..bytes.end / size_of::<u32>()
+    }
+
+    fn row_words(&self, field: Field, t: usize) -> std::ops::Range<usize> {
+        let (rows, width) = (self.layout.rows(field), self.layout.width(field));
+        assert!(t < rows, "row {t} of {field}, which has {rows}");
+        let start = self.words(field).start + t * width;
+        start..start + width
+    }
+}
+
+/// Lets [`Bytes`] own the words.
+struct Payload(Vec<u32>);
+
+impl AsRef<[u8]> for Payload {
+    fn as_ref(&self) -> &[u8] {
+        bytemuck::cast_slice(&self.0)
+    }
+}

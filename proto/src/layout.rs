@@ -1,0 +1,211 @@
+//! Where each field of an unroll lies in the payload.
+
+use std::fmt::{self, Write as _};
+use std::ops::Range;
+
+use comic_experiment::{Experiment, TaskSpec};
+use sha2::{Digest, Sha256};
+
+/// Bytes of an element: every field is `f32` or `u32`.
+const ELEMENT: usize = 4;
+/// Room in a message for everything of fixed size around payload and episode statistics.
+const HEADER_SLACK: usize = 4096;
+/// Room for one episode's statistics without its returns: a few varints and tags.
+const EPISODE_SLACK: usize = 64;
+
+/// The sizes an unroll is made of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct UnrollShape {
+    /// T: transitions.
+    pub length: usize,
+    /// P: proprioception.
+    pub proprioception: usize,
+    /// X: task observation.
+    pub task: usize,
+    /// A: action.
+    pub action: usize,
+    /// Z: latent.
+    pub latent: usize,
+    /// R: reward terms.
+    pub reward_terms: usize,
+}
+
+impl UnrollShape {
+    /// The unrolls of this task under this experiment.
+    pub fn new(spec: &TaskSpec, experiment: &Experiment) -> Self {
+        Self {
+            length: experiment.unroll.length,
+            proprioception: spec.proprioception,
+            task: spec.task,
+            action: spec.action,
+            latent: experiment.network.latent.size,
+            reward_terms: spec.reward_terms.len(),
+        }
+    }
+}
+
+/// One array of an unroll; the order here is the order in the payload.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Field {
+    /// `[T+1, P]` f32: what the body feels of itself, SI units.
+    Proprioception,
+    /// `[T+1, X]` f32: the task observation.
+    Task,
+    /// `[T, Z]` f32: z of the step before; zero at an episode's first step.
+    PreviousLatent,
+    /// `[T, Z]` f32: the standard-normal noise that made z.
+    LatentNoise,
+    /// `[T, A]` f32: the action as sampled, not clipped.
+    Action,
+    /// `[T, A]` f32: mean of the behaviour policy.
+    Mean,
+    /// `[T, A]` f32, positive: standard deviation of the behaviour policy.
+    Std,
+    /// `[T, R]` f32: one column for each reward term.
+    Reward,
+    /// `[T]` f32 in [0, 1]: 0 where the step terminated the episode, 1 elsewhere.
+    Discount,
+    /// `[T]` f32, 1 or 0: whether the row holds a transition.
+    Valid,
+    /// `[T+1]` f32, 1 or 0: whether the row is an episode's first observation.
+    First,
+    /// `[T+1]` u32: the clip's index.
+    Clip,
+}
+
+impl Field {
+    /// Every field, in payload order.
+    pub const ALL: [Self; 12] = [
+        Self::Proprioception,
+        Self::Task,
+        Self::PreviousLatent,
+        Self::LatentNoise,
+        Self::Action,
+        Self::Mean,
+        Self::Std,
+        Self::Reward,
+        Self::Discount,
+        Self::Valid,
+        Self::First,
+        Self::Clip,
+    ];
+
+    /// Its name in layout descriptions and messages.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Proprioception => "proprioception",
+            Self::Task => "task",
+            Self::PreviousLatent => "previous_latent",
+            Self::LatentNoise => "latent_noise",
+            Self::Action => "action",
+            Self::Mean => "mean",
+            Self::Std => "std",
+            Self::Reward => "reward",
+            Self::Discount => "discount",
+            Self::Valid => "valid",
+            Self::First => "first",
+            Self::Clip => "clip",
+        }
+    }
+
+    fn rows(self, length: usize) -> usize {
+        match self {
+            Self::Proprioception | Self::Task | Self::First | Self::Clip => length.saturating_add(1),
+            _ => length,
+        }
+    }
+
+    fn width(self, shape: &UnrollShape) -> usize {
+        match self {
+            Self::Proprioception => shape.proprioception,
+            Self::Task => shape.task,
+            Self::PreviousLatent | Self::LatentNoise => shape.latent,
+            Self::Action | Self::Mean | Self::Std => shape.action,
+            Self::Reward => shape.reward_terms,
+            Self::Discount | Self::Valid | Self::First | Self::Clip => 1,
+        }
+    }
+
+    fn element(self) -> &'static str {
+        if self == Self::Clip { "u32" } else { "f32" }
+    }
+}
+
+impl fmt::Display for Field {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(self.name())
+    }
+}
+
+/// Where every field of an unroll lies in the payload, and the hash by which both sides know they agree.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct UnrollLayout {
+    shape: UnrollShape,
+    ranges: [(usize, usize); Field::ALL.len()],
+    hash: [u8; 32],
+}
+
+impl UnrollLayout {
+    /// The layout of unrolls of this shape.
+    pub fn new(shape: UnrollShape) -> Self {
+        let mut ranges = [(0, 0); Field::ALL.len()];
+        let mut description = format!("comic unroll layout 1, little-endian, T={}\n", shape.length);
+        let mut start = 0usize;
+        for (range, field) in ranges.iter_mut().zip(Field::ALL) {
+            let (rows, width) = (field.rows(shape.length), field.width(&shape));
+            let end = start.saturating_add(rows.saturating_mul(width).saturating_mul(ELEMENT));
+            *range = (start, end);
+            start = end;
+            // Writing to a String cannot fail.
+            let _ = writeln!(description, "{field} {rows} {width} {}", field.element());
+        }
+        Self { shape, ranges, hash: Sha256::digest(description).into() }
+    }
+
+    /// The shape it was made from.
+    pub fn shape(&self) -> &UnrollShape {
+        &self.shape
+    }
+
+    /// Bytes of a payload.
+    pub fn size(&self) -> usize {
+        self.range(Field::Clip).end
+    }
+
+    /// SHA-256 over a canonical description: format version, T, and each field's name, rows, width and type.
+    pub fn hash(&self) -> [u8; 32] {
+        self.hash
+    }
+
+    /// The bytes of a payload in which this field lies.
+    pub fn range(&self, field: Field) -> Range<usize> {
+        let (start, end) = self.ranges[field as usize];
+        start..end
+    }
+
+    /// Elements a row.
+    pub fn width(&self, field: Field) -> usize {
+        field.width(&self.shape)
+    }
+
+    /// Rows: T or T + 1.
+    pub fn rows(&self, field: Field) -> usize {
+        field.rows(self.shape.length)
+    }
+
+    /// Elements of the whole field, rows × width.
+    pub fn elements(&self, field: Field) -> usize {
+        self.range(field).len() / ELEMENT
+    }
+
+    /// The most episodes that can end in one unroll: each has its last observation in a row of its own.
+    pub fn max_episodes(&self) -> usize {
+        self.shape.length.saturating_add(1)
+    }
+
+    /// The largest `UnrollMessage` that can be valid, in bytes: what a server sets as its decoding limit.
+    pub fn message_limit(&self) -> usize {
+        let episode = self.shape.reward_terms.saturating_mul(ELEMENT).saturating_add(EPISODE_SLACK);
+        self.size().saturating_add(self.max_episodes().saturating_mul(episode)).saturating_add(HEADER_SLACK)
+    }
+}

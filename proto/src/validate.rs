@@ -1,0 +1,238 @@
+//! What comes off the wire is checked here, before it touches a batch.
+
+use thiserror::Error;
+
+use crate::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
+use crate::{Field, UnrollLayout};
+
+/// Sequence numbers lie below this. At a thousand unrolls a second an actor reaches it after thirty years; a larger
+/// one is a broken header, and one such number taken seriously would spoil the books.
+pub const MAX_SEQUENCE: u64 = 1 << 40;
+
+/// The bits of an `f32`'s exponent: all set in an infinity or a NaN.
+const EXPONENT: u32 = 0x7f80_0000;
+
+/// What the learner knows at this moment and a header has to agree with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Expected {
+    /// Number of clips.
+    pub clips: usize,
+    /// The learner's epoch. An unroll of an earlier one is not invalid but superseded, which is the batcher's to say.
+    pub epoch: u64,
+    /// The newest version of the parameters that was published in this epoch.
+    pub newest_version: u64,
+}
+
+/// Why an unroll is refused as invalid.
+#[derive(Clone, Debug, PartialEq, Error)]
+#[non_exhaustive]
+pub enum Invalid {
+    /// The message has no header.
+    #[error("unroll has no header")]
+    Header,
+    /// A sequence number that no actor can have reached.
+    #[error("sequence {sequence} is beyond {MAX_SEQUENCE}")]
+    Sequence {
+        /// As received.
+        sequence: u64,
+    },
+    /// Another layout than this learner's.
+    #[error("layout hash differs from the learner's: actor and learner must run the same experiment, join again")]
+    LayoutHash,
+    /// An epoch that has not begun.
+    #[error("learner epoch {found} is in the future, this is epoch {newest}")]
+    Epoch {
+        /// As received.
+        found: u64,
+        /// The learner's.
+        newest: u64,
+    },
+    /// A version that was never published.
+    #[error("version {found} is in the future, the newest is {newest}")]
+    Version {
+        /// As received.
+        found: u64,
+        /// The newest published.
+        newest: u64,
+    },
+    /// Not the layout's size.
+    #[error("payload has {found} bytes, the layout {expected}")]
+    Length {
+        /// Bytes received.
+        found: usize,
+        /// Bytes of the layout.
+        expected: usize,
+    },
+    /// NaN or infinity.
+    #[error("{field}[{row}] is not finite")]
+    NotFinite {
+        /// The field.
+        field: Field,
+        /// The row.
+        row: usize,
+    },
+    /// A finite number outside the field's range.
+    #[error("{field}[{row}] = {value}, expected {expected}")]
+    Range {
+        /// The field.
+        field: Field,
+        /// The row.
+        row: usize,
+        /// As received.
+        value: f32,
+        /// What is allowed.
+        expected: &'static str,
+    },
+    /// An episode's end and the next one's beginning do not match.
+    #[error("valid[{row}] and first[{next}] contradict each other: an episode begins exactly after a row without a transition", next = row + 1)]
+    Boundary {
+        /// The row of `valid`.
+        row: usize,
+    },
+    /// A clip the task does not have.
+    #[error("clip {clip} in row {row}, but the task has {clips} clips")]
+    Clip {
+        /// As received.
+        clip: u32,
+        /// The row.
+        row: usize,
+        /// Number of clips.
+        clips: usize,
+    },
+    /// More episodes than an unroll has room for.
+    #[error("{found} episodes ended in one unroll, at most {limit} can")]
+    Episodes {
+        /// As received.
+        found: usize,
+        /// T + 1.
+        limit: usize,
+    },
+    /// An episode's statistics make no sense.
+    #[error("episode statistics: {problem}")]
+    Episode {
+        /// Which number is wrong.
+        problem: &'static str,
+    },
+}
+
+/// Checks header and payload of an unroll against everything both sides agreed on.
+///
+/// One pass over the payload finds whether all is finite; only when it is not does a second one look for the place.
+///
+/// # Errors
+/// The first [`Invalid`] found.
+pub fn validate(
+    layout: &UnrollLayout,
+    header: &UnrollHeader,
+    payload: &[u8],
+    expected: &Expected,
+) -> Result<(), Invalid> {
+    check_header(layout, header, expected)?;
+    if payload.len() != layout.size() {
+        return Err(Invalid::Length { found: payload.len(), expected: layout.size() });
+    }
+    check_finite(layout, payload)?;
+    check_range(layout, payload, Field::Std, "above 0", |value| value > 0.0)?;
+    check_range(layout, payload, Field::Discount, "0 to 1", |value| (0.0..=1.0).contains(&value))?;
+    check_range(layout, payload, Field::Valid, "0 or 1", |value| value == 0.0 || value == 1.0)?;
+    check_range(layout, payload, Field::First, "0 or 1", |value| value == 0.0 || value == 1.0)?;
+    check_boundaries(layout, payload)?;
+    check_clips(layout, payload, expected.clips)
+}
+
+fn check_header(layout: &UnrollLayout, header: &UnrollHeader, expected: &Expected) -> Result<(), Invalid> {
+    if header.sequence >= MAX_SEQUENCE {
+        return Err(Invalid::Sequence { sequence: header.sequence });
+    }
+    if header.layout_hash != layout.hash() {
+        return Err(Invalid::LayoutHash);
+    }
+    if header.learner_epoch > expected.epoch {
+        return Err(Invalid::Epoch { found: header.learner_epoch, newest: expected.epoch });
+    }
+    // Versions of another epoch cannot be compared with this one's.
+    if header.learner_epoch == expected.epoch && header.version > expected.newest_version {
+        return Err(Invalid::Version { found: header.version, newest: expected.newest_version });
+    }
+    if header.episodes.len() > layout.max_episodes() {
+        return Err(Invalid::Episodes { found: header.episodes.len(), limit: layout.max_episodes() });
+    }
+    header.episodes.iter().try_for_each(|episode| check_episode(layout, episode, expected.clips))
+}
+
+fn check_episode(layout: &UnrollLayout, episode: &EpisodeStatistics, clips: usize) -> Result<(), Invalid> {
+    let end = EpisodeEnd::try_from(episode.end).unwrap_or(EpisodeEnd::Unspecified);
+    let problem = if episode.clip as usize >= clips {
+        "the task has no such clip"
+    } else if episode.steps == 0 || episode.steps_left_at_start == 0 {
+        "an episode has at least one step and at least one step left at its start"
+    } else if episode.returns.len() != layout.shape().reward_terms {
+        "one return for each reward term is needed"
+    } else if !episode.returns.iter().all(|value| value.is_finite()) {
+        "a return is not finite"
+    } else if end == EpisodeEnd::Unspecified {
+        "how the episode ended is missing"
+    } else {
+        return Ok(());
+    };
+    Err(Invalid::Episode { problem })
+}
+
+/// The payload's words; the network's buffer is not aligned.
+fn words(payload: &[u8]) -> impl Iterator<Item = u32> {
+    payload.as_chunks::<4>().0.iter().map(|bytes| u32::from_le_bytes(*bytes))
+}
+
+fn field(layout: &UnrollLayout, payload: &[u8], field: Field) -> impl Iterator<Item = u32> {
+    words(&payload[layout.range(field)])
+}
+
+fn check_finite(layout: &UnrollLayout, payload: &[u8]) -> Result<(), Invalid> {
+    let floats = &payload[..layout.range(Field::Clip).start];
+    // No early exit: without one this is a handful of vector instructions per cache line.
+    let broken = words(floats).fold(false, |broken, word| broken | (word & EXPONENT == EXPONENT));
+    if !broken {
+        return Ok(());
+    }
+    for name in Field::ALL {
+        let place = field(layout, payload, name).position(|word| word & EXPONENT == EXPONENT);
+        if let Some(place) = place.filter(|_| name != Field::Clip) {
+            return Err(Invalid::NotFinite { field: name, row: place / layout.width(name).max(1) });
+        }
+    }
+    Ok(())
+}
+
+fn check_range(
+    layout: &UnrollLayout,
+    payload: &[u8],
+    name: Field,
+    expected: &'static str,
+    allowed: impl Fn(f32) -> bool,
+) -> Result<(), Invalid> {
+    for (place, word) in field(layout, payload, name).enumerate() {
+        let value = f32::from_bits(word);
+        if !allowed(value) {
+            return Err(Invalid::Range { field: name, row: place / layout.width(name).max(1), value, expected });
+        }
+    }
+    Ok(())
+}
+
+fn check_boundaries(layout: &UnrollLayout, payload: &[u8]) -> Result<(), Invalid> {
+    let valid = field(layout, payload, Field::Valid).map(f32::from_bits);
+    let next_first = field(layout, payload, Field::First).skip(1).map(f32::from_bits);
+    match valid.zip(next_first).position(|(valid, first)| (valid == 0.0) != (first == 1.0)) {
+        Some(row) => Err(Invalid::Boundary { row }),
+        None => Ok(()),
+    }
+}
+
+fn check_clips(layout: &UnrollLayout, payload: &[u8], clips: usize) -> Result<(), Invalid> {
+    for (row, clip) in field(layout, payload, Field::Clip).enumerate() {
+        if clip as usize >= clips {
+            return Err(Invalid::Clip { clip, row, clips });
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,82 @@
+//! The layout: fields lie one after the other, and the hash knows every dimension.
+
+use comic_experiment::{Experiment, TaskSpec, Tracking};
+use comic_proto::{Field, UnrollLayout, UnrollShape};
+use proptest::prelude::*;
+
+fn shape() -> impl Strategy<Value = UnrollShape> {
+    (1usize..40, 1usize..300, 1usize..1200, 1usize..60, 1usize..70, 1usize..8).prop_map(
+        |(length, proprioception, task, action, latent, reward_terms)| UnrollShape {
+            length,
+            proprioception,
+            task,
+            action,
+            latent,
+            reward_terms,
+        },
+    )
+}
+
+#[test]
+fn the_paper_s_unroll_has_the_shapes_of_experiment_and_task() {
+    let experiment = Experiment::default();
+    let spec = TaskSpec::tracking(&Tracking::default(), vec!["walk".into()]).unwrap();
+    let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
+    let dimensions = |field| (layout.rows(field), layout.width(field));
+    assert_eq!(dimensions(Field::Proprioception), (33, 205));
+    assert_eq!(dimensions(Field::Task), (33, spec.task));
+    assert_eq!(dimensions(Field::PreviousLatent), (32, 60));
+    assert_eq!(dimensions(Field::LatentNoise), (32, 60));
+    assert_eq!([Field::Action, Field::Mean, Field::Std].map(dimensions), [(32, 56); 3]);
+    assert_eq!(dimensions(Field::Reward), (32, 5));
+    assert_eq!([Field::Discount, Field::Valid].map(dimensions), [(32, 1); 2]);
+    assert_eq!([Field::First, Field::Clip].map(dimensions), [(33, 1); 2]);
+}
+
+#[test]
+fn the_hash_is_the_same_on_every_machine_and_in_every_build() {
+    let shape = UnrollShape { length: 2, proprioception: 3, task: 4, action: 5, latent: 6, reward_terms: 7 };
+    let hash: String = UnrollLayout::new(shape).hash().iter().map(|byte| format!("{byte:02x}")).collect();
+    assert_eq!(hash, "7f4f2dd564f8543fb88ae34a6038dcd0b3d035dd91e6fc0471503e517969fbb3");
+}
+
+proptest! {
+    #[test]
+    fn fields_lie_one_after_the_other_without_a_gap(shape in shape()) {
+        let layout = UnrollLayout::new(shape);
+        let mut end = 0;
+        for field in Field::ALL {
+            let range = layout.range(field);
+            prop_assert_eq!(range.start, end);
+            prop_assert_eq!(range.len(), layout.rows(field) * layout.width(field) * 4);
+            prop_assert_eq!(range.len(), layout.elements(field) * 4);
+            end = range.end;
+        }
+        prop_assert_eq!(layout.size(), end);
+        prop_assert!(layout.message_limit() > layout.size());
+    }
+
+    #[test]
+    fn the_hash_changes_with_any_dimension(shape in shape(), which in 0usize..6, more in 1usize..50) {
+        let mut other = shape;
+        *[
+            &mut other.length,
+            &mut other.proprioception,
+            &mut other.task,
+            &mut other.action,
+            &mut other.latent,
+            &mut other.reward_terms,
+        ].into_iter().nth(which).unwrap() += more;
+        prop_assert_ne!(UnrollLayout::new(shape).hash(), UnrollLayout::new(other).hash());
+        prop_assert_eq!(UnrollLayout::new(shape).hash(), UnrollLayout::new(shape).hash());
+    }
+
+    #[test]
+    fn dimensions_beyond_any_memory_do_not_overflow(length in any::<usize>(), width in any::<usize>()) {
+        let shape = UnrollShape {
+            length, proprioception: width, task: width, action: width, latent: width, reward_terms: width,
+        };
+        let layout = UnrollLayout::new(shape);
+        prop_assert!(layout.message_limit() >= layout.size());
+    }
+}

@@ -1,0 +1,76 @@
+//! What an actor writes is what a learner reads.
+
+use comic_proto::{Field, Invalid, UnrollBuffer, UnrollLayout, UnrollShape};
+use proptest::prelude::*;
+
+fn layout() -> UnrollLayout {
+    UnrollLayout::new(UnrollShape { length: 3, proprioception: 5, task: 7, action: 2, latent: 4, reward_terms: 3 })
+}
+
+/// A number that tells field, row and column apart.
+fn mark(field: Field, t: usize, column: usize) -> f32 {
+    (field as usize * 10_000 + t * 100 + column) as f32
+}
+
+#[test]
+fn every_element_lies_at_its_own_place_little_endian() {
+    let layout = layout();
+    let mut unroll = UnrollBuffer::new(&layout);
+    for field in Field::ALL.into_iter().filter(|field| *field != Field::Clip) {
+        for t in 0..layout.rows(field) {
+            for (column, value) in unroll.row_mut(field, t).iter_mut().enumerate() {
+                *value = mark(field, t, column);
+            }
+        }
+    }
+    for t in 0..layout.rows(Field::Clip) {
+        unroll.set_clip(t, t as u32 + 40);
+    }
+    let payload = unroll.to_bytes();
+    assert_eq!(payload.len(), layout.size());
+    for field in Field::ALL {
+        let width = layout.width(field);
+        for (place, bytes) in payload[layout.range(field)].chunks(4).enumerate() {
+            let word = u32::from_le_bytes(bytes.try_into().unwrap());
+            let (t, column) = (place / width, place % width);
+            let expected = if field == Field::Clip { t as u32 + 40 } else { mark(field, t, column).to_bits() };
+            assert_eq!(word, expected, "{field}[{t}][{column}]");
+        }
+    }
+    assert_eq!(unroll.into_bytes(), payload);
+}
+
+#[test]
+fn a_cleared_buffer_is_a_new_one() {
+    let layout = layout();
+    let mut unroll = UnrollBuffer::new(&layout);
+    unroll.row_mut(Field::Task, 1).fill(3.0);
+    unroll.row_mut(Field::Std, 0).fill(0.1);
+    unroll.set_clip(2, 9);
+    unroll.clear();
+    assert_eq!(unroll.to_bytes(), UnrollBuffer::new(&layout).to_bytes());
+    assert_eq!(unroll.row(Field::Std, 2), [1.0, 1.0]);
+}
+
+proptest! {
+    #[test]
+    fn any_payload_of_the_right_length_survives_the_round_trip(
+        bytes in prop::collection::vec(any::<u8>(), layout().size()),
+        offset in 0usize..4,
+    ) {
+        // The network aligns nothing.
+        let mut shifted = vec![0; offset];
+        shifted.extend(&bytes);
+        let unroll = UnrollBuffer::from_payload(&layout(), &shifted[offset..]).unwrap();
+        prop_assert_eq!(&unroll.to_bytes()[..], &bytes[..]);
+        prop_assert_eq!(&unroll.into_bytes()[..], &bytes[..]);
+    }
+
+    #[test]
+    fn no_other_length_is_an_unroll(bytes in prop::collection::vec(any::<u8>(), 0..2000)) {
+        prop_assume!(bytes.len() != layout().size());
+        let found = bytes.len();
+        let refused = UnrollBuffer::from_payload(&layout(), &bytes).err();
+        prop_assert_eq!(refused, Some(Invalid::Length { found, expected: layout().size() }));
+    }
+}

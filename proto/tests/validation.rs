@@ -1,0 +1,205 @@
+//! Whatever comes off the wire is either an unroll that makes sense or is refused by name.
+
+use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader, UnrollMessage};
+use comic_proto::{Expected, Field, Invalid, MAX_SEQUENCE, UnrollBuffer, UnrollLayout, UnrollShape, validate};
+use proptest::prelude::*;
+use prost::Message as _;
+
+const EXPECTED: Expected = Expected { clips: 4, epoch: 2, newest_version: 9 };
+
+fn layout() -> UnrollLayout {
+    UnrollLayout::new(UnrollShape { length: 4, proprioception: 3, task: 2, action: 2, latent: 2, reward_terms: 2 })
+}
+
+fn header() -> UnrollHeader {
+    let episode = EpisodeStatistics {
+        clip: 1,
+        steps: 7,
+        steps_left_at_start: 20,
+        returns: vec![1.5, 0.25],
+        end: EpisodeEnd::Terminated.into(),
+    };
+    UnrollHeader {
+        actor: 1,
+        incarnation: 77,
+        sequence: 5,
+        learner_epoch: 2,
+        version: 9,
+        layout_hash: layout().hash().to_vec(),
+        demonstration: false,
+        episodes: vec![episode],
+    }
+}
+
+/// An episode ends in row 1, the next begins in row 2.
+fn unroll() -> UnrollBuffer {
+    let mut unroll = UnrollBuffer::new(&layout());
+    for t in 0..4 {
+        unroll.row_mut(Field::Valid, t)[0] = if t == 1 { 0.0 } else { 1.0 };
+        unroll.row_mut(Field::Discount, t)[0] = 1.0;
+        unroll.row_mut(Field::First, t)[0] = if t == 2 { 1.0 } else { 0.0 };
+    }
+    for t in 0..5 {
+        unroll.set_clip(t, t as u32 % 4);
+    }
+    unroll
+}
+
+fn refusal(header: &UnrollHeader, unroll: &UnrollBuffer) -> Option<Invalid> {
+    validate(&layout(), header, &unroll.to_bytes(), &EXPECTED).err()
+}
+
+fn header_refusal(change: impl FnOnce(&mut UnrollHeader)) -> Option<Invalid> {
+    let mut header = header();
+    change(&mut header);
+    refusal(&header, &unroll())
+}
+
+fn payload_refusal(change: impl FnOnce(&mut UnrollBuffer)) -> Option<Invalid> {
+    let mut unroll = unroll();
+    change(&mut unroll);
+    refusal(&header(), &unroll)
+}
+
+#[test]
+fn an_unroll_that_makes_sense_passes() {
+    assert_eq!(refusal(&header(), &unroll()), None);
+}
+
+#[test]
+fn an_unroll_may_begin_in_the_middle_of_an_episode_or_with_its_first_observation() {
+    assert_eq!(payload_refusal(|unroll| unroll.row_mut(Field::First, 0)[0] = 1.0), None);
+}
+
+#[test]
+fn another_layout_is_refused() {
+    assert_eq!(header_refusal(|header| header.layout_hash[3] ^= 1), Some(Invalid::LayoutHash));
+    assert_eq!(header_refusal(|header| header.layout_hash.clear()), Some(Invalid::LayoutHash));
+}
+
+#[test]
+fn the_future_is_refused_and_the_past_is_not_this_check_s_affair() {
+    assert_eq!(header_refusal(|header| header.learner_epoch = 3), Some(Invalid::Epoch { found: 3, newest: 2 }));
+    assert_eq!(header_refusal(|header| header.version = 10), Some(Invalid::Version { found: 10, newest: 9 }));
+    assert_eq!(header_refusal(|header| header.version = 0), None);
+    assert_eq!(
+        header_refusal(|header| (header.learner_epoch, header.version) = (1, 1000)),
+        None,
+        "another epoch's versions say nothing here"
+    );
+}
+
+#[test]
+fn a_sequence_number_no_actor_can_have_reached_is_refused() {
+    assert_eq!(header_refusal(|header| header.sequence = MAX_SEQUENCE - 1), None);
+    assert_eq!(
+        header_refusal(|header| header.sequence = MAX_SEQUENCE),
+        Some(Invalid::Sequence { sequence: MAX_SEQUENCE })
+    );
+}
+
+#[test]
+fn episode_statistics_are_limited_in_number_and_have_to_make_sense() {
+    let episode = |change: fn(&mut EpisodeStatistics)| header_refusal(|header| change(&mut header.episodes[0]));
+    assert_eq!(
+        header_refusal(|header| header.episodes = vec![header.episodes[0].clone(); 6]),
+        Some(Invalid::Episodes { found: 6, limit: 5 })
+    );
+    for broken in [
+        episode(|episode| episode.clip = 4),
+        episode(|episode| episode.steps = 0),
+        episode(|episode| episode.steps_left_at_start = 0),
+        episode(|episode| episode.returns.truncate(1)),
+        episode(|episode| episode.returns[1] = f32::NAN),
+        episode(|episode| episode.end = 0),
+        episode(|episode| episode.end = 99),
+    ] {
+        assert!(matches!(broken, Some(Invalid::Episode { .. })), "{broken:?}");
+    }
+}
+
+#[test]
+fn numbers_that_are_not_finite_are_refused_wherever_they_stand() {
+    for field in Field::ALL.into_iter().filter(|field| *field != Field::Clip) {
+        for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            let row = layout().rows(field) - 1;
+            let refused = payload_refusal(|unroll| *unroll.row_mut(field, row).last_mut().unwrap() = value);
+            assert_eq!(refused, Some(Invalid::NotFinite { field, row }));
+        }
+    }
+}
+
+#[test]
+fn each_field_keeps_to_its_range() {
+    let cases = [(Field::Std, 0.0), (Field::Std, -1.0), (Field::Discount, 1.5), (Field::Valid, 0.5), (Field::First, 2.0)];
+    for (name, number) in cases {
+        let refused = payload_refusal(|unroll| unroll.row_mut(name, 3)[0] = number);
+        let expected = matches!(
+            refused,
+            Some(Invalid::Range { field, row: 3, value, .. }) if field == name && value == number
+        );
+        assert!(expected, "{name} = {number}: {refused:?}");
+    }
+}
+
+#[test]
+fn an_episode_begins_exactly_after_a_row_without_a_transition() {
+    assert_eq!(
+        payload_refusal(|unroll| unroll.row_mut(Field::First, 2)[0] = 0.0),
+        Some(Invalid::Boundary { row: 1 })
+    );
+    assert_eq!(
+        payload_refusal(|unroll| unroll.row_mut(Field::First, 4)[0] = 1.0),
+        Some(Invalid::Boundary { row: 3 })
+    );
+}
+
+#[test]
+fn a_clip_the_task_does_not_have_is_refused_even_if_its_bits_were_no_number() {
+    let refused = |clip| payload_refusal(|unroll| unroll.set_clip(4, clip));
+    assert_eq!(refused(4), Some(Invalid::Clip { clip: 4, row: 4, clips: 4 }));
+    assert_eq!(refused(u32::MAX), Some(Invalid::Clip { clip: u32::MAX, row: 4, clips: 4 }));
+}
+
+proptest! {
+    #[test]
+    fn bytes_at_random_never_panic(
+        payload in prop::collection::vec(any::<u8>(), 0..600),
+        hash in prop::collection::vec(any::<u8>(), 0..40),
+        message in prop::collection::vec(any::<u8>(), 0..300),
+    ) {
+        let mut header = header();
+        let _ = validate(&layout(), &header, &payload, &EXPECTED);
+        header.layout_hash = hash;
+        let _ = validate(&layout(), &header, &payload, &EXPECTED);
+        if let Ok(UnrollMessage { header: Some(header), payload }) = UnrollMessage::decode(&message[..]) {
+            let _ = validate(&layout(), &header, &payload, &EXPECTED);
+        }
+    }
+
+    #[test]
+    fn one_flipped_bit_passes_only_where_the_number_still_makes_sense(
+        place in 0..layout().size(),
+        bit in 0u8..8,
+    ) {
+        let mut payload = unroll().to_bytes().to_vec();
+        payload[place] ^= 1 << bit;
+        if validate(&layout(), &header(), &payload, &EXPECTED).is_ok() {
+            let unroll = UnrollBuffer::from_payload(&layout(), &payload).unwrap();
+            for field in Field::ALL.into_iter().filter(|field| *field != Field::Clip) {
+                for t in 0..layout().rows(field) {
+                    prop_assert!(unroll.row(field, t).iter().all(|value| value.is_finite()));
+                }
+            }
+            prop_assert!((0..5).all(|t| unroll.clip(t) < 4));
+            prop_assert!((0..4).all(|t| unroll.row(Field::Std, t).iter().all(|std| *std > 0.0)));
+        }
+    }
+
+    #[test]
+    fn any_length_but_the_layout_s_is_refused(length in 0usize..2000) {
+        prop_assume!(length != layout().size());
+        let refused = validate(&layout(), &header(), &vec![0; length], &EXPECTED).err();
+        prop_assert_eq!(refused, Some(Invalid::Length { found: length, expected: layout().size() }));
+    }
+}

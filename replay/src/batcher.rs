@@ -1,0 +1,353 @@
+//! Where network tasks and the trainer meet.
+
+use std::fmt;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use comic_proto::UnrollLayout;
+use comic_proto::v1::UnrollHeader;
+use tokio::sync::Semaphore;
+
+use crate::batch::{Batch, Buffer};
+use crate::ledger::{Books, JoinError, Joined, Ledger, Reason, Sighting};
+use crate::snapshot::Snapshot;
+
+/// One batch is open, one is full, one is being trained on.
+const BUFFERS: usize = 3;
+
+/// What does not change while a batcher lives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Config {
+    /// B: unrolls a batch, at least 1.
+    pub unrolls: usize,
+    /// An unroll may be so many published versions old.
+    pub max_staleness: u64,
+}
+
+/// What the trainer wants at this moment.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Phase {
+    /// This life of the learner.
+    pub epoch: u64,
+    /// The newest published version; versions count publications.
+    pub version: u64,
+    /// Demonstrations instead of the policy's own unrolls.
+    pub demonstration: bool,
+}
+
+/// What became of an unroll.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// It is in a batch.
+    Taken,
+    /// Dropped: its parameters are too old.
+    Stale,
+    /// Dropped: it is no unroll of this layout, or was refused as invalid.
+    Invalid,
+    /// Dropped: of another epoch or phase.
+    Superseded,
+    /// Accounted for before.
+    Duplicate,
+    /// This actor and incarnation have no account: they have to join first.
+    NotJoined,
+    /// The batcher is closed; nothing was recorded.
+    Closed,
+}
+
+/// What waiting for a batch led to.
+#[derive(Debug)]
+pub enum Next {
+    /// A full batch.
+    Batch(Batch),
+    /// The time is over.
+    Elapsed,
+    /// The batcher is closed.
+    Closed,
+}
+
+struct State {
+    ledger: Ledger,
+    phase: Phase,
+    open: Option<Buffer>,
+    full: Option<Buffer>,
+    free: Vec<Buffer>,
+    /// Unrolls in batches the trainer holds.
+    taken: usize,
+    closed: bool,
+}
+
+struct Inner {
+    layout: Arc<UnrollLayout>,
+    config: Config,
+    /// Everything that must agree with everything else stands behind this one lock.
+    state: Mutex<State>,
+    /// A permit for each slot of the open batch that is neither filled nor promised to somebody: first come, first
+    /// served, and a waiting insert costs no memory but its own.
+    slots: Semaphore,
+    filled: Condvar,
+}
+
+/// Bounded, exactly-once assembly of batches; a handle that can be cloned. See the crate's rules.
+#[derive(Clone)]
+pub struct Batcher {
+    inner: Arc<Inner>,
+}
+
+impl Batcher {
+    /// An empty batcher that carries on these books.
+    pub fn new(layout: Arc<UnrollLayout>, config: Config, phase: Phase, ledger: Ledger) -> Self {
+        let config = Config { unrolls: config.unrolls.max(1), ..config };
+        let mut free: Vec<_> = (0..BUFFERS).map(|_| Buffer::new(&layout, config.unrolls)).collect();
+        let open = free.pop();
+        let state = Mutex::new(State { ledger, phase, open, full: None, free, taken: 0, closed: false });
+        let slots = Semaphore::new(config.unrolls);
+        Self { inner: Arc::new(Inner { layout, config, state, slots, filled: Condvar::new() }) }
+    }
+
+    /// Opens an account, or finds the one this incarnation has; see [`Ledger::join`].
+    ///
+    /// # Errors
+    /// [`JoinError::Closed`] when it had an account that was closed.
+    pub fn join(&self, incarnation: u64, claimed: Option<u64>) -> Result<Joined, JoinError> {
+        self.lock().ledger.join(incarnation, claimed)
+    }
+
+    /// Puts a validated unroll into a batch, waiting for a slot as long as it takes, or says why not.
+    ///
+    /// Cancel-safe: until it returns, nothing has happened.
+    pub async fn insert(&self, header: &UnrollHeader, payload: Bytes) -> Outcome {
+        // What is refused anyway does not queue for a slot.
+        if let Some(outcome) = self.refuse(&mut self.lock(), header, &payload) {
+            return outcome;
+        }
+        let Ok(slot) = self.inner.slots.acquire().await else { return Outcome::Closed };
+        let mut state = self.lock();
+        if let Some(outcome) = self.refuse(&mut state, header, &payload) {
+            return outcome;
+        }
+        let State { ledger, open: Some(open), .. } = &mut *state else { return Outcome::Closed };
+        if !ledger.record(header.actor, header.sequence) {
+            ledger.sums.unattributed += 1;
+            return Outcome::Invalid;
+        }
+        open.push(&self.inner.layout, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
+        slot.forget();
+        self.settle(&mut state);
+        Outcome::Taken
+    }
+
+    /// Records an unroll that failed validation: dropped as invalid if its header has an account, or else refused
+    /// without one.
+    pub fn refuse_invalid(&self, header: &UnrollHeader) -> Outcome {
+        let mut state = self.lock();
+        if state.closed {
+            return Outcome::Closed;
+        }
+        if let Some(outcome) = refuse_unaccountable(&mut state.ledger, header) {
+            return outcome;
+        }
+        drop_unroll(&mut state.ledger, header, Reason::Invalid)
+    }
+
+    /// Counts a message without so much as a header.
+    pub fn refuse_unattributed(&self) {
+        self.lock().ledger.sums.unattributed += 1;
+    }
+
+    /// Says what is wanted from now on. What waits in the batcher for another epoch or phase is superseded.
+    pub fn set_phase(&self, phase: Phase) {
+        let mut state = self.lock();
+        let over = state.phase.epoch != phase.epoch || state.phase.demonstration != phase.demonstration;
+        state.phase = phase;
+        if !over {
+            return;
+        }
+        let mut dropped = 0;
+        if let Some(mut full) = state.full.take() {
+            dropped += full.len();
+            full.headers.clear();
+            state.free.push(full);
+        }
+        // The slots of a full open batch come back too; those promised to waiting inserts stay promised.
+        if let Some(open) = state.open.as_mut() {
+            dropped += open.len();
+            self.inner.slots.add_permits(open.len());
+            open.headers.clear();
+        }
+        state.ledger.sums.dropped.count(Reason::Superseded, dropped as u64);
+        self.settle(&mut state);
+    }
+
+    /// What is wanted at this moment.
+    pub fn phase(&self) -> Phase {
+        self.lock().phase
+    }
+
+    /// The next full batch; blocks the calling thread. `None` once the batcher is closed.
+    pub fn next_batch(&self) -> Option<Batch> {
+        loop {
+            match self.next_batch_within(Duration::MAX) {
+                Next::Batch(batch) => return Some(batch),
+                Next::Closed => return None,
+                Next::Elapsed => {}
+            }
+        }
+    }
+
+    /// The next full batch, if there is one within this time; blocks the calling thread.
+    pub fn next_batch_within(&self, patience: Duration) -> Next {
+        // Patience beyond what the clock can express is no deadline.
+        let deadline = Instant::now().checked_add(patience);
+        let mut state = self.lock();
+        loop {
+            if state.closed {
+                return Next::Closed;
+            }
+            if let Some(buffer) = state.full.take() {
+                state.taken += buffer.len();
+                self.settle(&mut state);
+                drop(state);
+                return Next::Batch(Batch::new(self.inner.layout.clone(), buffer, self.clone()));
+            }
+            let left = deadline.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
+            if left.is_zero() {
+                return Next::Elapsed;
+            }
+            state = self.inner.filled.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    /// Books a batch as trained on and takes its memory back.
+    pub fn trained(&self, batch: Batch) {
+        batch.finish(None);
+    }
+
+    /// Books a batch as dropped for this reason and takes its memory back.
+    pub fn discard(&self, batch: Batch, reason: Reason) {
+        batch.finish(Some(reason));
+    }
+
+    /// The books at this moment.
+    pub fn books(&self) -> Books {
+        let state = self.lock();
+        Books { in_flight: state.in_flight(), ..state.ledger.sums }
+    }
+
+    /// Books and accounts for a checkpoint.
+    pub fn snapshot(&self) -> Snapshot {
+        let state = self.lock();
+        state.ledger.snapshot(state.in_flight())
+    }
+
+    /// The layout of its unrolls.
+    pub fn layout(&self) -> &Arc<UnrollLayout> {
+        &self.inner.layout
+    }
+
+    /// Ends all waiting, of inserts and of the trainer, now and for ever.
+    pub fn close(&self) {
+        self.lock().closed = true;
+        self.inner.slots.close();
+        self.inner.filled.notify_all();
+    }
+
+    /// Takes a buffer back from a [`Batch`] whose unrolls were trained on, or dropped for a reason.
+    pub(crate) fn take_back(&self, mut buffer: Buffer, end: Option<Reason>) {
+        let mut state = self.lock();
+        let unrolls = buffer.len();
+        state.taken -= unrolls;
+        match end {
+            None => state.ledger.sums.trained += unrolls as u64,
+            Some(reason) => state.ledger.sums.dropped.count(reason, unrolls as u64),
+        }
+        buffer.headers.clear();
+        state.free.push(buffer);
+        self.settle(&mut state);
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        // Nothing in here panics half-way through a change; a poisoned lock means a bug elsewhere, not broken books.
+        self.inner.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Applies every rule that keeps an unroll out of a batch. `None`, and nothing recorded, if there is none.
+    fn refuse(&self, state: &mut State, header: &UnrollHeader, payload: &[u8]) -> Option<Outcome> {
+        if state.closed {
+            return Some(Outcome::Closed);
+        }
+        if let Some(outcome) = refuse_unaccountable(&mut state.ledger, header) {
+            return Some(outcome);
+        }
+        let Phase { epoch, version, demonstration } = state.phase;
+        let reason = if header.learner_epoch != epoch || header.demonstration != demonstration {
+            Reason::Superseded
+        } else if payload.len() != self.inner.layout.size() {
+            Reason::Invalid
+        } else if version.saturating_sub(header.version) > self.inner.config.max_staleness {
+            Reason::Stale
+        } else {
+            return None;
+        };
+        Some(drop_unroll(&mut state.ledger, header, reason))
+    }
+
+    /// Moves buffers on: a filled open batch becomes the full one when there is none, and a free buffer the open one.
+    fn settle(&self, state: &mut State) {
+        let filled = state.open.as_ref().is_some_and(|open| open.len() == self.inner.config.unrolls);
+        if filled && state.full.is_none() {
+            state.full = state.open.take();
+            self.inner.filled.notify_one();
+        }
+        if state.open.is_none()
+            && let Some(buffer) = state.free.pop()
+        {
+            state.open = Some(buffer);
+            self.inner.slots.add_permits(self.inner.config.unrolls);
+        }
+    }
+}
+
+impl State {
+    fn in_flight(&self) -> u64 {
+        let waiting: usize = [&self.open, &self.full].into_iter().flatten().map(Buffer::len).sum();
+        (waiting + self.taken) as u64
+    }
+}
+
+fn refuse_unaccountable(ledger: &mut Ledger, header: &UnrollHeader) -> Option<Outcome> {
+    match ledger.sight(header.actor, header.incarnation, header.sequence) {
+        Sighting::New => None,
+        Sighting::Duplicate => {
+            ledger.sums.duplicates += 1;
+            Some(Outcome::Duplicate)
+        }
+        Sighting::Broken => {
+            ledger.sums.unattributed += 1;
+            Some(Outcome::Invalid)
+        }
+        Sighting::Unknown => {
+            ledger.sums.unattributed += 1;
+            Some(Outcome::NotJoined)
+        }
+    }
+}
+
+fn drop_unroll(ledger: &mut Ledger, header: &UnrollHeader, reason: Reason) -> Outcome {
+    if !ledger.record(header.actor, header.sequence) {
+        ledger.sums.unattributed += 1;
+        return Outcome::Invalid;
+    }
+    ledger.sums.dropped.count(reason, 1);
+    match reason {
+        Reason::Stale => Outcome::Stale,
+        Reason::Invalid => Outcome::Invalid,
+        Reason::Superseded | Reason::LostAtRestart => Outcome::Superseded,
+    }
+}
+
+impl fmt::Debug for Batcher {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.debug_struct("Batcher").field("books", &self.books()).finish_non_exhaustive()
+    }
+}

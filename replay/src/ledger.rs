@@ -1,0 +1,229 @@
+//! Who sent what, and what became of it.
+
+use std::collections::HashMap;
+
+use comic_proto::MAX_SEQUENCE;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// Sums over every unroll ever produced for this run.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Books {
+    /// Unrolls the sequence numbers speak of.
+    pub produced: u64,
+    /// Unrolls trained on.
+    pub trained: u64,
+    /// Unrolls that never will be, by reason.
+    pub dropped: Dropped,
+    /// Unrolls in a batch that is open, full, or being trained on.
+    pub in_flight: u64,
+    /// Messages that repeated an unroll already accounted for; not in the sum.
+    pub duplicates: u64,
+    /// Messages refused without an account to charge; not in the sum.
+    pub unattributed: u64,
+}
+
+impl Books {
+    /// Whether `produced = trained + dropped + in flight`.
+    pub fn balance(&self) -> bool {
+        [self.dropped.stale, self.dropped.invalid, self.dropped.superseded, self.dropped.lost_at_restart, self.in_flight]
+            .iter()
+            .try_fold(self.trained, |sum, part| sum.checked_add(*part))
+            == Some(self.produced)
+    }
+}
+
+/// Dropped unrolls by reason.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Dropped {
+    /// Made with parameters older than the experiment allows.
+    pub stale: u64,
+    /// Failed validation.
+    pub invalid: u64,
+    /// Made in another epoch, or for a phase that is over.
+    pub superseded: u64,
+    /// Taken by, or sent to, a life of the learner that ended before it trained on them.
+    pub lost_at_restart: u64,
+}
+
+impl Dropped {
+    /// All reasons together.
+    pub fn total(&self) -> u64 {
+        self.stale + self.invalid + self.superseded + self.lost_at_restart
+    }
+
+    pub(crate) fn count(&mut self, reason: Reason, unrolls: u64) {
+        *match reason {
+            Reason::Stale => &mut self.stale,
+            Reason::Invalid => &mut self.invalid,
+            Reason::Superseded => &mut self.superseded,
+            Reason::LostAtRestart => &mut self.lost_at_restart,
+        } += unrolls;
+    }
+}
+
+/// Why an unroll is not trained on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Reason {
+    /// See [`Dropped::stale`].
+    Stale,
+    /// See [`Dropped::invalid`].
+    Invalid,
+    /// See [`Dropped::superseded`].
+    Superseded,
+    /// See [`Dropped::lost_at_restart`].
+    LostAtRestart,
+}
+
+/// What an actor gets by joining.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Joined {
+    /// Its index.
+    pub actor: u64,
+    /// The first sequence number its account does not speak of.
+    pub next_sequence: u64,
+}
+
+/// Why an actor may not join.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum JoinError {
+    /// Its account was closed to make room for others.
+    #[error("the account of actor {actor}, incarnation {incarnation:016x}, was closed after a long silence: start the actor again")]
+    Closed {
+        /// The index it had.
+        actor: u64,
+        /// Who asked.
+        incarnation: u64,
+    },
+}
+
+/// One incarnation's account.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Entry {
+    pub(crate) incarnation: u64,
+    pub(crate) next_sequence: u64,
+    /// When it was last heard of, on the ledger's own clock.
+    pub(crate) heard: u64,
+}
+
+/// What the accounts say about a number.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Sighting {
+    /// Not accounted for yet.
+    New,
+    /// Accounted for.
+    Duplicate,
+    /// No number an actor can have reached.
+    Broken,
+    /// Nobody's.
+    Unknown,
+}
+
+/// Every actor's account, and the sums. See the crate's rules.
+#[derive(Clone, Debug)]
+pub struct Ledger {
+    pub(crate) entries: HashMap<u64, Entry>,
+    pub(crate) actors: HashMap<u64, u64>,
+    pub(crate) next_actor: u64,
+    pub(crate) clock: u64,
+    capacity: usize,
+    /// All but `in_flight`, which the batcher counts in its buffers.
+    pub(crate) sums: Books,
+}
+
+impl Default for Ledger {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Ledger {
+    /// Accounts that can be open at once: above any number of actors that can be connected, a few MB of memory.
+    pub const CAPACITY: usize = 65_536;
+
+    /// The ledger of a new run.
+    pub fn new() -> Self {
+        Self::with_capacity(Self::CAPACITY)
+    }
+
+    /// A ledger with room for this many open accounts, at least one.
+    pub fn with_capacity(capacity: usize) -> Self {
+        Self {
+            entries: HashMap::new(),
+            actors: HashMap::new(),
+            next_actor: 0,
+            clock: 0,
+            capacity: capacity.max(1),
+            sums: Books::default(),
+        }
+    }
+
+    /// Opens an account, or finds the one this incarnation has. `claimed` is the index the actor says it had.
+    ///
+    /// # Errors
+    /// [`JoinError::Closed`] when it had an account that was closed.
+    pub fn join(&mut self, incarnation: u64, claimed: Option<u64>) -> Result<Joined, JoinError> {
+        self.clock += 1;
+        if let Some(actor) = self.actors.get(&incarnation)
+            && let Some(entry) = self.entries.get_mut(actor)
+        {
+            entry.heard = self.clock;
+            return Ok(Joined { actor: *actor, next_sequence: entry.next_sequence });
+        }
+        // Every index below `next_actor` was given out in this run. One without an entry was closed. One that belongs
+        // to somebody else was given out anew after a restart that did not know the claimant; that one starts afresh,
+        // and so does a claimant of an index this life of the learner has not reached.
+        if let Some(actor) = claimed.filter(|actor| *actor < self.next_actor && !self.entries.contains_key(actor)) {
+            return Err(JoinError::Closed { actor, incarnation });
+        }
+        if self.entries.len() >= self.capacity {
+            self.close_least_recent();
+        }
+        let actor = self.next_actor;
+        self.next_actor += 1;
+        self.entries.insert(actor, Entry { incarnation, next_sequence: 0, heard: self.clock });
+        self.actors.insert(incarnation, actor);
+        Ok(Joined { actor, next_sequence: 0 })
+    }
+
+    fn close_least_recent(&mut self) {
+        let least = self.entries.iter().min_by_key(|(_, entry)| entry.heard).map(|(actor, _)| *actor);
+        if let Some(entry) = least.and_then(|actor| self.entries.remove(&actor)) {
+            self.actors.remove(&entry.incarnation);
+        }
+    }
+
+    /// Open accounts.
+    pub fn open_accounts(&self) -> usize {
+        self.entries.len()
+    }
+
+    pub(crate) fn sight(&self, actor: u64, incarnation: u64, sequence: u64) -> Sighting {
+        match self.entries.get(&actor) {
+            Some(entry) if entry.incarnation != incarnation => Sighting::Unknown,
+            Some(_) if sequence >= MAX_SEQUENCE => Sighting::Broken,
+            Some(entry) if sequence < entry.next_sequence => Sighting::Duplicate,
+            Some(_) => Sighting::New,
+            None => Sighting::Unknown,
+        }
+    }
+
+    /// Accounts for a number that [`sight`](Self::sight) called new. False, and nothing changed, if it is not, or if
+    /// the sum of all numbers would leave its range (then no other sum can).
+    pub(crate) fn record(&mut self, actor: u64, sequence: u64) -> bool {
+        let Some(entry) = self.entries.get_mut(&actor) else { return false };
+        let Some(skipped) = sequence.checked_sub(entry.next_sequence) else { return false };
+        let Some(produced) = self.sums.produced.checked_add(skipped).and_then(|sum| sum.checked_add(1)) else {
+            return false;
+        };
+        self.clock += 1;
+        entry.heard = self.clock;
+        entry.next_sequence = sequence + 1;
+        self.sums.produced = produced;
+        self.sums.dropped.count(Reason::LostAtRestart, skipped);
+        true
+    }
+}

@@ -1,0 +1,167 @@
+//! Memory is bounded: who comes when the batches are full waits, and whoever waits can leave.
+
+mod common;
+
+use std::time::Duration;
+
+use common::{Actor, CONFIG, PHASE, SLOTS, batch_now, batcher, now, payload};
+use comic_replay::{Next, Outcome, Phase};
+
+#[test]
+fn nothing_more_is_taken_than_an_open_and_a_full_batch() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    for sequence in 0..SLOTS as u64 {
+        assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
+    }
+    assert_eq!(actor.send(&batcher, SLOTS as u64), None);
+    assert_eq!(batcher.books().in_flight, SLOTS as u64);
+    assert_eq!(batcher.books().produced, SLOTS as u64, "waiting left no trace");
+}
+
+#[test]
+fn what_is_refused_anyway_does_not_wait() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    for sequence in 0..SLOTS as u64 {
+        assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
+    }
+    assert_eq!(actor.send(&batcher, 0), Some(Outcome::Duplicate));
+    let mut header = actor.header(6);
+    header.learner_epoch = 0;
+    assert_eq!(common::insert_now(&batcher, &header), Some(Outcome::Superseded));
+}
+
+#[test]
+fn waiting_inserts_get_their_slots_in_the_order_they_came() {
+    let batcher = batcher();
+    let filler = Actor::join(&batcher, 5);
+    for sequence in 0..SLOTS as u64 {
+        assert_eq!(filler.send(&batcher, sequence), Some(Outcome::Taken));
+    }
+    let headers: Vec<_> = (10..14).map(|incarnation| Actor::join(&batcher, incarnation).header(0)).collect();
+    let mut waiting: Vec<_> = headers.iter().map(|header| Box::pin(batcher.insert(header, payload(header)))).collect();
+    assert!(waiting.iter_mut().all(|insert| now(insert).is_none()));
+    // The second one leaves; nobody is held up by it.
+    drop(waiting.remove(1));
+    batcher.trained(batch_now(&batcher).unwrap());
+    assert!(waiting.iter_mut().all(|insert| now(insert) == Some(Outcome::Taken)));
+    batcher.trained(batch_now(&batcher).unwrap());
+    let actors: Vec<_> = batch_now(&batcher).unwrap().headers().iter().map(|header| header.actor).collect();
+    assert_eq!(actors, [headers[0].actor, headers[2].actor, headers[3].actor]);
+}
+
+#[test]
+fn of_two_copies_that_wait_one_is_taken() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    for sequence in 0..SLOTS as u64 {
+        assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
+    }
+    let header = actor.header(SLOTS as u64);
+    let mut old = Box::pin(batcher.insert(&header, payload(&header)));
+    let mut new = Box::pin(batcher.insert(&header, payload(&header)));
+    assert_eq!((now(&mut old), now(&mut new)), (None, None));
+    batcher.trained(batch_now(&batcher).unwrap());
+    assert_eq!((now(&mut old), now(&mut new)), (Some(Outcome::Taken), Some(Outcome::Duplicate)));
+    assert_eq!(batcher.books().produced, SLOTS as u64 + 1);
+}
+
+#[test]
+fn a_change_of_phase_wakes_those_who_wait_for_the_old_one() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    for sequence in 0..SLOTS as u64 {
+        assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
+    }
+    let header = actor.header(SLOTS as u64);
+    let mut waiting = Box::pin(batcher.insert(&header, payload(&header)));
+    assert_eq!(now(&mut waiting), None);
+    batcher.set_phase(Phase { demonstration: true, ..PHASE });
+    assert_eq!(now(&mut waiting), Some(Outcome::Superseded));
+}
+
+#[test]
+fn closing_ends_all_waiting_and_records_nothing() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    for sequence in 0..SLOTS as u64 {
+        assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
+    }
+    let header = actor.header(SLOTS as u64);
+    let mut waiting = Box::pin(batcher.insert(&header, payload(&header)));
+    assert_eq!(now(&mut waiting), None);
+    let before = batcher.books();
+    batcher.close();
+    assert_eq!(now(&mut waiting), Some(Outcome::Closed));
+    assert_eq!(actor.send(&batcher, 0), Some(Outcome::Closed));
+    assert_eq!(batcher.refuse_invalid(&header), Outcome::Closed);
+    assert!(batcher.next_batch().is_none());
+    assert_eq!(batcher.books(), before);
+}
+
+#[test]
+fn a_trainer_waits_for_a_batch_and_is_woken_by_its_last_unroll_or_by_the_end() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    assert!(matches!(batcher.next_batch_within(Duration::from_millis(1)), Next::Elapsed));
+    let (arrived, arrivals) = std::sync::mpsc::sync_channel(1);
+    let trainer = std::thread::spawn({
+        let batcher = batcher.clone();
+        move || {
+            while let Some(batch) = batcher.next_batch() {
+                batcher.trained(batch);
+                arrived.send(()).unwrap();
+            }
+        }
+    });
+    for sequence in 0..4 * CONFIG.unrolls as u64 {
+        assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
+        if (sequence + 1).is_multiple_of(CONFIG.unrolls as u64) {
+            arrivals.recv().unwrap();
+        }
+    }
+    batcher.close();
+    trainer.join().unwrap();
+    assert_eq!(batcher.books().trained, 12);
+}
+
+#[test]
+fn many_tasks_and_one_trainer_lose_nothing() {
+    const ACTORS: u64 = 8;
+    const EACH: u64 = 300;
+    let batcher = batcher();
+    let trainer = std::thread::spawn({
+        let batcher = batcher.clone();
+        move || {
+            let mut seen = std::collections::HashSet::new();
+            while seen.len() < (ACTORS * EACH) as usize {
+                let batch = batcher.next_batch().unwrap();
+                for header in batch.headers() {
+                    assert!(seen.insert((header.actor, header.sequence)), "trained on twice");
+                }
+                batcher.trained(batch);
+                assert!(batcher.books().balance());
+            }
+        }
+    });
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(3).build().unwrap();
+    runtime.block_on(async {
+        let senders = (0..ACTORS).map(|incarnation| {
+            let batcher = batcher.clone();
+            tokio::spawn(async move {
+                let actor = Actor::join(&batcher, incarnation);
+                for sequence in 0..EACH {
+                    let header = actor.header(sequence);
+                    assert_eq!(batcher.insert(&header, payload(&header)).await, Outcome::Taken);
+                }
+            })
+        });
+        for sender in senders.collect::<Vec<_>>() {
+            sender.await.unwrap();
+        }
+    });
+    trainer.join().unwrap();
+    let books = batcher.books();
+    assert_eq!((books.produced, books.trained, books.in_flight), (ACTORS * EACH, ACTORS * EACH, 0));
+}

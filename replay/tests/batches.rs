@@ -1,0 +1,81 @@
+//! A batch holds the unrolls that were put in, field by field, slot by slot.
+
+mod common;
+
+use common::{Actor, CONFIG, SLOTS, batch_now, batcher, layout, mark, payload};
+use comic_proto::{Field, Invalid};
+use comic_replay::{Batch, Outcome};
+
+fn assert_holds(batch: &Batch, expected: &[comic_proto::v1::UnrollHeader]) {
+    assert_eq!(batch.unrolls, expected.len());
+    for (slot, header) in expected.iter().enumerate() {
+        assert_eq!(batch.headers()[slot].sequence, header.sequence);
+        for field in Field::ALL.into_iter().filter(|field| *field != Field::Clip) {
+            let (rows, width) = (batch.layout.rows(field), batch.layout.width(field));
+            for t in 0..rows {
+                let start = (slot * rows + t) * width;
+                assert_eq!(batch.f32(field)[start..start + width], vec![mark(header, field, t); width], "{field}[{t}]");
+            }
+            assert_eq!(batch.f32(field).len(), expected.len() * rows * width);
+        }
+        assert_eq!(batch.clip()[slot * 3..(slot + 1) * 3], [header.sequence as u32; 3]);
+    }
+}
+
+#[test]
+fn fields_are_contiguous_and_in_order_of_arrival_also_when_buffers_are_used_again() {
+    let batcher = batcher();
+    let actors = [5, 6].map(|incarnation| Actor::join(&batcher, incarnation));
+    for round in 0..10 {
+        let mut sent = Vec::new();
+        for slot in 0..CONFIG.unrolls {
+            let actor = actors[slot % 2];
+            let header = actor.header(round * 2 + slot as u64 / 2);
+            assert_eq!(actor.send(&batcher, header.sequence), Some(Outcome::Taken));
+            sent.push(header);
+        }
+        let batch = batch_now(&batcher).unwrap();
+        assert_holds(&batch, &sent);
+        batcher.trained(batch);
+    }
+    assert_eq!(batcher.books().trained, 30);
+}
+
+#[test]
+fn while_one_batch_is_trained_on_the_next_two_are_assembled() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    for sequence in 0..3 {
+        assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
+    }
+    let first = batch_now(&batcher).unwrap();
+    for sequence in 3..3 + SLOTS as u64 {
+        assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
+    }
+    assert_eq!(actor.send(&batcher, 9), None);
+    assert_holds(&first, &[0, 1, 2].map(|sequence| actor.header(sequence)));
+    // A second one before the first is given back: allowed, and memory is still three batches.
+    let second = batch_now(&batcher).unwrap();
+    assert_holds(&second, &[3, 4, 5].map(|sequence| actor.header(sequence)));
+    assert_eq!(actor.send(&batcher, 9), None);
+    batcher.trained(first);
+    assert_eq!(actor.send(&batcher, 9), Some(Outcome::Taken));
+    assert_holds(&second, &[3, 4, 5].map(|sequence| actor.header(sequence)));
+    assert!(batcher.books().balance());
+}
+
+#[test]
+fn a_batch_can_be_assembled_from_a_recording() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    let recorded = [actor.header(7), actor.header(3)];
+    let unrolls: Vec<_> = recorded.iter().map(|header| (header.clone(), payload(header))).collect();
+    let batch = Batch::assemble(layout(), unrolls.clone()).unwrap();
+    assert_holds(&batch, &recorded);
+    batcher.trained(batch);
+    assert_eq!(batcher.books().trained, 0, "it was none of this batcher's");
+
+    let short = unrolls[0].1.slice(1..);
+    let refused = Batch::assemble(layout(), [(recorded[0].clone(), short)]).err();
+    assert_eq!(refused, Some(Invalid::Length { found: layout().size() - 1, expected: layout().size() }));
+}

@@ -1,0 +1,208 @@
+//! The law: produced = trained + dropped + in flight, whatever happens in whatever order, and nothing is trained on
+//! twice.
+
+mod common;
+
+use std::collections::{HashMap, HashSet};
+
+use common::{Actor, CONFIG, PHASE, batch_now, insert_now, layout};
+use comic_replay::{Batch, Batcher, Ledger, Outcome, Phase, Reason, Snapshot};
+use proptest::prelude::*;
+
+const ACTORS: u64 = 3;
+
+#[derive(Clone, Debug)]
+enum Event {
+    Send { actor: u64, skip: u64, version: u64, demonstration: bool },
+    SendAgain { actor: u64, back: u64 },
+    SendInvalid { actor: u64 },
+    SendUnknown,
+    Take,
+    Train,
+    Discard { reason: Reason },
+    LetGo,
+    NewVersion,
+    SwitchPhase,
+    Reconnect { actor: u64 },
+    Replace { actor: u64 },
+    Checkpoint,
+    Crash,
+}
+
+fn event() -> impl Strategy<Value = Event> {
+    let reason = prop_oneof![Just(Reason::Stale), Just(Reason::Superseded)];
+    prop_oneof![
+        20 => (0..ACTORS, prop_oneof![9 => Just(0u64), 1 => 1u64..5], 0u64..7, prop::bool::weighted(0.1))
+            .prop_map(|(actor, skip, version, demonstration)| Event::Send { actor, skip, version, demonstration }),
+        3 => (0..ACTORS, 1u64..5).prop_map(|(actor, back)| Event::SendAgain { actor, back }),
+        1 => (0..ACTORS).prop_map(|actor| Event::SendInvalid { actor }),
+        1 => Just(Event::SendUnknown),
+        4 => Just(Event::Take),
+        4 => Just(Event::Train),
+        1 => reason.prop_map(|reason| Event::Discard { reason }),
+        1 => Just(Event::LetGo),
+        2 => Just(Event::NewVersion),
+        1 => Just(Event::SwitchPhase),
+        1 => (0..ACTORS).prop_map(|actor| Event::Reconnect { actor }),
+        1 => (0..ACTORS).prop_map(|actor| Event::Replace { actor }),
+        1 => Just(Event::Checkpoint),
+        1 => Just(Event::Crash),
+    ]
+}
+
+/// What the test knows by itself of a run.
+#[derive(Clone, Default)]
+struct Known {
+    /// Next sequence number of each incarnation, as the learner should see it.
+    cursors: HashMap<u64, u64>,
+    trained: HashSet<(u64, u64)>,
+    refused: u64,
+}
+
+struct World {
+    batcher: Batcher,
+    phase: Phase,
+    actors: Vec<Actor>,
+    /// What each actor will number its next unroll; unlike the learner, it forgets nothing in a crash.
+    sequences: HashMap<u64, u64>,
+    incarnations: u64,
+    taken: Vec<Batch>,
+    known: Known,
+    checkpoint: (Snapshot, Known),
+}
+
+impl World {
+    fn new() -> Self {
+        let batcher = Batcher::new(layout(), CONFIG, PHASE, Ledger::new());
+        let actors = (0..ACTORS).map(|incarnation| Actor::join(&batcher, incarnation)).collect();
+        Self {
+            checkpoint: (batcher.snapshot(), Known::default()),
+            phase: PHASE,
+            actors,
+            sequences: HashMap::new(),
+            incarnations: ACTORS,
+            taken: Vec::new(),
+            known: Known::default(),
+            batcher,
+        }
+    }
+
+    fn send(&mut self, actor: u64, sequence: u64, version: u64, demonstration: bool) {
+        let actor = self.actors[actor as usize];
+        let mut header = actor.header(sequence);
+        header.learner_epoch = self.phase.epoch;
+        header.version = self.phase.version.saturating_sub(version);
+        header.demonstration = demonstration != self.phase.demonstration;
+        let outcome = insert_now(&self.batcher, &header);
+        let cursor = self.known.cursors.entry(actor.incarnation).or_default();
+        match outcome {
+            None => return,
+            Some(Outcome::Taken | Outcome::Stale | Outcome::Superseded) => {
+                assert!(sequence >= *cursor);
+                *cursor = sequence + 1;
+            }
+            Some(Outcome::Duplicate) => assert!(sequence < *cursor),
+            Some(other) => panic!("{other:?}"),
+        }
+        let next = self.sequences.entry(actor.incarnation).or_default();
+        *next = (*next).max(sequence + 1);
+    }
+
+    fn next_sequence(&self, actor: u64) -> u64 {
+        self.sequences.get(&self.actors[actor as usize].incarnation).copied().unwrap_or(0)
+    }
+
+    fn train(&mut self) {
+        let Some(batch) = self.taken.pop() else { return };
+        for header in batch.headers() {
+            assert!(self.known.trained.insert((header.incarnation, header.sequence)), "trained on twice");
+        }
+        self.batcher.trained(batch);
+    }
+
+    fn crash(&mut self) {
+        let (snapshot, known) = self.checkpoint.clone();
+        self.taken.clear();
+        self.known = known;
+        self.phase.epoch += 1;
+        self.batcher = Batcher::new(layout(), CONFIG, self.phase, Ledger::restore(&snapshot).unwrap());
+        for actor in &mut self.actors {
+            let joined = self.batcher.join(actor.incarnation, Some(actor.actor)).unwrap();
+            actor.actor = joined.actor;
+            let known = self.known.cursors.get(&actor.incarnation).copied().unwrap_or(0);
+            assert_eq!(joined.next_sequence, known, "the account is the checkpoint's");
+        }
+    }
+
+    fn happen(&mut self, event: Event) {
+        match event {
+            Event::Send { actor, skip, version, demonstration } => {
+                self.send(actor, self.next_sequence(actor) + skip, version, demonstration);
+            }
+            Event::SendAgain { actor, back } => {
+                if let Some(sequence) = self.next_sequence(actor).checked_sub(back) {
+                    self.send(actor, sequence, 0, false);
+                }
+            }
+            Event::SendInvalid { actor } => {
+                let (sequence, actor) = (self.next_sequence(actor), self.actors[actor as usize]);
+                assert_eq!(self.batcher.refuse_invalid(&actor.header(sequence)), Outcome::Invalid);
+                self.sequences.insert(actor.incarnation, sequence + 1);
+                self.known.cursors.insert(actor.incarnation, sequence + 1);
+            }
+            Event::SendUnknown => {
+                let stranger = Actor { actor: 0, incarnation: u64::MAX };
+                assert_eq!(stranger.send(&self.batcher, 0), Some(Outcome::NotJoined));
+                self.known.refused += 1;
+            }
+            Event::Take => self.taken.extend(batch_now(&self.batcher)),
+            Event::Train => self.train(),
+            Event::Discard { reason } => {
+                if let Some(batch) = self.taken.pop() {
+                    self.batcher.discard(batch, reason);
+                }
+            }
+            Event::LetGo => drop(self.taken.pop()),
+            Event::NewVersion => {
+                self.phase.version += 1;
+                self.batcher.set_phase(self.phase);
+            }
+            Event::SwitchPhase => {
+                self.phase.demonstration = !self.phase.demonstration;
+                self.batcher.set_phase(self.phase);
+            }
+            Event::Reconnect { actor } => {
+                let actor = self.actors[actor as usize];
+                assert_eq!(self.batcher.join(actor.incarnation, Some(actor.actor)).unwrap().actor, actor.actor);
+            }
+            Event::Replace { actor } => {
+                self.actors[actor as usize] = Actor::join(&self.batcher, self.incarnations);
+                self.incarnations += 1;
+            }
+            Event::Checkpoint => self.checkpoint = (self.batcher.snapshot(), self.known.clone()),
+            Event::Crash => self.crash(),
+        }
+    }
+
+    fn check(&self) {
+        let books = self.batcher.books();
+        assert!(books.balance(), "{books:?}");
+        assert_eq!(books.produced, self.known.cursors.values().sum::<u64>(), "what the sequence numbers say");
+        assert_eq!(books.trained, self.known.trained.len() as u64);
+        assert_eq!(books.unattributed, self.known.refused);
+        assert!(books.in_flight <= 3 * CONFIG.unrolls as u64);
+        assert_eq!(self.batcher.snapshot().books, books);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(500))]
+    #[test]
+    fn at_any_moment_of_any_history(events in prop::collection::vec(event(), 1..200)) {
+        let mut world = World::new();
+        for event in events {
+            world.happen(event);
+            world.check();
+        }
+    }
+}

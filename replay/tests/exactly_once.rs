@@ -1,0 +1,136 @@
+//! Each unroll is taken at most once, and every refusal has a reason that is counted.
+
+mod common;
+
+use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, payload};
+use comic_proto::MAX_SEQUENCE;
+use comic_replay::{Dropped, Outcome, Phase, Reason};
+
+#[test]
+fn an_unroll_sent_twice_is_taken_once() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    assert_eq!(actor.send(&batcher, 0), Some(Outcome::Taken));
+    assert_eq!(actor.send(&batcher, 0), Some(Outcome::Duplicate));
+    assert_eq!(actor.send(&batcher, 1), Some(Outcome::Taken));
+    assert_eq!(actor.send(&batcher, 0), Some(Outcome::Duplicate));
+    let books = batcher.books();
+    assert_eq!((books.produced, books.in_flight, books.duplicates), (2, 2, 2));
+}
+
+#[test]
+fn skipped_sequence_numbers_were_lost_and_do_not_come_back() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    assert_eq!(actor.send(&batcher, 4), Some(Outcome::Taken));
+    assert_eq!(actor.send(&batcher, 2), Some(Outcome::Duplicate));
+    let books = batcher.books();
+    assert_eq!((books.produced, books.in_flight, books.dropped.lost_at_restart), (5, 1, 4));
+}
+
+#[test]
+fn two_incarnations_count_apart() {
+    let batcher = batcher();
+    let (one, other) = (Actor::join(&batcher, 5), Actor::join(&batcher, 6));
+    assert_ne!(one.actor, other.actor);
+    assert_eq!(one.send(&batcher, 0), Some(Outcome::Taken));
+    assert_eq!(other.send(&batcher, 0), Some(Outcome::Taken));
+    assert_eq!(batcher.books().produced, 2);
+}
+
+#[test]
+fn nobody_is_charged_for_a_message_without_an_account() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    let stranger = Actor { actor: 9, ..actor };
+    let impostor = Actor { incarnation: 6, ..actor };
+    assert_eq!(stranger.send(&batcher, 0), Some(Outcome::NotJoined));
+    assert_eq!(impostor.send(&batcher, 0), Some(Outcome::NotJoined));
+    assert_eq!(batcher.refuse_invalid(&stranger.header(0)), Outcome::NotJoined);
+    assert_eq!(actor.send(&batcher, MAX_SEQUENCE), Some(Outcome::Invalid));
+    assert_eq!(actor.send(&batcher, u64::MAX), Some(Outcome::Invalid));
+    batcher.refuse_unattributed();
+    let books = batcher.books();
+    assert_eq!((books.produced, books.unattributed), (0, 6));
+    assert_eq!(actor.send(&batcher, 0), Some(Outcome::Taken), "its account was not spoilt");
+}
+
+#[test]
+fn invalid_unrolls_are_dropped_once_and_the_next_one_is_welcome() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    assert_eq!(batcher.refuse_invalid(&actor.header(0)), Outcome::Invalid);
+    assert_eq!(batcher.refuse_invalid(&actor.header(0)), Outcome::Duplicate);
+    let short = common::now(&mut Box::pin(batcher.insert(&actor.header(1), payload(&actor.header(1)).slice(4..))));
+    assert_eq!(short, Some(Outcome::Invalid), "the batcher itself takes no payload of another size");
+    assert_eq!(actor.send(&batcher, 2), Some(Outcome::Taken));
+    assert_eq!(batcher.books().dropped, Dropped { invalid: 2, ..Dropped::default() });
+}
+
+#[test]
+fn staleness_is_counted_in_published_versions() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    let mut header = actor.header(0);
+    header.version = PHASE.version - CONFIG.max_staleness;
+    assert_eq!(insert_now(&batcher, &header), Some(Outcome::Taken));
+    batcher.set_phase(Phase { version: PHASE.version + 1, ..PHASE });
+    header.sequence = 1;
+    assert_eq!(insert_now(&batcher, &header), Some(Outcome::Stale));
+    let books = batcher.books();
+    assert_eq!((books.dropped.stale, books.in_flight), (1, 1), "a new version takes nothing away from the open batch");
+}
+
+#[test]
+fn unrolls_of_another_epoch_or_phase_are_superseded() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    let (mut earlier, mut demonstration) = (actor.header(0), actor.header(1));
+    earlier.learner_epoch = 0;
+    demonstration.demonstration = true;
+    assert_eq!(insert_now(&batcher, &earlier), Some(Outcome::Superseded));
+    assert_eq!(insert_now(&batcher, &demonstration), Some(Outcome::Superseded));
+    batcher.set_phase(Phase { demonstration: true, ..PHASE });
+    demonstration.sequence = 2;
+    assert_eq!(insert_now(&batcher, &demonstration), Some(Outcome::Taken));
+    assert_eq!(batcher.books().dropped.superseded, 2);
+}
+
+#[test]
+fn a_change_of_phase_drops_what_waits_for_the_old_one() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    for sequence in 0..6 {
+        assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
+    }
+    assert_eq!(actor.send(&batcher, 6), None);
+    batcher.set_phase(Phase { demonstration: true, ..PHASE });
+    let books = batcher.books();
+    assert_eq!((books.dropped.superseded, books.in_flight), (6, 0));
+    assert!(batch_now(&batcher).is_none());
+    for sequence in 6..12 {
+        let mut header = actor.header(sequence);
+        header.demonstration = true;
+        assert_eq!(insert_now(&batcher, &header), Some(Outcome::Taken), "all slots are free again");
+    }
+    assert!(batcher.books().balance());
+}
+
+#[test]
+fn every_batch_ends_in_the_books_also_one_that_is_let_go() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    let mut sequences = 0..;
+    let mut next = || {
+        for sequence in sequences.by_ref().take(CONFIG.unrolls) {
+            assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
+        }
+        batch_now(&batcher).unwrap()
+    };
+    batcher.trained(next());
+    batcher.discard(next(), Reason::Stale);
+    drop(next());
+    let books = batcher.books();
+    assert_eq!((books.trained, books.dropped.stale, books.dropped.lost_at_restart), (3, 3, 3));
+    assert_eq!((books.produced, books.in_flight), (9, 0));
+}

@@ -1,0 +1,86 @@
+//! A checkpoint's books and accounts carry on in the next life of the learner.
+
+mod common;
+
+use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, layout};
+use comic_replay::{Batcher, Books, Dropped, Error, Ledger, Outcome, Phase, Snapshot};
+
+/// The next life of the learner, from what a checkpoint file would hold.
+fn restarted(snapshot: &Snapshot) -> Batcher {
+    let stored = serde_json::to_string(snapshot).unwrap();
+    let ledger = Ledger::restore(&serde_json::from_str(&stored).unwrap()).unwrap();
+    Batcher::new(layout(), CONFIG, Phase { epoch: PHASE.epoch + 1, ..PHASE }, ledger)
+}
+
+#[test]
+fn what_was_in_flight_at_the_checkpoint_is_lost_and_never_trained_on_later() {
+    let before = batcher();
+    let actor = Actor::join(&before, 5);
+    for sequence in 0..5 {
+        assert_eq!(actor.send(&before, sequence), Some(Outcome::Taken));
+    }
+    before.trained(batch_now(&before).unwrap());
+    let snapshot = before.snapshot();
+    assert_eq!((snapshot.books.trained, snapshot.books.in_flight), (3, 2));
+
+    let after = restarted(&snapshot);
+    let lost = Dropped { lost_at_restart: 2, ..Dropped::default() };
+    assert_eq!(after.books(), Books { produced: 5, trained: 3, dropped: lost, ..Books::default() });
+    let mut resent = actor.header(4);
+    resent.learner_epoch = PHASE.epoch + 1;
+    assert_eq!(insert_now(&after, &resent), Some(Outcome::Duplicate));
+}
+
+#[test]
+fn an_actor_that_reconnects_finds_its_account_and_the_learner_counts_what_it_missed() {
+    let before = batcher();
+    let actor = Actor::join(&before, 5);
+    assert_eq!(actor.send(&before, 0), Some(Outcome::Taken));
+    let snapshot = before.snapshot();
+    // These two were taken after the checkpoint, and are gone with the process. Unroll 3 was never answered.
+    assert_eq!(actor.send(&before, 1), Some(Outcome::Taken));
+    assert_eq!(actor.send(&before, 2), Some(Outcome::Taken));
+
+    let after = restarted(&snapshot);
+    let joined = after.join(5, Some(actor.actor)).unwrap();
+    assert_eq!((joined.actor, joined.next_sequence), (actor.actor, 1));
+    assert_eq!(actor.send(&after, 3), Some(Outcome::Superseded), "resent, but made in the life before");
+    let mut fresh = actor.header(4);
+    fresh.learner_epoch = PHASE.epoch + 1;
+    assert_eq!(insert_now(&after, &fresh), Some(Outcome::Taken));
+    let dropped = Dropped { lost_at_restart: 3, superseded: 1, ..Dropped::default() };
+    assert_eq!(after.books(), Books { produced: 5, dropped, in_flight: 1, ..Books::default() });
+}
+
+#[test]
+fn an_actor_the_checkpoint_does_not_know_starts_afresh() {
+    let before = batcher();
+    let snapshot = before.snapshot();
+    let late = Actor::join(&before, 5);
+    let after = restarted(&snapshot);
+    let newcomer = after.join(6, None).unwrap();
+    assert_eq!(newcomer.actor, late.actor, "that index was given out again");
+    let joined = after.join(5, Some(late.actor)).unwrap();
+    assert_ne!(joined.actor, newcomer.actor);
+    assert_eq!(joined.next_sequence, 0);
+}
+
+#[test]
+fn a_snapshot_that_contradicts_itself_is_refused() {
+    let before = batcher();
+    let actor = Actor::join(&before, 5);
+    assert_eq!(actor.send(&before, 0), Some(Outcome::Taken));
+    let good = before.snapshot();
+    let refusal = |change: fn(&mut Snapshot)| {
+        let mut snapshot = good.clone();
+        change(&mut snapshot);
+        Ledger::restore(&snapshot).err()
+    };
+    assert_eq!(refusal(|_| {}), None);
+    assert!(matches!(refusal(|snapshot| snapshot.books.trained += 1), Some(Error::Unbalanced { .. })));
+    assert!(matches!(refusal(|snapshot| snapshot.books.dropped.stale = u64::MAX), Some(Error::Unbalanced { .. })));
+    assert!(matches!(refusal(|snapshot| snapshot.accounts[0].next_sequence = 2), Some(Error::Unbalanced { .. })));
+    let repeated = |snapshot: &mut Snapshot| snapshot.accounts.push(snapshot.accounts[0]);
+    assert_eq!(refusal(repeated), Some(Error::Account { actor: 0 }));
+    assert_eq!(refusal(|snapshot| snapshot.next_actor = 0), Some(Error::Account { actor: 0 }));
+}

@@ -1,0 +1,195 @@
+//! One simulation of the tracking task.
+
+use std::sync::Arc;
+
+use comic_clips::pose_to_action;
+use mujoco_rs::prelude::*;
+use rand::SeedableRng;
+use rand_pcg::Pcg64;
+
+use crate::error::Error;
+use crate::observation::{ALL, Observation, PROPRIOCEPTION, View};
+use crate::physics::{Data, is_healthy};
+use crate::reference::Reference;
+use crate::tracking::TrackingTask;
+use crate::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Step, reward};
+
+/// An environment of a [`TrackingTask`]. Owns its simulation state and its random numbers, shares all else.
+#[derive(Debug)]
+pub struct TrackingEnvironment {
+    task: Arc<TrackingTask>,
+    data: Data,
+    random: Pcg64,
+    clip: usize,
+    /// Frames counted from the sub-range's first: where the episode started, where it is.
+    start: usize,
+    frame: usize,
+    /// `qpos` one control step ago.
+    previous: [f64; 63],
+    error: f64,
+    diverged: bool,
+}
+
+impl TrackingEnvironment {
+    pub(crate) fn new(task: Arc<TrackingTask>, seed: u64) -> Self {
+        let data = task.models.data();
+        let random = Pcg64::seed_from_u64(seed);
+        let mut environment =
+            Self { task, data, random, clip: 0, start: 0, frame: 0, previous: [0.0; 63], error: 0.0, diverged: false };
+        environment.reset();
+        environment
+    }
+
+    /// Begins an episode at frame `start` of clip `clip`, the frame counted from the clip's own first.
+    ///
+    /// # Errors
+    /// [`Error::Start`] when that is no frame of the clip's range from which a step can be made.
+    pub fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error> {
+        let (first, frames) = self
+            .task
+            .references
+            .get(clip)
+            .map_or((0, 0), |reference| (reference.first, reference.last_step(self.task.look_ahead)));
+        match start.checked_sub(first) {
+            Some(frame) if frame < frames => {
+                self.place(clip, frame);
+                Ok(())
+            }
+            _ => Err(Error::Start { clip, start, first, frames }),
+        }
+    }
+
+    /// One control step with the control in full precision; see [`Environment::step`].
+    ///
+    /// Nothing keeps a caller from stepping on after the episode's end: the physics goes on, references stay at the
+    /// clip's last frame. After a divergence every step reports it again until the next reset.
+    pub fn step_control(&mut self, control: &[f64; 56]) -> Step {
+        if self.diverged || !control.iter().all(|value| value.is_finite()) {
+            return self.diverge();
+        }
+        self.previous.copy_from_slice(self.data.qpos());
+        self.task.models.step(&mut self.data, control);
+        self.frame += 1;
+        if !is_healthy(&self.data) {
+            return self.diverge();
+        }
+        let Self { task, data, frame, .. } = self;
+        let (reference, config) = (&task.references[self.clip], &task.config);
+        self.error = reward::termination_error(config.termination_error, &task.walker, data, reference, *frame);
+        let reward_terms =
+            reward::terms(&task.walker, data, reference, *frame, self.error, config.termination_threshold);
+        let outcome = if self.error > config.termination_threshold {
+            Outcome::Terminated
+        } else if *frame >= reference.last_step(task.look_ahead) || data.time() >= config.time_limit {
+            Outcome::Truncated
+        } else {
+            Outcome::Running
+        };
+        Step { reward_terms, discount: if outcome == Outcome::Terminated { 0.0 } else { 1.0 }, outcome }
+    }
+
+    /// dm_control's whole observation dictionary, in its order, in full precision; for comparisons.
+    pub fn dictionary(&self) -> Vec<(&'static str, Vec<f64>)> {
+        let (view, steps) = (self.view(), self.task.config.reference_steps.len());
+        let value = |one: Observation| {
+            let mut value = vec![0.0; one.size(&self.task.walker, steps)];
+            one.write(&view, &mut value);
+            (one.name(), value)
+        };
+        ALL.iter().map(|one| value(*one)).collect()
+    }
+
+    /// The simulation itself, to look at.
+    pub fn simulation(&self) -> &MjData<Arc<MjModel>> {
+        &self.data
+    }
+
+    /// The current frame of the reference, counted from the first of the clip's range.
+    pub fn frame(&self) -> usize {
+        self.frame
+    }
+
+    /// ε after the last reset or step.
+    pub fn termination_error(&self) -> f64 {
+        self.error
+    }
+
+    fn place(&mut self, clip: usize, frame: usize) {
+        let Self { task, data, .. } = self;
+        let reference = &task.references[clip];
+        let preset = task.config.preset_actuators.then(|| pose_to_action(reference.joints(frame)));
+        let activation = preset.as_ref().map(<[f64; 56]>::as_slice).filter(|_| task.walker.activations == 56);
+        task.models.place(data, &reference.qpos(frame), &reference.qvel(frame), activation);
+        self.error =
+            reward::termination_error(task.config.termination_error, &task.walker, data, reference, frame);
+        self.previous.copy_from_slice(data.qpos());
+        (self.clip, self.start, self.frame, self.diverged) = (clip, frame, frame, false);
+    }
+
+    fn diverge(&mut self) -> Step {
+        self.diverged = true;
+        Step { reward_terms: [0.0; MAX_REWARD_TERMS], discount: 0.0, outcome: Outcome::Diverged }
+    }
+
+    fn reference(&self) -> &Reference {
+        &self.task.references[self.clip]
+    }
+
+    fn view(&self) -> View<'_> {
+        View {
+            walker: &self.task.walker,
+            data: &self.data,
+            reference: self.reference(),
+            steps: &self.task.config.reference_steps,
+            previous: &self.previous,
+            clip: self.clip,
+            start: self.start,
+            frame: self.frame,
+        }
+    }
+
+    fn write(&self, observations: &[Observation], out: &mut [f32]) {
+        if self.diverged {
+            out.fill(0.0);
+            return;
+        }
+        let (view, steps) = (self.view(), self.task.config.reference_steps.len());
+        let mut rest = out;
+        for one in observations {
+            let (place, after) = rest.split_at_mut(one.size(&self.task.walker, steps));
+            one.write(&view, place);
+            rest = after;
+        }
+    }
+}
+
+impl Environment for TrackingEnvironment {
+    fn reset(&mut self) {
+        let (clip, start) = self.task.starts.draw(&mut self.random);
+        let first = self.task.references[clip].first;
+        self.place(clip, start.saturating_sub(first));
+    }
+
+    fn step(&mut self, action: &[f32]) -> Step {
+        let Ok(action) = <&[f32; 56]>::try_from(action) else { return self.diverge() };
+        self.step_control(&action.map(f64::from))
+    }
+
+    fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
+        self.write(&PROPRIOCEPTION, proprioception);
+        self.write(&self.task.observations, task);
+    }
+
+    fn episode(&self) -> Episode {
+        let reference = self.reference();
+        let steps_left = reference.last_step(self.task.look_ahead).saturating_sub(self.start);
+        Episode { clip: self.clip, start: reference.first + self.start, steps_left }
+    }
+
+    fn servo_action(&self, action: &mut [f32]) {
+        let target = pose_to_action(self.reference().joints(self.frame + 1));
+        for (place, value) in action.iter_mut().zip(target) {
+            *place = value as f32;
+        }
+    }
+}

@@ -1,0 +1,97 @@
+//! Stepping MuJoCo the way dm_control does.
+
+use std::sync::Arc;
+
+use mujoco_rs::mujoco_c::mjtDisableBit;
+use mujoco_rs::prelude::*;
+
+use crate::error::Error;
+
+/// A simulation state on a shared model.
+pub(crate) type Data = MjData<Arc<MjModel>>;
+
+/// Beyond this MuJoCo calls a number bad (`mjMAXVAL`).
+const MAX_VALUE: f64 = 1e10;
+
+/// The compiled model, twice: as it is, and with the servos off, as dm_control computes an episode's first
+/// observation. Shared by all simulations.
+#[derive(Debug)]
+pub(crate) struct Models {
+    active: Arc<MjModel>,
+    passive: Arc<MjModel>,
+    /// Physics steps in a control step.
+    substeps: usize,
+}
+
+impl Models {
+    pub(crate) fn new(model: MjModel, substeps: usize) -> Self {
+        let mut passive = model.clone();
+        passive.opt_mut().disableflags |= mjtDisableBit::mjDSBL_ACTUATION as i32;
+        Self { active: Arc::new(model), passive: Arc::new(passive), substeps }
+    }
+
+    /// A new simulation state; its arena is 18 MB of which the operating system commits what is used.
+    pub(crate) fn data(&self) -> Data {
+        Data::new(Arc::clone(&self.active))
+    }
+
+    /// Puts the humanoid into a state and computes everything that follows from it without servo forces.
+    /// Filter states are 0 unless given.
+    pub(crate) fn place(&self, data: &mut Data, qpos: &[f64], qvel: &[f64], activation: Option<&[f64]>) {
+        data.reset();
+        data.qpos_mut().copy_from_slice(qpos);
+        data.qvel_mut().copy_from_slice(qvel);
+        if let Some(activation) = activation {
+            data.act_mut().copy_from_slice(activation);
+        }
+        // The two models differ in one option, so the exchange cannot fail.
+        if let Ok(active) = data.try_swap_model(Arc::clone(&self.passive)) {
+            data.forward();
+            let _ = data.try_swap_model(active);
+        }
+    }
+
+    /// One control step with the control held. Bitwise equal to dm_control's `mj_step2, mj_step1` loop, and cheaper
+    /// than `mj_step` alone: the first half of the first step is the `mj_forward` that ended the last control step.
+    /// That one is there for the accelerometer, touch and torque sensors.
+    pub(crate) fn step(&self, data: &mut Data, control: &[f64; 56]) {
+        data.ctrl_mut().copy_from_slice(control);
+        data.step2();
+        for _ in 1..self.substeps {
+            data.step();
+        }
+        data.forward();
+    }
+
+    /// The plain sequence, the yardstick of the benchmarks.
+    pub(crate) fn step_plainly(&self, data: &mut Data, control: &[f64; 56]) {
+        data.ctrl_mut().copy_from_slice(control);
+        for _ in 0..self.substeps {
+            data.step();
+        }
+        data.forward();
+    }
+}
+
+/// Whether the simulation since its last reset is free of MuJoCo warnings, and every number is a sane one.
+/// MuJoCo looks at positions and velocities only before a step, hence the second look here.
+pub(crate) fn is_healthy(data: &Data) -> bool {
+    let sane = |values: &[f64]| values.iter().all(|value| value.abs() < MAX_VALUE);
+    data.warning().iter().all(|warning| warning.number == 0)
+        && sane(data.qpos())
+        && sane(data.qvel())
+        && sane(data.qacc())
+}
+
+/// Substeps in a control step of `dt` seconds.
+pub(crate) fn substeps(clip: &str, dt: f64) -> Result<usize, Error> {
+    use crate::humanoid::PHYSICS_TIMESTEP;
+    let count = (dt / PHYSICS_TIMESTEP).round();
+    if count >= 1.0 && (count * PHYSICS_TIMESTEP - dt).abs() < 1e-9 {
+        return Ok(count as usize);
+    }
+    Err(Error::Clip {
+        clip: clip.into(),
+        reason: format!("dt = {dt} s is no multiple of the physics step of {PHYSICS_TIMESTEP} s; resample the clip"),
+    })
+}

@@ -1,0 +1,112 @@
+//! The tracking task against dm_control's own rollouts.
+//!
+//! `COMIC_GOLDEN_DIR` names a folder of rollouts (files `tracking_*.npz`, `tracking2019_*.npz` and the `.h5` files of
+//! their clips); without it the repository's own are used. Every number of every row is compared.
+
+mod support {
+    pub(crate) mod npz;
+    pub(crate) mod rollout;
+}
+
+use support::npz::{Array, Values};
+use support::rollout::{KINDS, Rollout, folder, rollouts};
+
+fn all_rollouts() -> Vec<Rollout> {
+    let folder = folder();
+    let mut all = Vec::new();
+    for kind in KINDS {
+        let found = rollouts(&folder, kind).unwrap();
+        if found.is_empty() {
+            eprintln!("reported: {} has no rollouts {kind}*.npz", folder.display());
+        }
+        all.extend(found);
+    }
+    assert!(!all.is_empty(), "{}: no rollouts at all; set COMIC_GOLDEN_DIR to a folder that has some", folder.display());
+    all
+}
+
+#[test]
+fn parity_of_every_rollout() {
+    let all = all_rollouts();
+    let differences: Vec<String> = all.iter().filter_map(|rollout| rollout.compare().err()).collect();
+    assert!(differences.is_empty(), "{} of {} rollouts differ:\n{}", differences.len(), all.len(), differences.join("\n"));
+    eprintln!("{} rollouts equal, {} rows", all.len(), all.iter().map(Rollout::rows).sum::<usize>());
+}
+
+/// The smallest change that a comparison must see: one unit in the last place where it is exact, else a billionth.
+fn altered(name: &str, value: f64) -> f64 {
+    match name {
+        _ if value.is_nan() => 0.25,
+        "qpos" | "qvel" | "act" | "time" | "qacc_warmstart_after_reset" => value.next_up(),
+        "clip" | "start" | "ncon" | "mocap_step" | "truncate" | "end_mocap" | "step_type" | "discount" => value + 1.0,
+        // Controls are clipped to their range, so the change goes inwards.
+        "actions" => value * 0.5 + if value == 0.0 { 0.5 } else { 0.0 },
+        _ => value + 1e-9,
+    }
+}
+
+fn alter(rollout: &Rollout, name: &str, index: usize) -> Rollout {
+    let mut copy = rollout.clone();
+    if let Some(Array { values: Values::Numbers(numbers), .. }) = copy.arrays.get_mut(name) {
+        numbers[index] = altered(name, numbers[index]);
+    }
+    copy
+}
+
+#[test]
+fn parity_fails_when_any_quantity_is_altered() {
+    let all = all_rollouts();
+    for kind in KINDS {
+        let Some(rollout) = all.iter().find(|rollout| rollout.file.starts_with(kind)) else { continue };
+        let rollout = rollout.clone().head(3);
+        rollout.compare().unwrap();
+        let names: Vec<String> = rollout.arrays.keys().cloned().collect();
+        for name in &names {
+            let length = match &rollout.arrays[name].values {
+                Values::Numbers(numbers) => numbers.len(),
+                Values::Text(_) => continue,
+            };
+            for index in [0, length / 2, length.saturating_sub(1)].into_iter().take(length) {
+                // What these two say of a reset is the end of the episode before.
+                if index == 0 && ["truncate", "end_mocap"].contains(&name.as_str()) {
+                    continue;
+                }
+                let outcome = alter(&rollout, name, index).compare();
+                assert!(outcome.is_err(), "{}: altering {name}[{index}] went unseen", rollout.file);
+            }
+        }
+    }
+}
+
+#[test]
+fn parity_fails_when_any_observation_is_altered() {
+    for rollout in all_rollouts().into_iter().take(1) {
+        let rollout = rollout.head(1);
+        let layout = rollout.layout().unwrap();
+        let width: usize = layout.iter().map(|(_, size)| size).sum();
+        let mut place = 0;
+        for (name, size) in layout {
+            if size > 0 {
+                for row in 0..2 {
+                    let difference = alter(&rollout, "obs", row * width + place).compare().unwrap_err();
+                    assert!(difference.contains(&format!("row {row}: {name}[0]")), "{difference}");
+                }
+            }
+            place += size;
+        }
+    }
+}
+
+#[test]
+fn parity_fails_when_names_are_altered() {
+    for rollout in all_rollouts().into_iter().take(1) {
+        let rollout = rollout.head(1);
+        for name in ["clip_id", "obs_layout", "reward_channels"] {
+            let mut copy = rollout.clone();
+            if let Some(Array { values: Values::Text(text), .. }) = copy.arrays.get_mut(name) {
+                text[0] = text[0].replacen(['a', 'S', 'c'], "x", 1);
+            }
+            assert!(copy.compare().is_err(), "altering {name} went unseen");
+        }
+    }
+}

@@ -1,0 +1,253 @@
+//! A learner and actors as real processes on this machine.
+
+use std::fs::{self, File, OpenOptions};
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail, ensure};
+use comic_proto::v1::learner_client::LearnerClient;
+use comic_proto::v1::{Books, Status, StatusRequest};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// How often a condition is looked at again.
+const POLL: Duration = Duration::from_millis(50);
+/// How long a status call may take.
+const CALL_LIMIT: Duration = Duration::from_secs(5);
+
+/// A program of this workspace, built beside the running test.
+///
+/// # Errors
+/// When it has not been built, with the command that does.
+pub fn program(name: &str) -> Result<PathBuf> {
+    let own = std::env::current_exe().context("cannot tell where this test lies")?;
+    // Tests lie in target/PROFILE/deps, programs in target/PROFILE.
+    let directory = own.ancestors().nth(2).context("this test lies in no target directory")?;
+    let path = directory.join(format!("{name}{}", std::env::consts::EXE_SUFFIX));
+    ensure!(
+        path.exists(),
+        "there is no {}: `cargo build --release --package comic-learner --package comic-actor` builds the programs \
+         (`cargo xtask test` does it by itself)",
+        path.display()
+    );
+    Ok(path)
+}
+
+/// A learner and actors that share one run; whatever is still there at the end of the test is killed.
+pub struct System {
+    directory: TempDir,
+    port: u16,
+    arguments: Vec<String>,
+    /// The learner's process, while there is one.
+    pub learner: Option<Process>,
+    started: usize,
+}
+
+impl System {
+    /// A run whose learner is started with `arguments`; nothing runs yet.
+    ///
+    /// # Errors
+    /// No directory or port to be had.
+    pub fn new(arguments: &[&str]) -> Result<Self> {
+        Ok(Self {
+            directory: tempfile::tempdir().context("cannot make a directory")?,
+            port: free_port()?,
+            arguments: arguments.iter().map(|argument| (*argument).to_owned()).collect(),
+            learner: None,
+            started: 0,
+        })
+    }
+
+    /// The run's directory.
+    pub fn run(&self) -> PathBuf {
+        self.directory.path().join("run")
+    }
+
+    /// Starts the learner, anew after it was killed, and returns its first status.
+    ///
+    /// # Errors
+    /// When it does not serve within `limit`, with the end of its log.
+    pub async fn start_learner(&mut self, limit: Duration) -> Result<Status> {
+        let mut command = Command::new(program("comic-learner")?);
+        command.args(&self.arguments).args(["--address", "127.0.0.1", "--port", &self.port.to_string()]);
+        command.arg("--run").arg(self.run());
+        self.learner = Some(self.spawn("learner", command)?);
+        self.until("the learner serves", limit, |status| Some(status.clone())).await
+    }
+
+    /// Starts an actor, which is told nothing but where the learner is.
+    ///
+    /// # Errors
+    /// When it cannot be started.
+    pub fn start_actor(&mut self) -> Result<Process> {
+        let mut command = Command::new(program("comic-actor")?);
+        command.args(["--learner", &format!("http://127.0.0.1:{}", self.port)]);
+        self.spawn("actor", command)
+    }
+
+    fn spawn(&mut self, kind: &str, mut command: Command) -> Result<Process> {
+        self.started += 1;
+        let log = self.directory.path().join(format!("{}-{kind}.log", self.started));
+        let output = OpenOptions::new().create(true).append(true).open(&log).context("cannot write a log")?;
+        // Nobody's own directories and settings decide what a test sees.
+        let home = self.directory.path().join("home");
+        fs::create_dir_all(&home).context("cannot make a home directory")?;
+        command.env("HOME", &home).env("XDG_CACHE_HOME", home.join("cache")).env_remove("RUST_LOG").env("NO_COLOR", "1");
+        let child = command.stdin(Stdio::null()).stdout(output.try_clone()?).stderr(output).spawn();
+        let child = child.with_context(|| format!("cannot start the {kind}"))?;
+        Ok(Process { child, log })
+    }
+
+    /// What the learner says of itself.
+    ///
+    /// # Errors
+    /// When it does not answer.
+    pub async fn status(&self) -> Result<Status> {
+        let address = format!("http://127.0.0.1:{}", self.port);
+        let call = async {
+            let mut client = LearnerClient::connect(address).await?;
+            anyhow::Ok(client.get_status(StatusRequest {}).await?.into_inner())
+        };
+        tokio::time::timeout(CALL_LIMIT, call).await.context("the learner does not answer")?
+    }
+
+    /// Polls the learner's status until `condition` gives something; books that do not balance end the test at once.
+    ///
+    /// # Errors
+    /// After `limit`, with `what` was waited for, the last status and the end of the learner's log; or when the learner
+    /// has ended.
+    pub async fn until<T>(
+        &mut self,
+        what: &str,
+        limit: Duration,
+        mut condition: impl FnMut(&Status) -> Option<T>,
+    ) -> Result<T> {
+        let deadline = Instant::now() + limit;
+        let mut last = String::from("none");
+        while Instant::now() < deadline {
+            match self.status().await {
+                Ok(status) => {
+                    let books = status.books.unwrap_or_default();
+                    ensure!(balance(&books), "{what}: the books do not balance: {books:?}");
+                    if let Some(found) = condition(&status) {
+                        return Ok(found);
+                    }
+                    last = format!("{status:?}");
+                }
+                Err(error) => last = format!("{error:#}"),
+            }
+            if let Some(learner) = &mut self.learner
+                && let Some(ended) = learner.ended()?
+            {
+                bail!("{what}: the learner ended with {ended}: {}", learner.log());
+            }
+            tokio::time::sleep(POLL).await;
+        }
+        let log = self.learner.as_ref().map(Process::log).unwrap_or_default();
+        bail!("{what}: not within {limit:?}; last status: {last}; learner's log: {log}")
+    }
+}
+
+/// produced = trained + dropped by reason + in flight.
+pub fn balance(books: &Books) -> bool {
+    let Books { produced, trained, in_flight, .. } = *books;
+    let dropped =
+        books.dropped_stale + books.dropped_invalid + books.dropped_superseded + books.dropped_lost_at_restart;
+    produced == trained + dropped + in_flight
+}
+
+/// A number in the status's metrics; 0 while there are none.
+pub fn metric(status: &Status, name: &str) -> f64 {
+    let metrics: Value = serde_json::from_str(&status.metrics_json).unwrap_or_default();
+    metrics[name].as_f64().unwrap_or_default()
+}
+
+/// A port that is free now, below the ephemeral range so that no client gets it while the learner is down.
+fn free_port() -> Result<u16> {
+    let offset = u16::try_from(std::process::id() % 10_000)?;
+    let candidates = (0..10_000).map(|step| 20_000 + (offset + step) % 10_000);
+    let mut free = candidates.filter(|port| TcpListener::bind(("127.0.0.1", *port)).is_ok());
+    free.next().context("no port from 20000 to 29999 is free")
+}
+
+/// A process with a log, killed when dropped.
+pub struct Process {
+    child: Child,
+    log: PathBuf,
+}
+
+impl Process {
+    /// Ends it on the spot (SIGKILL), as a power cut would.
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn kill(mut self) -> Result<()> {
+        self.child.kill().context("cannot kill")?;
+        self.child.wait().context("cannot wait")?;
+        Ok(())
+    }
+
+    /// Asks it to leave (SIGTERM) and waits.
+    ///
+    /// # Errors
+    /// When it is still there after `limit`.
+    pub async fn terminate(mut self, limit: Duration) -> Result<ExitStatus> {
+        let pid = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw).context("no process id")?;
+        kill_process(pid, Signal::TERM).context("cannot signal")?;
+        let deadline = Instant::now() + limit;
+        while Instant::now() < deadline {
+            if let Some(status) = self.ended()? {
+                return Ok(status);
+            }
+            tokio::time::sleep(POLL).await;
+        }
+        bail!("still there {limit:?} after SIGTERM: {}", self.log())
+    }
+
+    /// How it ended, if it has.
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn ended(&mut self) -> Result<Option<ExitStatus>> {
+        self.child.try_wait().context("cannot wait")
+    }
+
+    /// Everything it has written.
+    pub fn log(&self) -> String {
+        read(&self.log)
+    }
+
+    /// Waits until its log holds `text`.
+    ///
+    /// # Errors
+    /// When it ends or `limit` is over before that, with the log.
+    pub async fn until_log_holds(&mut self, text: &str, limit: Duration) -> Result<()> {
+        let deadline = Instant::now() + limit;
+        loop {
+            if self.log().contains(text) {
+                return Ok(());
+            }
+            let ended = self.ended()?;
+            if ended.is_some() || Instant::now() > deadline {
+                bail!("`{text}` is not in the log ({ended:?}): {}", self.log());
+            }
+            tokio::time::sleep(POLL).await;
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn read(path: &Path) -> String {
+    let mut text = Vec::new();
+    let _ = File::open(path).and_then(|mut file| std::io::Read::read_to_end(&mut file, &mut text));
+    String::from_utf8_lossy(&text).into_owned()
+}
