@@ -4,10 +4,8 @@
 fn main() {
     println!("cargo:rerun-if-env-changed=LIBTORCH");
     println!("cargo:rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
-    let directories = [
-        std::env::var("LIBTORCH").map(|root| format!("{root}/lib")),
-        std::env::var("MUJOCO_DYNAMIC_LINK_DIR"),
-    ];
+    let directories =
+        [std::env::var("LIBTORCH").map(|root| format!("{root}/lib")), std::env::var("MUJOCO_DYNAMIC_LINK_DIR")];
     for directory in directories.into_iter().flatten() {
         println!("cargo:rustc-link-arg=-Wl,-rpath,{directory}");
     }

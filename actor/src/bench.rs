@@ -1,6 +1,81 @@
-//! wip
-/// wip
-#[derive(clap::Args, Debug)]
-pub struct Bench {}
-impl Bench { /// wip
-pub fn run(&self)->Result<(),crate::Error>{Ok(())} }
+//! The figures of `comic-actor bench`: one JSON line each, medians of short interleaved segments.
+//!
+//! A figure stands beside its floor, measured in the same run: the physics alone, on the same model and the very same
+//! controls and starts (a tape records them). Other programs on the machine then slow both down alike.
+
+mod acting;
+mod figure;
+mod physics;
+mod tape;
+mod wire;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use clap::{Args, ValueEnum};
+use comic_clips::Catalogue;
+use comic_experiment::Experiment;
+use comic_tasks::TrackingTask;
+
+use crate::Error;
+
+/// Environments a thread wherever a policy acts.
+const ENVIRONMENTS: usize = 16;
+
+/// Measures how fast an actor is.
+///
+/// `ratio` is always value / floor. `actor.env`, `actor.policy`: steps/s, resets included, against the same controls
+/// through the physics alone. `actor.threads`: steps/s of two threads against one. `actor.reset`: ms. `actor.wire`: ms
+/// of one core that an update's worth of unrolls costs between a worker and a batch, against one second.
+#[derive(Args, Clone, Debug)]
+pub struct Bench {
+    /// Seconds for each figure.
+    #[arg(long, default_value_t = 15.0)]
+    seconds: f64,
+    /// Only these figures.
+    #[arg(value_enum)]
+    figures: Vec<Name>,
+}
+
+/// A figure's name, without `actor.`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Name {
+    Env,
+    Policy,
+    Threads,
+    Reset,
+    Wire,
+}
+
+/// What all figures are measured on: the paper's networks, one built-in walk.
+struct Subject {
+    experiment: Experiment,
+    task: Arc<TrackingTask>,
+    budget: Duration,
+}
+
+impl Bench {
+    /// Measures and prints.
+    ///
+    /// # Errors
+    /// Whatever keeps it from that.
+    pub fn run(&self) -> Result<(), Error> {
+        let budget = Duration::try_from_secs_f64(self.seconds)
+            .map_err(|error| Error::Usage(format!("--seconds {}: {error}", self.seconds)))?;
+        let experiment = Experiment::default();
+        let catalogue = Catalogue::open(&experiment.clips)?;
+        let task = Arc::new(TrackingTask::new(&experiment.task, &catalogue)?);
+        let subject = Subject { experiment, task, budget };
+        for name in Name::value_variants().iter().filter(|name| self.figures.is_empty() || self.figures.contains(name)) {
+            let figure = match name {
+                Name::Env => physics::environment(&subject),
+                Name::Policy => acting::policy(&subject)?,
+                Name::Threads => acting::threads(&subject)?,
+                Name::Reset => physics::reset(&subject),
+                Name::Wire => wire::wire(&subject)?,
+            };
+            figure.print()?;
+        }
+        Ok(())
+    }
+}

@@ -1,5 +1,6 @@
 //! The `comic-actor` program.
 
+use std::io::IsTerminal as _;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -13,6 +14,7 @@ const EXIT_CODES: &str = "\
 Exit codes: 0 when the run is over or the actor was told to stop, 2 when the configuration is wrong and starting
 again cannot help, 1 otherwise (for instance when the learner now serves another experiment).
 Logs go to standard error; RUST_LOG chooses what (default: info).";
+
 
 /// Steps humanoids for a learner; it needs nothing but the learner's address.
 #[derive(Debug, Parser)]
@@ -60,7 +62,9 @@ enum LogFormat {
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
-    start_logging(arguments.log_format);
+    // Joining a learner of its own over and over is no news to who asked for figures.
+    let level = if matches!(arguments.command, Some(Command::Bench(_))) { "warn" } else { "info" };
+    start_logging(arguments.log_format, level);
     policy::use_one_torch_thread();
     match command(arguments) {
         Ok(()) => ExitCode::SUCCESS,
@@ -87,9 +91,12 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
     }
 }
 
-fn start_logging(format: LogFormat) {
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
-    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+fn start_logging(format: LogFormat, level: &str) {
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+    let builder = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal());
     match format {
         LogFormat::Text => builder.with_target(false).init(),
         LogFormat::Json => builder.json().init(),

@@ -69,11 +69,7 @@ fn find(name: &str) -> Result<&'static Stored, Error> {
     let own = ALIASES.iter().find(|(alias, _)| *alias == name).map_or(name, |(_, own)| own);
     stored().iter().find(|clip| clip.name == own).ok_or_else(|| {
         let names = builtin_names();
-        Error::NoSuchBuiltin {
-            name: name.into(),
-            hint: hint(name, names.iter().copied()),
-            known: names.join(", "),
-        }
+        Error::NoSuchBuiltin { name: name.into(), hint: hint(name, names.iter().copied()), known: names.join(", ") }
     })
 }
 

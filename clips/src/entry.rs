@@ -59,8 +59,9 @@ impl Entry {
         if self.model != expected {
             return Err(Error::WrongModel { name: self.name.clone(), has: self.model, expected });
         }
-        // Written so that a NaN fails.
-        if !((self.dt - control_dt).abs() < TIMESTEP_TOLERANCE) {
+        // Put so that a NaN is refused.
+        let same = (self.dt - control_dt).abs() < TIMESTEP_TOLERANCE;
+        if !same {
             return Err(Error::WrongTimestep { name: self.name.clone(), dt: self.dt, expected: control_dt });
         }
         if self.starts(look_ahead, min_steps).is_empty() {
@@ -80,7 +81,8 @@ impl Entry {
 
     /// Checks the sub-range against the clip's length.
     pub(crate) fn check_range(&self) -> Result<(), Error> {
-        let error = |field, value, allowed| Error::Range { name: self.name.clone(), field, value, allowed, steps: self.steps };
+        let error =
+            |field, value, allowed| Error::Range { name: self.name.clone(), field, value, allowed, steps: self.steps };
         if self.start_step >= self.steps {
             return Err(error("start_step", self.start_step, format!("at most {}", self.steps - 1)));
         }

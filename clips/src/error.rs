@@ -143,7 +143,9 @@ pub enum Error {
         expected: WalkerModel,
     },
     /// A clip whose frames are not one control step apart.
-    #[error("clip `{name}` has dt = {dt} s, expected {expected} s; a control step is one frame, so all clips of an experiment have the same dt")]
+    #[error(
+        "clip `{name}` has dt = {dt} s, expected {expected} s; a control step is one frame, so all clips of an experiment have the same dt"
+    )]
     WrongTimestep {
         /// The clip.
         name: String,
@@ -153,7 +155,9 @@ pub enum Error {
         expected: f64,
     },
     /// No frame of the clip can be a start.
-    #[error("clip `{name}` is too short: its frames {first} to {last} are {frames}, but looking {look_ahead} frames ahead for at least {min_steps} steps needs {needed}; lower task.reference_steps or task.min_steps, or leave it out")]
+    #[error(
+        "clip `{name}` is too short: its frames {first} to {last} are {frames}, but looking {look_ahead} frames ahead for at least {min_steps} steps needs {needed}; lower task.reference_steps or task.min_steps, or leave it out"
+    )]
     TooShort {
         /// The clip.
         name: String,

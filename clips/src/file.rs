@@ -241,7 +241,8 @@ impl Walker<'_> {
         let per_frame = quaternions.len() / 4 / self.header.steps;
         for (index, quaternion) in quaternions.chunks_exact(4).enumerate() {
             let norm = quaternion.iter().map(|part| part * part).sum::<f64>().sqrt();
-            if !((norm - 1.0).abs() < NORM_TOLERANCE) {
+            // A norm may overflow to infinity, but is no NaN: the numbers are finite.
+            if (norm - 1.0).abs() >= NORM_TOLERANCE {
                 let reason = format!("a quaternion of frame {} has norm {norm}, expected 1", index / per_frame);
                 return Err(self.file.malformed(&format!("{}/{field}", self.item), reason));
             }

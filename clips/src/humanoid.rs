@@ -4,6 +4,7 @@ use std::fmt;
 
 /// Hinges in the order of `qpos[7:]` and of every clip: depth first through the body, `rz`, `ry`, `rx` within one
 /// (dm_control's `_CMU_MOCAP_JOINTS`).
+#[rustfmt::skip]
 pub const JOINTS: [&str; 56] = [
     "lfemurrz", "lfemurry", "lfemurrx", "ltibiarx", "lfootrz", "lfootrx", "ltoesrx", "rfemurrz", "rfemurry",
     "rfemurrx", "rtibiarx", "rfootrz", "rfootrx", "rtoesrx", "lowerbackrz", "lowerbackry", "lowerbackrx",
@@ -16,6 +17,7 @@ pub const JOINTS: [&str; 56] = [
 
 /// Lowest and highest angle of each of [`JOINTS`], rad (`humanoid_CMU_V2020.xml`).
 #[rustfmt::skip]
+#[allow(clippy::approx_constant, reason = "the XML's own digits")]
 pub const JOINT_RANGES: [[f64; 2]; 56] = [
     [-1.0472, 1.22173], [-1.22173, 1.22173], [-2.79253, 0.349066], [0.01, 2.96706], [-1.22173, 0.349066],
     [-0.785398, 0.8], [-1.5708, 0.349066], [-1.22173, 1.0472], [-1.22173, 1.22173], [-2.79253, 0.349066],
@@ -32,6 +34,7 @@ pub const JOINT_RANGES: [[f64; 2]; 56] = [
 ];
 
 /// Hinges in the order of `ctrl`, and so of an action: alphabetical, as dm_control adds the position actuators.
+#[rustfmt::skip]
 pub const ACTUATORS: [&str; 56] = [
     "headrx", "headry", "headrz", "lclaviclery", "lclaviclerz", "lfemurrx", "lfemurry", "lfemurrz", "lfingersrx",
     "lfootrx", "lfootrz", "lhandrx", "lhandrz", "lhumerusrx", "lhumerusry", "lhumerusrz", "lowerbackrx",
@@ -43,6 +46,7 @@ pub const ACTUATORS: [&str; 56] = [
 ];
 
 /// For each of [`ACTUATORS`] its place in [`JOINTS`].
+#[rustfmt::skip]
 pub const ACTUATOR_JOINTS: [usize; 56] = [
     31, 30, 29, 33, 32, 2, 1, 0, 41, 5, 4, 40, 39, 36, 35, 34, 16, 15, 14, 25, 24, 23, 37, 43, 42, 3, 6, 38, 45,
     44, 9, 8, 7, 53, 12, 11, 52, 51, 48, 47, 46, 49, 55, 54, 10, 13, 50, 22, 21, 20, 19, 18, 17, 28, 27, 26,

@@ -1,23 +1,18 @@
 //! dm_control's named subsets of the CMU clips.
 
-use crate::{Error, nearest::hint};
+use comic_experiment::SUBSETS;
 
-/// Names of the subsets: 36, 50, 7, 316 and 836 clips.
-pub const SUBSETS: [&str; 5] = ["walk_tiny", "run_jump_tiny", "get_up", "locomotion_small", "all"];
+use crate::{Error, nearest::hint};
 
 const TEXT: &str = include_str!("../data/subsets.txt");
 
-/// The clips of a subset, sorted by name (dm_control 1.0.49, `locomotion/tasks/reference_pose/cmu_subsets.py`).
+/// The clips of a subset, 36, 50, 7, 316 or 836 of them, sorted by name (dm_control 1.0.49, `locomotion/tasks/reference_pose/cmu_subsets.py`).
 ///
 /// # Errors
 /// [`Error::NoSuchSubset`] for a name that is none of [`SUBSETS`].
 pub fn subset(name: &str) -> Result<Vec<String>, Error> {
     if !SUBSETS.contains(&name) {
-        return Err(Error::NoSuchSubset {
-            name: name.into(),
-            hint: hint(name, SUBSETS),
-            known: SUBSETS.join(", "),
-        });
+        return Err(Error::NoSuchSubset { name: name.into(), hint: hint(name, SUBSETS), known: SUBSETS.join(", ") });
     }
     let mut ids: Vec<String> = TEXT
         .lines()

@@ -1,4 +1,5 @@
 //! Clips that need no file.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
 
 mod support;
 
@@ -106,7 +107,10 @@ fn provenance_and_acknowledgement_lie_beside_the_data() {
 #[test]
 fn an_unknown_name_is_refused_with_the_nearest_and_all_names() {
     let message = refused(ClipSource::whole("builtin:walking"));
-    assert!(message.starts_with("no built-in clip `walking` (did you mean `walk`?); built-in clips are stand, walk, "), "{message}");
+    assert!(
+        message.starts_with("no built-in clip `walking` (did you mean `walk`?); built-in clips are stand, walk, "),
+        "{message}"
+    );
     let message = refused(ClipSource::whole("builtin:cmu_007_02"));
     assert!(message.contains("did you mean `CMU_007_01`, `CMU_007_04` or `CMU_002_02`?"), "{message}");
     let message = refused(ClipSource::whole("builtin:"));

@@ -91,6 +91,8 @@ fn starts_and_frames_equal_dm_controls() {
 }
 
 proptest! {
+    #![proptest_config(support::law())]
+
     /// From any start, `min_steps` steps with their references stay inside the frames.
     #[test]
     fn references_never_run_past_the_frames(

@@ -1,4 +1,5 @@
 //! Every message names the file, the item and the remedy.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
 
 mod support;
 
@@ -117,10 +118,7 @@ fn a_file_that_is_no_hdf5() {
 #[test]
 fn sub_ranges_that_the_clip_does_not_have() {
     let range = |start_step, end_step| ClipSource { start_step, end_step, ..with_ids(tiny(), &["TINY_001_02"]) };
-    assert_eq!(
-        refused(range(9, None)),
-        "clip `TINY_001_02`: start_step = 9: must be at most 8; the clip has 9 frames"
-    );
+    assert_eq!(refused(range(9, None)), "clip `TINY_001_02`: start_step = 9: must be at most 8; the clip has 9 frames");
     for end in [0, 4, 10, usize::MAX] {
         assert_eq!(
             refused(range(4, Some(end))),
@@ -136,7 +134,10 @@ fn sub_ranges_that_the_clip_does_not_have() {
 fn weights_that_are_none() {
     for weight in [-1.0, f64::NAN, f64::INFINITY] {
         let message = refused(ClipSource { weight, ..ClipSource::whole("builtin:walk") });
-        assert!(message.starts_with(&format!("builtin:walk: weight = {weight}: must be a finite number, 0 or more")), "{message}");
+        assert!(
+            message.starts_with(&format!("builtin:walk: weight = {weight}: must be a finite number, 0 or more")),
+            "{message}"
+        );
     }
 }
 

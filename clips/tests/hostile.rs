@@ -1,4 +1,5 @@
 //! Whatever the bytes, the outcome is a catalogue or an error.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
 
 mod support;
 
@@ -39,6 +40,8 @@ fn sound_file() -> impl Strategy<Value = Vec<u8>> {
 }
 
 proptest! {
+    #![proptest_config(support::law())]
+
     #[test]
     fn changed_bytes_never_panic(
         mut bytes in sound_file(),

@@ -39,6 +39,8 @@ fn the_ends_of_the_ranges_are_the_ends_of_the_actions() {
 }
 
 proptest! {
+    #![proptest_config(support::law())]
+
     #[test]
     fn an_action_is_within_bounds_and_its_servo_target_is_the_pose_clamped(
         first in uniform32(-4.0..4.0_f64),

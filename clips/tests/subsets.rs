@@ -7,13 +7,10 @@ use comic_clips::{SUBSETS, subset};
 #[test]
 fn sizes_are_dm_controls() {
     let sizes = SUBSETS.map(|name| subset(name).unwrap().len());
-    assert_eq!(SUBSETS.into_iter().zip(sizes).collect::<Vec<_>>(), [
-        ("walk_tiny", 36),
-        ("run_jump_tiny", 50),
-        ("get_up", 7),
-        ("locomotion_small", 316),
-        ("all", 836),
-    ]);
+    assert_eq!(
+        SUBSETS.into_iter().zip(sizes).collect::<Vec<_>>(),
+        [("walk_tiny", 36), ("run_jump_tiny", 50), ("get_up", 7), ("locomotion_small", 316), ("all", 836),]
+    );
 }
 
 #[test]

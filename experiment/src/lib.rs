@@ -12,7 +12,9 @@
 //! Every default is the paper's: (S) the CoMic supplement, (V) V-MPO, (D) a decision of this project where both are
 //! silent. A preset that deviates says so in its own file.
 
+mod check;
 mod document;
+mod lines;
 pub mod presets;
 mod resolve;
 mod spec;

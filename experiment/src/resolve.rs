@@ -4,7 +4,7 @@ use std::path::Path;
 
 use toml::{Table, Value};
 
-use crate::{Experiment, presets};
+use crate::{Experiment, check::check, lines::line_of, presets};
 
 /// Why a document is not an experiment.
 #[derive(Debug, thiserror::Error)]
@@ -31,11 +31,11 @@ pub enum Error {
     /// A field no experiment has.
     #[error("{origin}: unknown field `{field}`{hint}")]
     UnknownField {
-        /// The file, preset or `--set` it stands in.
+        /// The file and line, preset or `--set` it stands in.
         origin: String,
-        /// Its dotted name.
+        /// Its dotted name; a number is a place in an array, as in `--set clips.0.weight=2`.
         field: String,
-        /// "; did you mean `…`?", or nothing.
+        /// "; did you mean `…`?", or the names known there.
         hint: String,
     },
     /// `--set` without `=`.
@@ -45,38 +45,51 @@ pub enum Error {
         argument: String,
     },
     /// A value outside its meaning.
-    #[error("{field} = {value}: {remedy}")]
+    #[error("{origin}: {field} = {value}: {remedy}")]
     Value {
+        /// The file and line, preset or `--set` it stands in.
+        origin: String,
         /// Dotted name.
-        field: &'static str,
+        field: String,
         /// The value given.
         value: String,
         /// What is allowed.
-        remedy: &'static str,
+        remedy: String,
     },
 }
 
 /// Resolves `document`, a preset's name or the path of a TOML file, with `overrides` of the form `field.path=value`
-/// applied in order.
+/// applied in order. Elements of arrays are named by number: `clips.0.weight=2`.
 ///
 /// # Errors
 /// [`Error`], naming file, line and field.
 pub fn resolve(document: &str, overrides: &[String]) -> Result<Experiment, Error> {
     let (origin, text) = read(document)?;
-    let mut table = parse(&origin, &text)?;
+    let mut experiment = decode(&origin, &text)?;
     for argument in overrides {
-        apply_override(&mut table, argument)?;
+        experiment = apply_override(&experiment, argument)?;
     }
-    decode(&origin, table)
+    check(&experiment).map_err(|fault| {
+        let overridden = overrides.iter().rev().find(|argument| names(argument, &fault.field));
+        let origin =
+            overridden.map_or_else(|| at(&origin, &text, &fault.field), |argument| format!("--set {argument}"));
+        Error::Value { origin, field: fault.field, value: fault.value, remedy: fault.remedy }
+    })?;
+    Ok(experiment)
 }
 
 impl Experiment {
-    /// Reads a resolved document, for instance one that came over the wire.
+    /// Reads a resolved document, for instance one that came over the wire. `origin` names it in errors.
     ///
     /// # Errors
     /// [`Error`], naming line and field.
     pub fn from_toml(origin: &str, text: &str) -> Result<Self, Error> {
-        decode(origin, parse(origin, text)?)
+        let experiment = decode(origin, text)?;
+        check(&experiment).map_err(|fault| {
+            let origin = at(origin, text, &fault.field);
+            Error::Value { origin, field: fault.field, value: fault.value, remedy: fault.remedy }
+        })?;
+        Ok(experiment)
     }
 
     /// The whole document, every field written out.
@@ -84,8 +97,7 @@ impl Experiment {
     /// # Errors
     /// [`Error::Malformed`] when a number is beyond what TOML can write.
     pub fn to_toml(&self) -> Result<String, Error> {
-        toml::to_string(self)
-            .map_err(|error| Error::Malformed { origin: "experiment".into(), message: error.to_string() })
+        toml::to_string(self).map_err(|error| malformed("experiment", &error))
     }
 }
 
@@ -103,23 +115,47 @@ fn read(document: &str) -> Result<(String, String), Error> {
     }
 }
 
-fn parse(origin: &str, text: &str) -> Result<Table, Error> {
-    text.parse::<Table>()
-        .map_err(|error| Error::Malformed { origin: origin.to_string(), message: error.to_string() })
+/// Text to values: syntax, names and types, each with its line; what the values mean is for [`check`].
+fn decode(origin: &str, text: &str) -> Result<Experiment, Error> {
+    let table: Table = text.parse().map_err(|error| malformed(origin, &error))?;
+    refuse_unknown(&table).map_err(|Unknown { field, hint }| {
+        let origin = at(origin, text, &field);
+        Error::UnknownField { origin, field, hint }
+    })?;
+    toml::from_str(text).map_err(|error| malformed(origin, &error))
 }
 
-/// Decodes without line numbers (they are lost once overrides are merged) but with the field's whole path.
-fn decode(origin: &str, table: Table) -> Result<Experiment, Error> {
-    refuse_unknown(origin, "", &table, &known()?)?;
-    let experiment: Experiment = Value::Table(table)
-        .try_into()
-        .map_err(|error: toml::de::Error| Error::Malformed { origin: origin.to_string(), message: error.to_string() })?;
-    check(&experiment)?;
-    Ok(experiment)
+fn malformed(origin: &str, error: &impl std::fmt::Display) -> Error {
+    Error::Malformed { origin: origin.to_string(), message: error.to_string().trim_end().to_string() }
 }
 
-/// The default document with every optional field present: the vocabulary of names.
-fn known() -> Result<Table, Error> {
+/// `origin:line` of a field, as far as the text names it.
+fn at(origin: &str, text: &str, field: &str) -> String {
+    line_of(text, field).map_or_else(|| origin.to_string(), |line| format!("{origin}:{line}"))
+}
+
+/// Whether `argument` sets `field`, something in it, or something it is in.
+fn names(argument: &str, field: &str) -> bool {
+    let path = argument.split_once('=').map_or(argument, |(path, _)| path).trim();
+    let within = |outer: &str, inner: &str| {
+        inner.strip_prefix(outer).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+    };
+    within(path, field) || within(field, path)
+}
+
+struct Unknown {
+    field: String,
+    hint: String,
+}
+
+fn refuse_unknown(table: &Table) -> Result<(), Unknown> {
+    // The defaults have every name there is, and TOML can write them all.
+    let Ok(everything) = vocabulary() else { return Ok(()) };
+    refuse_unknown_in("", table, &everything, &everything)
+}
+
+/// The default document with every optional field present.
+fn vocabulary() -> Result<Table, toml::ser::Error> {
     let mut everything = Experiment::default();
     for clip in &mut everything.clips {
         clip.subset = Some(String::new());
@@ -127,104 +163,104 @@ fn known() -> Result<Table, Error> {
         clip.end_step = Some(0);
     }
     Table::try_from(&everything)
-        .map_err(|error| Error::Malformed { origin: "default experiment".into(), message: error.to_string() })
 }
 
-fn refuse_unknown(origin: &str, prefix: &str, table: &Table, known: &Table) -> Result<(), Error> {
+fn refuse_unknown_in(prefix: &str, table: &Table, known: &Table, everything: &Table) -> Result<(), Unknown> {
     for (key, value) in table {
-        let field = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+        let field = join(prefix, key);
         let Some(model) = known.get(key) else {
-            return Err(Error::UnknownField { origin: origin.to_string(), hint: hint(prefix, key, known), field });
+            return Err(Unknown { hint: hint(prefix, key, known, everything), field });
         };
         match (value, model) {
-            (Value::Table(inner), Value::Table(names)) => refuse_unknown(origin, &field, inner, names)?,
+            (Value::Table(inner), Value::Table(names)) => refuse_unknown_in(&field, inner, names, everything)?,
             (Value::Array(items), Value::Array(models)) => {
-                if let Some(Value::Table(names)) = models.first() {
-                    for item in items.iter().filter_map(Value::as_table) {
-                        refuse_unknown(origin, &field, item, names)?;
-                    }
+                let Some(Value::Table(names)) = models.first() else { continue };
+                for (index, item) in items.iter().enumerate() {
+                    let Value::Table(item) = item else { continue };
+                    refuse_unknown_in(&join(&field, &index.to_string()), item, names, everything)?;
                 }
             }
+            // A value of the wrong kind is for serde to refuse.
             _ => {}
         }
     }
     Ok(())
 }
 
-fn hint(prefix: &str, key: &str, known: &Table) -> String {
-    let nearest = known.keys().max_by(|a, b| strsim::jaro_winkler(a, key).total_cmp(&strsim::jaro_winkler(b, key)));
-    match nearest {
-        Some(name) if strsim::jaro_winkler(name, key) > 0.7 => {
-            let path = if prefix.is_empty() { name.clone() } else { format!("{prefix}.{name}") };
-            format!("; did you mean `{path}`?")
-        }
-        _ => format!("; known here are {}", known.keys().cloned().collect::<Vec<_>>().join(", ")),
+fn join(prefix: &str, key: &str) -> String {
+    if prefix.is_empty() { key.to_string() } else { format!("{prefix}.{key}") }
+}
+
+/// The same name in another section, else the nearest in this one, else all names of this one.
+fn hint(prefix: &str, key: &str, known: &Table, everything: &Table) -> String {
+    /// Jaro-Winkler similarity from which a name is taken for a misspelling.
+    const SIMILAR: f64 = 0.7;
+    let similarity = |name: &&String| strsim::jaro_winkler(name, key);
+    let nearest = known.keys().max_by(|a, b| similarity(a).total_cmp(&similarity(b)));
+    let meant = elsewhere("", key, everything)
+        .or_else(|| nearest.filter(|name| similarity(name) > SIMILAR).map(|name| join(prefix, name)));
+    match meant {
+        Some(path) => format!("; did you mean `{path}`?"),
+        None => format!("; known here are {}", known.keys().cloned().collect::<Vec<_>>().join(", ")),
     }
 }
 
-fn apply_override(table: &mut Table, argument: &str) -> Result<(), Error> {
-    let malformed = || Error::Override { argument: argument.to_string() };
-    let (path, value) = argument.split_once('=').ok_or_else(malformed)?;
-    let (path, value) = (path.trim(), value.trim());
+fn elsewhere(prefix: &str, key: &str, table: &Table) -> Option<String> {
+    if table.contains_key(key) {
+        return Some(join(prefix, key));
+    }
+    table.iter().find_map(|(name, value)| elsewhere(&join(prefix, name), key, value.as_table()?))
+}
+
+/// One `--set`, checked for its name and type on its own, so that an error can name it.
+fn apply_override(experiment: &Experiment, argument: &str) -> Result<Experiment, Error> {
+    let expected = || Error::Override { argument: argument.to_string() };
+    let (path, text) = argument.split_once('=').ok_or_else(expected)?;
+    let (path, text) = (path.trim(), text.trim());
     if path.is_empty() || path.split('.').any(str::is_empty) {
-        return Err(malformed());
+        return Err(expected());
     }
-    // Anything that is no TOML value is a string, so `--set name=mine` needs no quotes.
-    let value = format!("value = {value}")
-        .parse::<Table>()
-        .ok()
-        .and_then(|mut parsed| parsed.remove("value"))
-        .unwrap_or_else(|| Value::String(value.to_string()));
-    let mut place = table;
-    let mut parts = path.split('.').peekable();
-    while let Some(part) = parts.next() {
-        if parts.peek().is_none() {
-            place.insert(part.to_string(), value);
-            return Ok(());
+    let origin = format!("--set {argument}");
+    let document = Table::try_from(experiment).map_err(|error| malformed(&origin, &error))?;
+    let with = |value: Value| {
+        let mut document = Value::Table(document.clone());
+        *place(&mut document, path).ok_or_else(|| malformed(&origin, &format!("no element `{path}`")))? = value;
+        if let Value::Table(table) = &document {
+            refuse_unknown(table).map_err(|Unknown { field, hint }| Error::UnknownField {
+                origin: origin.clone(),
+                field,
+                hint,
+            })?;
         }
-        place = place
-            .entry(part)
-            .or_insert_with(|| Value::Table(Table::new()))
-            .as_table_mut()
-            .ok_or_else(malformed)?;
+        document.try_into::<Experiment>().map_err(|error| malformed(&origin, &on_one_line(&error)))
+    };
+    // Anything that is no TOML value is a string, so `--set name=mine` needs no quotes; nor does `--set name=7`.
+    let string = || with(Value::String(text.to_string()));
+    match parse_value(text) {
+        Some(value) => with(value).or_else(|error| string().map_err(|_| error)),
+        None => string(),
     }
-    Ok(())
 }
 
-/// Values that parse but mean nothing.
-fn check(experiment: &Experiment) -> Result<(), Error> {
-    let Experiment { clips, task, network, vmpo, optimiser, unroll, actor, warm_start, learner, .. } = experiment;
-    let positive = "must be at least 1";
-    let rules: [(&'static str, String, bool, &'static str); 24] = [
-        ("clips", clips.len().to_string(), !clips.is_empty(), "name at least one clip source"),
-        ("task.reference_steps", format!("{:?}", task.reference_steps), (1..=64).contains(&task.reference_steps.len()) && task.reference_steps.iter().all(|step| (1..=1000).contains(step)), "must be 1 to 64 numbers of frames ahead, each 1 to 1000"),
-        ("task.termination_threshold", task.termination_threshold.to_string(), task.termination_threshold > 0.0, "must be positive"),
-        ("task.time_limit", task.time_limit.to_string(), task.time_limit > 0.0, "must be positive seconds"),
-        ("network.latent.size", network.latent.size.to_string(), (1..=4096).contains(&network.latent.size), "must be 1 to 4096"),
-        ("network.latent.min_std", network.latent.min_std.to_string(), network.latent.min_std > 0.0, "must be positive"),
-        ("network.latent.initial_std", network.latent.initial_std.to_string(), network.latent.initial_std > network.latent.min_std, "must exceed network.latent.min_std"),
-        ("network.min_std", network.min_std.to_string(), network.min_std > 0.0, "must be positive"),
-        ("network.initial_std", network.initial_std.to_string(), network.initial_std > network.min_std, "must exceed network.min_std"),
-        ("network.*", "sizes".into(), [&network.encoder, &network.low_level, &network.value].iter().all(|sizes| !sizes.is_empty() && sizes.iter().all(|size| (1..=16384).contains(size))), "encoder, low_level and value need one or more layers of 1 to 16384 units"),
-        ("vmpo.discount", vmpo.discount.to_string(), (0.0..1.0).contains(&vmpo.discount), "must be in [0, 1)"),
-        ("vmpo.lambda", vmpo.lambda.to_string(), (0.0..=1.0).contains(&vmpo.lambda), "must be in [0, 1]"),
-        ("vmpo.top_fraction", vmpo.top_fraction.to_string(), vmpo.top_fraction > 0.0 && vmpo.top_fraction <= 1.0, "must be in (0, 1]"),
-        ("vmpo.target_period", vmpo.target_period.to_string(), vmpo.target_period > 0, positive),
-        ("vmpo.gradient_steps", vmpo.gradient_steps.to_string(), vmpo.gradient_steps > 0, positive),
-        ("vmpo.minibatch_unrolls", vmpo.minibatch_unrolls.to_string(), vmpo.minibatch_unrolls > 0 && unroll.batch.is_multiple_of(vmpo.minibatch_unrolls), "must divide unroll.batch"),
-        ("vmpo.epsilon_*", "limits".into(), [vmpo.epsilon_eta, vmpo.epsilon_mean, vmpo.epsilon_std].iter().all(|limit| *limit > 0.0), "limits must be positive"),
-        ("optimiser.learning_rate", optimiser.learning_rate.to_string(), optimiser.learning_rate > 0.0 && optimiser.multiplier_learning_rate > 0.0, "learning rates must be positive"),
-        ("unroll.length", unroll.length.to_string(), (1..=4096).contains(&unroll.length), "must be 1 to 4096"),
-        ("unroll.batch", unroll.batch.to_string(), (1..=65536).contains(&unroll.batch), "must be 1 to 65536"),
-        ("actor.threads", actor.threads.to_string(), (1..=1024).contains(&actor.threads), "must be 1 to 1024"),
-        ("actor.environments", actor.environments.to_string(), (1..=4096).contains(&actor.environments), "must be 1 to 4096"),
-        ("warm_start.noise", warm_start.noise.to_string(), warm_start.noise > 0.0 && warm_start.minibatch_unrolls > 0, "noise must be positive and minibatch_unrolls at least 1"),
-        ("learner.threads", learner.threads.to_string(), learner.threads > 0 && learner.checkpoints_kept > 0 && learner.checkpoint_seconds > 0.0 && learner.metrics_seconds > 0.0, "threads and checkpoints_kept must be at least 1, intervals positive"),
-    ];
-    for (field, value, holds, remedy) in rules {
-        if !holds {
-            return Err(Error::Value { field, value, remedy });
+fn parse_value(text: &str) -> Option<Value> {
+    let mut parsed: Table = format!("value = {text}").parse().ok()?;
+    let value = parsed.remove("value");
+    value.filter(|_| parsed.is_empty())
+}
+
+/// The value at a dotted path; sections on the way are made where there are none, elements of arrays are not.
+fn place<'a>(document: &'a mut Value, path: &str) -> Option<&'a mut Value> {
+    path.split('.').try_fold(document, |place, part| match place {
+        Value::Array(items) => items.get_mut(part.parse::<usize>().ok()?),
+        place => {
+            if !place.is_table() {
+                *place = Value::Table(Table::new());
+            }
+            Some(place.as_table_mut()?.entry(part).or_insert_with(|| Value::Table(Table::new())))
         }
-    }
-    Ok(())
+    })
+}
+
+fn on_one_line(error: &toml::de::Error) -> String {
+    error.to_string().lines().map(str::trim).filter(|line| !line.is_empty()).collect::<Vec<_>>().join(" ")
 }

@@ -1,5 +1,7 @@
 //! The layout: fields lie one after the other, and the hash knows every dimension.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
 use comic_experiment::{Experiment, TaskSpec, Tracking};
 use comic_proto::{Field, UnrollLayout, UnrollShape};
 use proptest::prelude::*;

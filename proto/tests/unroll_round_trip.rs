@@ -1,5 +1,7 @@
 //! What an actor writes is what a learner reads.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
 use comic_proto::{Field, Invalid, UnrollBuffer, UnrollLayout, UnrollShape};
 use proptest::prelude::*;
 

@@ -1,5 +1,7 @@
 //! Whatever comes off the wire is either an unroll that makes sense or is refused by name.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
 use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader, UnrollMessage};
 use comic_proto::{Expected, Field, Invalid, MAX_SEQUENCE, UnrollBuffer, UnrollLayout, UnrollShape, validate};
 use proptest::prelude::*;

@@ -59,12 +59,12 @@ pub struct Batch {
     pub layout: Arc<UnrollLayout>,
     /// B.
     pub unrolls: usize,
-    buffer: Option<Buffer>,
+    buffer: Option<Box<Buffer>>,
     owner: Option<Batcher>,
 }
 
 impl Batch {
-    pub(crate) fn new(layout: Arc<UnrollLayout>, buffer: Buffer, owner: Batcher) -> Self {
+    pub(crate) fn new(layout: Arc<UnrollLayout>, buffer: Box<Buffer>, owner: Batcher) -> Self {
         Self { layout, unrolls: buffer.len(), buffer: Some(buffer), owner: Some(owner) }
     }
 
@@ -77,7 +77,7 @@ impl Batch {
         unrolls: impl IntoIterator<Item = (UnrollHeader, impl AsRef<[u8]>), IntoIter: ExactSizeIterator>,
     ) -> Result<Self, Invalid> {
         let unrolls = unrolls.into_iter();
-        let mut buffer = Buffer::new(&layout, unrolls.len());
+        let mut buffer = Box::new(Buffer::new(&layout, unrolls.len()));
         for (header, payload) in unrolls {
             let payload = payload.as_ref();
             if payload.len() != layout.size() {

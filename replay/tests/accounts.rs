@@ -1,5 +1,7 @@
 //! Who joins gets an account; there is room for so many, and none is mixed up with another.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
 use comic_replay::{JoinError, Joined, Ledger};
 use proptest::prelude::*;
 

@@ -1,5 +1,7 @@
 //! Memory is bounded: who comes when the batches are full waits, and whoever waits can leave.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
 mod common;
 
 use std::time::Duration;

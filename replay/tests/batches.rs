@@ -1,5 +1,7 @@
 //! A batch holds the unrolls that were put in, field by field, slot by slot.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
 mod common;
 
 use common::{Actor, CONFIG, SLOTS, batch_now, batcher, layout, mark, payload};

@@ -1,6 +1,8 @@
 //! The law: produced = trained + dropped + in flight, whatever happens in whatever order, and nothing is trained on
 //! twice.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
 mod common;
 
 use std::collections::{HashMap, HashSet};

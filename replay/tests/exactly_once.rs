@@ -1,5 +1,7 @@
 //! Each unroll is taken at most once, and every refusal has a reason that is counted.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
 mod common;
 
 use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, payload};

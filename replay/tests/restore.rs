@@ -1,5 +1,7 @@
 //! A checkpoint's books and accounts carry on in the next life of the learner.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
 mod common;
 
 use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, layout};

@@ -120,8 +120,7 @@ impl TrackingEnvironment {
         let preset = task.config.preset_actuators.then(|| pose_to_action(reference.joints(frame)));
         let activation = preset.as_ref().map(<[f64; 56]>::as_slice).filter(|_| task.walker.activations == 56);
         task.models.place(data, &reference.qpos(frame), &reference.qvel(frame), activation);
-        self.error =
-            reward::termination_error(task.config.termination_error, &task.walker, data, reference, frame);
+        self.error = reward::termination_error(task.config.termination_error, &task.walker, data, reference, frame);
         self.previous.copy_from_slice(data.qpos());
         (self.clip, self.start, self.frame, self.diverged) = (clip, frame, frame, false);
     }

@@ -44,7 +44,9 @@ pub enum Error {
         nearest: String,
     },
     /// No clip has a frame at which an episode may start.
-    #[error("task: no clip has a start with weight above 0; lower task.min_steps ({min_steps}) or widen the clips' ranges")]
+    #[error(
+        "task: no clip has a start with weight above 0; lower task.min_steps ({min_steps}) or widen the clips' ranges"
+    )]
     NoStarts {
         /// `task.min_steps`.
         min_steps: usize,

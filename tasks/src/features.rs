@@ -43,3 +43,59 @@ pub(crate) fn appendages(walker: &Walker, data: &Data) -> [f64; 15] {
     }
     all
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use comic_clips::{Catalogue, WalkerModel};
+    use comic_experiment::ClipSource;
+
+    use super::*;
+    use crate::humanoid;
+    use crate::physics::Models;
+
+    fn largest(a: &[f64], b: &[f64]) -> f64 {
+        assert_eq!(a.len(), b.len());
+        a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+    }
+
+    /// Clip for clip, the features that a file has against the ones its motion gives.
+    fn assert_kinematics_give_the_files_features(path: &Path) {
+        let model = humanoid::build(WalkerModel::Cmu2020).unwrap();
+        let walker = Walker::new(WalkerModel::Cmu2020, &model).unwrap();
+        let mut data = Models::new(model, 6).data();
+        let catalogue = Catalogue::open(&[ClipSource::whole(path.to_string_lossy())]).unwrap();
+        for index in 0..catalogue.entries().len() {
+            let clip = catalogue.load(index).unwrap();
+            let found = features(&walker, &mut data, &clip.motion);
+            let file = clip.features.unwrap();
+            let differences = [
+                ("center_of_mass", largest(found.center_of_mass.as_flattened(), file.center_of_mass.as_flattened())),
+                ("end_effectors", largest(found.end_effectors.as_flattened(), file.end_effectors.as_flattened())),
+                ("appendages", largest(found.appendages.as_flattened(), file.appendages.as_flattened())),
+                ("body_positions", largest(&found.body_positions, &file.body_positions)),
+                ("body_quaternions", largest(&found.body_quaternions, &file.body_quaternions)),
+            ];
+            for (name, difference) in differences {
+                assert!(difference < 1e-9, "{}: {name} differs by {difference:e}", clip.name);
+            }
+        }
+    }
+
+    #[test]
+    fn kinematics_give_the_features_of_the_synthetic_clips() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fixtures/tracking/synthetic_v2020.h5");
+        assert_kinematics_give_the_files_features(&path);
+    }
+
+    #[test]
+    fn kinematics_give_the_features_of_the_recorded_clips() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/clips/cmu_dev.h5");
+        if !path.is_file() {
+            eprintln!("skipped: {} is not there", path.display());
+            return;
+        }
+        assert_kinematics_give_the_files_features(&path);
+    }
+}

@@ -39,4 +39,9 @@ impl RawFloor {
         }
         self.task.models.step_plainly(&mut self.data, &self.control);
     }
+
+    /// `mj_forward`: after [`RawFloor::reset_to`], the least that a reset costs.
+    pub fn forward(&mut self) {
+        self.data.forward();
+    }
 }

@@ -189,7 +189,10 @@ impl Observation {
             }
             // 1 where something touches.
             O::Touch => {
-                fill(out, sensors[walker.touch.clone()].iter().map(|force| f64::from(u8::from(*force > TOUCH_THRESHOLD))));
+                fill(
+                    out,
+                    sensors[walker.touch.clone()].iter().map(|force| f64::from(u8::from(*force > TOUCH_THRESHOLD))),
+                );
             }
             // The world's z axis in the root's frame.
             _ => fill(out, data.xmat()[walker.root][6..].iter().copied()),

@@ -95,3 +95,50 @@ pub(crate) fn substeps(clip: &str, dt: f64) -> Result<usize, Error> {
         reason: format!("dt = {dt} s is no multiple of the physics step of {PHYSICS_TIMESTEP} s; resample the clip"),
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use comic_clips::WalkerModel;
+
+    use super::*;
+    use crate::humanoid;
+
+    fn upright(models: &Models, data: &mut Data, speed: f64) {
+        let mut qpos = [0.0; 63];
+        qpos[2] = 1.5;
+        qpos[3] = 1.0;
+        models.place(data, &qpos, &[speed; 62], None);
+    }
+
+    #[test]
+    fn a_simulation_that_explodes_is_unhealthy_until_it_is_placed_anew() {
+        let models = Models::new(humanoid::build(WalkerModel::Cmu2020).unwrap(), 6);
+        let mut data = models.data();
+        for speed in [1e5, 1e8, 1e11, f64::NAN] {
+            upright(&models, &mut data, speed);
+            models.step(&mut data, &[1.0; 56]);
+            assert!(!is_healthy(&data), "{speed}");
+            upright(&models, &mut data, 0.0);
+            models.step(&mut data, &[0.0; 56]);
+            assert!(is_healthy(&data));
+        }
+        assert!(!std::path::Path::new("MUJOCO_LOG.TXT").exists(), "MuJoCo wrote its warnings to a file");
+    }
+
+    #[test]
+    fn the_cheaper_sequence_gives_the_plain_ones_numbers() {
+        let models = Models::new(humanoid::build(WalkerModel::Cmu2020).unwrap(), 6);
+        let (mut cheap, mut plain) = (models.data(), models.data());
+        upright(&models, &mut cheap, 0.1);
+        upright(&models, &mut plain, 0.1);
+        for step in 0..50 {
+            let control = std::array::from_fn(|servo| ((step * 56 + servo) as f64).sin());
+            models.step(&mut cheap, &control);
+            models.step_plainly(&mut plain, &control);
+            assert_eq!(cheap.qpos(), plain.qpos());
+            assert_eq!(cheap.qvel(), plain.qvel());
+            assert_eq!(cheap.act(), plain.act());
+            assert_eq!(cheap.sensordata(), plain.sensordata());
+        }
+    }
+}

@@ -27,11 +27,15 @@ pub(crate) struct Reference {
 impl Reference {
     /// Takes the sub-range of `entry`; features that the clip lacks come from the body's kinematics.
     pub(crate) fn new(clip: Clip, entry: &Entry, walker: &Walker, data: &mut Data) -> Result<Self, Error> {
+        let range = entry.frames();
+        if range.is_empty() || range.end > clip.steps() {
+            let reason = format!("frames {range:?} wanted, {} are there; has its file been replaced?", clip.steps());
+            return Err(Error::Clip { clip: clip.name, reason });
+        }
         let features = match clip.features {
             Some(features) => features,
             None => features::features(walker, data, &clip.motion),
         };
-        let range = entry.frames();
         let reference = Self {
             dt: clip.dt,
             first: range.start,
@@ -50,8 +54,7 @@ impl Reference {
         let bodies = data.xpos()[walker.tracked.clone()].as_flattened();
         let deviation = bodies.iter().zip(self.body_positions(0)).map(|(a, b)| (a - b).abs()).sum::<f64>();
         let error = 0.5 * deviation / bodies.len() as f64;
-        // Written so that a NaN fails.
-        if !(error <= MISMATCH) {
+        if error.is_nan() || error > MISMATCH {
             return Err(Error::Clip {
                 clip: name.into(),
                 reason: format!(
@@ -130,5 +133,36 @@ impl Reference {
         qvel[3..6].copy_from_slice(&self.motion.angular_velocity[index]);
         qvel[6..].copy_from_slice(self.joints_velocity(frame));
         qvel
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use comic_clips::{Catalogue, WalkerModel};
+    use comic_experiment::ClipSource;
+
+    use super::*;
+    use crate::humanoid;
+    use crate::physics::Models;
+
+    #[test]
+    fn a_clip_of_another_body_is_refused_by_name() {
+        let model = humanoid::build(WalkerModel::Cmu2020).unwrap();
+        let walker = Walker::new(WalkerModel::Cmu2020, &model).unwrap();
+        let mut data = Models::new(model, 6).data();
+        let catalogue = Catalogue::open(&[ClipSource::whole("builtin:stand")]).unwrap();
+        let entry = &catalogue.entries()[0];
+        for (scale, accepted) in [(1.0, true), (0.83, false), (f64::NAN, false)] {
+            let mut clip = catalogue.load(0).unwrap();
+            let mut features = features::features(&walker, &mut data, &clip.motion);
+            for position in &mut features.body_positions {
+                *position *= scale;
+            }
+            clip.features = Some(features);
+            match Reference::new(clip, entry, &walker, &mut data) {
+                Ok(_) => assert!(accepted),
+                Err(error) => assert!(!accepted && error.to_string().starts_with("clip stand: its first frame")),
+            }
+        }
     }
 }

@@ -22,9 +22,7 @@ pub(crate) fn termination_error(
     let (body_sum, joint_sum) =
         (absolute(bodies, reference.body_positions(frame)), absolute(joints, reference.joints(frame)));
     match kind {
-        TerminationError::DmControl => {
-            0.5 * (body_sum / bodies.len() as f64) + 0.5 * (joint_sum / joints.len() as f64)
-        }
+        TerminationError::DmControl => 0.5 * (body_sum / bodies.len() as f64) + 0.5 * (joint_sum / joints.len() as f64),
         TerminationError::Supplement => body_sum + joint_sum,
     }
 }

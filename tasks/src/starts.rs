@@ -26,7 +26,12 @@ pub(crate) struct Starts {
 
 impl Starts {
     /// `None` when nothing can be drawn.
-    pub(crate) fn new(entries: &[Entry], look_ahead: usize, min_steps: usize, always_at_clip_start: bool) -> Option<Self> {
+    pub(crate) fn new(
+        entries: &[Entry],
+        look_ahead: usize,
+        min_steps: usize,
+        always_at_clip_start: bool,
+    ) -> Option<Self> {
         let frames = |entry: &Entry| {
             if always_at_clip_start {
                 entry.start_step..entry.start_step + 1

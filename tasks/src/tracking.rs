@@ -58,7 +58,8 @@ impl TrackingTask {
         for entry in entries {
             entry.check(kind, first.dt, look_ahead, min_steps)?;
         }
-        let observations = config.observations.iter().map(|name| task_observation(name)).collect::<Result<Vec<_>, _>>()?;
+        let observations =
+            config.observations.iter().map(|name| task_observation(name)).collect::<Result<Vec<_>, _>>()?;
         let starts = Starts::new(entries, look_ahead, min_steps, config.always_start_at_clip_start)
             .ok_or(Error::NoStarts { min_steps })?;
 

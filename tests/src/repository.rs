@@ -70,7 +70,8 @@ pub fn direct_dependencies(package: &str) -> Result<BTreeSet<String>> {
 
 fn tree(package: &str, more: &[&str]) -> Result<BTreeSet<String>> {
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let arguments = ["tree", "--offline", "--edges", "normal", "--prefix", "none", "--format", "{p}", "--package", package];
+    let arguments =
+        ["tree", "--offline", "--edges", "normal", "--prefix", "none", "--format", "{p}", "--package", package];
     let output = Command::new(cargo).args(arguments).args(more).current_dir(root()).output();
     let output = output.context("cannot start cargo")?;
     if !output.status.success() {

@@ -95,7 +95,11 @@ impl System {
         // Nobody's own directories and settings decide what a test sees.
         let home = self.directory.path().join("home");
         fs::create_dir_all(&home).context("cannot make a home directory")?;
-        command.env("HOME", &home).env("XDG_CACHE_HOME", home.join("cache")).env_remove("RUST_LOG").env("NO_COLOR", "1");
+        command
+            .env("HOME", &home)
+            .env("XDG_CACHE_HOME", home.join("cache"))
+            .env_remove("RUST_LOG")
+            .env("NO_COLOR", "1");
         let child = command.stdin(Stdio::null()).stdout(output.try_clone()?).stderr(output).spawn();
         let child = child.with_context(|| format!("cannot start the {kind}"))?;
         Ok(Process { child, log })

@@ -75,7 +75,7 @@ async fn two_actors_and_a_learner_survive_every_death_and_their_books_balance() 
     let resumed = kill_and_restart_the_learner(&mut system).await?;
     ensure!(resumed.learner_epoch > first.learner_epoch, "a restarted learner lives in a new epoch");
     for actor in [&mut second, &mut third] {
-        actor.until_log_holds("reconnected to the learner", LIMIT).await?;
+        actor.until_log_holds(&format!("learner_epoch={}", resumed.learner_epoch), LIMIT).await?;
     }
     leaves(second).await?;
     trains_on(&mut system, "the third actor's unrolls are trained on after the restart").await?;

@@ -30,7 +30,7 @@ impl<E: Environment> Lane<E> {
     pub(super) fn new(mut environment: E, layout: &UnrollLayout, row: &mut ActingRow<'_>) -> Self {
         environment.reset();
         let episode = environment.episode();
-        let mut lane = Self {
+        let lane = Self {
             environment,
             unroll: UnrollBuffer::new(layout),
             first: true,

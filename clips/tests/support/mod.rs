@@ -1,10 +1,16 @@
 //! Where the fixtures are.
-#![allow(dead_code)]
+#![allow(dead_code, reason = "no test uses all of it")]
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
 
 use std::path::{Path, PathBuf};
 
 use comic_clips::{Catalogue, Error};
 use comic_experiment::ClipSource;
+
+/// A failing case is printed, not kept in a file.
+pub(crate) fn law() -> proptest::test_runner::Config {
+    proptest::test_runner::Config { failure_persistence: None, ..Default::default() }
+}
 
 pub(crate) fn tiny() -> String {
     fixture("tiny.h5")

@@ -67,7 +67,8 @@ fn learner(threads: u16, arguments: &[String]) -> Result<()> {
     let Some(first) = ours.first() else { return Ok(()) };
     let mut lines = Vec::new();
     for (index, figure) in first.iter().enumerate() {
-        let of_rounds = |part: fn(&Figure) -> f64| median(ours.iter().filter_map(|round| round.get(index)).map(part).collect());
+        let of_rounds =
+            |part: fn(&Figure) -> f64| median(ours.iter().filter_map(|round| round.get(index)).map(part).collect());
         let (value, floor) = (of_rounds(|figure| figure.value), of_rounds(|figure| figure.floor));
         lines.push(Figure { value, floor, ratio: value / floor, ..figure.clone() });
     }

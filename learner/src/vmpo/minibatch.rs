@@ -128,6 +128,11 @@ impl MinibatchTensors {
         }
     }
 
+    /// z_{t−1} as the next step will take it, `[B, T, Z]`.
+    pub fn previous_latent(&self) -> &Tensor {
+        &self.previous_latent
+    }
+
     /// The unrolls at `indices`, `[M]` int64 below B, copied.
     pub fn select(&self, indices: &Tensor) -> Self {
         let take = |tensor: &Tensor| tensor.index_select(0, indices);

@@ -1,5 +1,5 @@
 //! A small unroll, and actors that make them.
-#![allow(dead_code)]
+#![allow(dead_code, clippy::unwrap_used, clippy::expect_used)]
 
 use std::future::Future;
 use std::sync::Arc;
@@ -10,33 +10,33 @@ use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{Batch, Batcher, Config, Ledger, Next, Outcome, Phase};
 
-pub const PHASE: Phase = Phase { epoch: 1, version: 10, demonstration: false };
-pub const CONFIG: Config = Config { unrolls: 3, max_staleness: 4 };
+pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, demonstration: false };
+pub(crate) const CONFIG: Config = Config { unrolls: 3, max_staleness: 4 };
 /// Slots that fill up while nobody trains: the open batch and the full one.
-pub const SLOTS: usize = 2 * CONFIG.unrolls;
+pub(crate) const SLOTS: usize = 2 * CONFIG.unrolls;
 
-pub fn layout() -> Arc<UnrollLayout> {
+pub(crate) fn layout() -> Arc<UnrollLayout> {
     let shape = UnrollShape { length: 2, proprioception: 3, task: 4, action: 2, latent: 1, reward_terms: 2 };
     Arc::new(UnrollLayout::new(shape))
 }
 
-pub fn batcher() -> Batcher {
+pub(crate) fn batcher() -> Batcher {
     Batcher::new(layout(), CONFIG, PHASE, Ledger::new())
 }
 
 /// An actor that has joined.
 #[derive(Clone, Copy, Debug)]
-pub struct Actor {
-    pub actor: u64,
-    pub incarnation: u64,
+pub(crate) struct Actor {
+    pub(crate) actor: u64,
+    pub(crate) incarnation: u64,
 }
 
 impl Actor {
-    pub fn join(batcher: &Batcher, incarnation: u64) -> Self {
+    pub(crate) fn join(batcher: &Batcher, incarnation: u64) -> Self {
         Self { actor: batcher.join(incarnation, None).unwrap().actor, incarnation }
     }
 
-    pub fn header(self, sequence: u64) -> UnrollHeader {
+    pub(crate) fn header(self, sequence: u64) -> UnrollHeader {
         UnrollHeader {
             actor: self.actor,
             incarnation: self.incarnation,
@@ -50,13 +50,13 @@ impl Actor {
     }
 
     /// Sends unroll `sequence`; `None` if it has to wait, and then gives up.
-    pub fn send(self, batcher: &Batcher, sequence: u64) -> Option<Outcome> {
+    pub(crate) fn send(self, batcher: &Batcher, sequence: u64) -> Option<Outcome> {
         insert_now(batcher, &self.header(sequence))
     }
 }
 
 /// An unroll whose every number says who made it.
-pub fn payload(header: &UnrollHeader) -> Bytes {
+pub(crate) fn payload(header: &UnrollHeader) -> Bytes {
     let layout = layout();
     let mut unroll = UnrollBuffer::new(&layout);
     for field in Field::ALL.into_iter().filter(|field| *field != Field::Clip) {
@@ -70,17 +70,17 @@ pub fn payload(header: &UnrollHeader) -> Bytes {
     unroll.into_bytes()
 }
 
-pub fn mark(header: &UnrollHeader, field: Field, t: usize) -> f32 {
-    (header.actor * 10_000 + header.sequence * 100) as f32 + (field as usize * 4 + t) as f32 / 64.0
+pub(crate) fn mark(header: &UnrollHeader, field: Field, t: usize) -> f32 {
+    header.actor as f32 * 10_000.0 + header.sequence as f32 * 100.0 + (field as usize * 4 + t) as f32 / 64.0
 }
 
 /// Inserts if that is possible without waiting; the future is dropped otherwise.
-pub fn insert_now(batcher: &Batcher, header: &UnrollHeader) -> Option<Outcome> {
+pub(crate) fn insert_now(batcher: &Batcher, header: &UnrollHeader) -> Option<Outcome> {
     now(&mut Box::pin(batcher.insert(header, payload(header))))
 }
 
 /// Polls a future once.
-pub fn now<T>(future: &mut (impl Future<Output = T> + Unpin)) -> Option<T> {
+pub(crate) fn now<T>(future: &mut (impl Future<Output = T> + Unpin)) -> Option<T> {
     match std::pin::Pin::new(future).poll(&mut Context::from_waker(Waker::noop())) {
         Poll::Ready(value) => Some(value),
         Poll::Pending => None,
@@ -88,7 +88,7 @@ pub fn now<T>(future: &mut (impl Future<Output = T> + Unpin)) -> Option<T> {
 }
 
 /// The full batch, if there is one.
-pub fn batch_now(batcher: &Batcher) -> Option<Batch> {
+pub(crate) fn batch_now(batcher: &Batcher) -> Option<Batch> {
     match batcher.next_batch_within(std::time::Duration::ZERO) {
         Next::Batch(batch) => Some(batch),
         Next::Elapsed | Next::Closed => None,

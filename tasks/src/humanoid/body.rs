@@ -22,8 +22,7 @@ pub(super) fn humanoid(directory: &Path, model: WalkerModel) -> Result<MjSpec, E
         WalkerModel::Cmu2019 => ("humanoid_CMU_V2019.xml", &servos::V2019),
         WalkerModel::Cmu2020 => ("humanoid_CMU_V2020.xml", &servos::V2020),
     };
-    let mut spec =
-        MjSpec::from_xml(assets::file(directory, file)?).map_err(refused("reading the humanoid's XML"))?;
+    let mut spec = MjSpec::from_xml(assets::file(directory, file)?).map_err(refused("reading the humanoid's XML"))?;
     spec.set_modelname("walker");
     if model == WalkerModel::Cmu2020 {
         add_face(&mut spec)?;

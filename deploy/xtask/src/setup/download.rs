@@ -55,7 +55,14 @@ pub(super) fn fetch(wheel: &Wheel, directory: &Path, interrupt: &Interrupt) -> R
     find(wheel, directory)
 }
 
-fn pip(wheel: &Wheel, directory: &Path, temporary: &Path, requirements: &Path, log: &Path, interrupt: &Interrupt) -> Result<()> {
+fn pip(
+    wheel: &Wheel,
+    directory: &Path,
+    temporary: &Path,
+    requirements: &Path,
+    log: &Path,
+    interrupt: &Interrupt,
+) -> Result<()> {
     let output = File::create(log).with_context(|| format!("cannot write {}", log.display()))?;
     let mut progress = Progress::start(format!("fetching {} {}", wheel.name, wheel.version), wheel.size);
     let mut child = Command::new("python3")
@@ -152,7 +159,8 @@ mod tests {
 
     #[test]
     fn a_failed_download_names_the_wheel_the_remedy_and_pips_last_words() {
-        let message = explain(&WHEELS[0], "Collecting mujoco\nERROR: No matching distribution found", Path::new("pip.log"));
+        let message =
+            explain(&WHEELS[0], "Collecting mujoco\nERROR: No matching distribution found", Path::new("pip.log"));
         assert!(message.contains("mujoco 3.17.0"), "{message}");
         assert!(message.contains("PIP_FIND_LINKS"), "{message}");
         assert!(message.ends_with("No matching distribution found"), "{message}");

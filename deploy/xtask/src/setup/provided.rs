@@ -11,7 +11,11 @@ use super::wheels::Part;
 ///
 /// `.cargo/config.toml` sets the same variables to places inside `dependencies` unless they are set already, so only a
 /// value that points elsewhere is the user's.
-pub(super) fn directory(part: Part, dependencies: &Path, variable: impl Fn(&str) -> Option<PathBuf>) -> Result<Option<PathBuf>> {
+pub(super) fn directory(
+    part: Part,
+    dependencies: &Path,
+    variable: impl Fn(&str) -> Option<PathBuf>,
+) -> Result<Option<PathBuf>> {
     let name = match part {
         Part::Mujoco => "MUJOCO_DYNAMIC_LINK_DIR",
         Part::Libtorch => "LIBTORCH",

@@ -40,7 +40,8 @@ impl Stamp {
         let path = Self::path(dependencies, wheel);
         let unfinished = path.with_extension("unfinished");
         fs::create_dir_all(dependencies.join("stamps")).context("cannot make the directory of stamps")?;
-        fs::write(&unfinished, serde_json::to_vec(self)?).with_context(|| format!("cannot write {}", unfinished.display()))?;
+        fs::write(&unfinished, serde_json::to_vec(self)?)
+            .with_context(|| format!("cannot write {}", unfinished.display()))?;
         super::extract::rename(&unfinished, &path)
     }
 

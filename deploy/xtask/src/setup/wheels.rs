@@ -74,9 +74,7 @@ pub(crate) const WHEELS: [Wheel; 5] = [
         size: 10_248_621,
         native: true,
         part: Part::Libtorch,
-        place: |file, _| {
-            (file == "nvidia/cuda_cupti/lib/libcupti.so.12").then(|| "libtorch/lib/libcupti.so.12".into())
-        },
+        place: |file, _| (file == "nvidia/cuda_cupti/lib/libcupti.so.12").then(|| "libtorch/lib/libcupti.so.12".into()),
         links: &[],
     },
     Wheel {

@@ -53,7 +53,8 @@ pub(super) fn compare(job: &Job, interrupt: &Interrupt) -> Result<()> {
     }
     let path = job.directory.path().join("evaluation.json");
     let record: BTreeMap<_, _> = columns.iter().cloned().collect();
-    fs::write(&path, serde_json::to_vec_pretty(&record)?).with_context(|| format!("cannot write {}", path.display()))?;
+    fs::write(&path, serde_json::to_vec_pretty(&record)?)
+        .with_context(|| format!("cannot write {}", path.display()))?;
     println!("{}", table(&columns));
     println!("kept in {}", job.directory.path().display());
     Ok(())
@@ -137,7 +138,8 @@ mod tests {
 
     #[test]
     fn the_table_has_a_block_per_clip_and_a_column_per_policy() {
-        let table = table(&[("untrained", evaluation(&["CMU_007_01"], 0.03)), ("trained", evaluation(&["CMU_007_01"], 0.41))]);
+        let table =
+            table(&[("untrained", evaluation(&["CMU_007_01"], 0.03)), ("trained", evaluation(&["CMU_007_01"], 0.41))]);
         assert!(table.contains("CMU_007_01                       untrained       trained\n"), "{table}");
         assert!(table.contains("  normalised reward                  0.030         0.410\n"), "{table}");
         assert!(table.contains("  com, per step                      0.010         0.010\n"), "{table}");

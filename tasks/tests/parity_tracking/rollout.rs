@@ -7,7 +7,7 @@ use comic_clips::Catalogue;
 use comic_experiment::{ClipSource, TRACKING_REWARD_TERMS, Tracking};
 use comic_tasks::{Environment, Outcome, Step, TrackingEnvironment, TrackingTask};
 
-use crate::support::npz::{self, Arrays};
+use crate::npz::{self, Arrays};
 
 /// What of a file's name says that it is a rollout, kind by kind.
 pub(crate) const KINDS: [&str; 2] = ["tracking_", "tracking2019_"];
@@ -98,14 +98,15 @@ impl Rollout {
             .map_or_else(|| workspace().join(".deps/dm_control"), |directory| workspace().join(directory));
         let mut candidates = files(&self.folder, "h5")?;
         candidates.push(wheel.join("test_trajectories.h5"));
+        let mut searched = Vec::new();
         for path in candidates {
-            let catalogue = Catalogue::open(&[ClipSource::whole(path.to_string_lossy())])
-                .map_err(|error| format!("{}: {error}", self.file))?;
-            if catalogue.entries().iter().any(|entry| entry.name == clip) {
-                return Ok(path);
+            match Catalogue::open(&[ClipSource::whole(path.to_string_lossy())]) {
+                Ok(catalogue) if catalogue.entries().iter().any(|entry| entry.name == clip) => return Ok(path),
+                Ok(_) => searched.push(path.display().to_string()),
+                Err(error) => searched.push(error.to_string()),
             }
         }
-        Err(format!("{}: no .h5 file of the folder, nor test_trajectories.h5, has clip `{clip}`", self.file))
+        Err(format!("{}: clip `{clip}` is in none of: {}", self.file, searched.join("; ")))
     }
 
     fn environment(&self) -> Result<TrackingEnvironment, String> {

@@ -1,16 +1,11 @@
 //! The compiled model against dm_control's: every array, bit for bit.
 
-mod support {
-    pub mod model_arrays;
-    pub mod npz;
-}
-
 use std::path::PathBuf;
 
 use comic_clips::WalkerModel;
 use comic_tasks::humanoid;
-use mujoco_rs::prelude::*;
-use support::{model_arrays, npz};
+
+use crate::{model_arrays, npz};
 
 fn golden(name: &str) -> Option<PathBuf> {
     let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/golden").join(name);

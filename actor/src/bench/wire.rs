@@ -1,0 +1,172 @@
+//! What an unroll costs on its way from a worker into a batch.
+
+use std::pin::Pin;
+use std::sync::Arc;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use comic_proto::v1::learner_server::{Learner, LearnerServer};
+use comic_proto::v1::*;
+use comic_proto::{Expected, Field, UnrollBuffer, UnrollLayout, UnrollShape, validate};
+use comic_replay::{Batcher, Config, Ledger, Outcome, Phase};
+use futures::{Stream, StreamExt as _};
+use tokio::net::TcpListener;
+use tokio::sync::{mpsc, watch};
+use tokio_stream::wrappers::TcpListenerStream;
+use tonic::{Request, Response, Status, Streaming};
+
+use super::figure::{Figure, Medians, interleave};
+use super::Subject;
+use crate::Error;
+use crate::mailbox::Mailbox;
+use crate::session::{self, Limits};
+use crate::worker::FinishedUnroll;
+
+/// Updates' worth of unrolls in a segment.
+const UPDATES: usize = 2;
+
+/// Session, loopback, validation and batcher share one thread, so the wall-clock time of a segment is the processor
+/// time of them all. At one update a second it is spent once a second.
+pub(super) fn wire(subject: &Subject) -> Result<Figure, Error> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(Error::Thread)?;
+    let (spec, experiment) = (subject.task.spec(), &subject.experiment);
+    let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, experiment)));
+    let phase = Phase { epoch: 1, version: 1, demonstration: false };
+    let config = Config { unrolls: experiment.unroll.batch, max_staleness: experiment.unroll.max_staleness };
+    let batcher = Batcher::new(Arc::clone(&layout), config, phase, Ledger::new());
+    let trainer = thread::spawn({
+        let batcher = batcher.clone();
+        move || {
+            while let Some(batch) = batcher.next_batch() {
+                batcher.trained(batch);
+            }
+        }
+    });
+    let reply = JoinReply {
+        learner_epoch: 1,
+        experiment: experiment.to_toml()?,
+        task_spec: toml::to_string(spec).map_err(|error| Error::Usage(error.to_string()))?,
+        layout_hash: layout.hash().to_vec(),
+        ..JoinReply::default()
+    };
+    let address = runtime.block_on(serve(Receiver { batcher: batcher.clone(), reply }))?;
+    let unrolls = UPDATES * experiment.unroll.batch;
+    let unroll = still_unroll(&layout);
+    let medians = interleave(subject.budget, || {
+        let elapsed = runtime.block_on(send(&address, &unroll, unrolls))?;
+        Ok::<_, Error>((elapsed.as_secs_f64() * 1000.0 / UPDATES as f64, 1000.0))
+    });
+    batcher.close();
+    trainer.join().map_err(|_| Error::WorkerPanicked)?;
+    let Medians { value, floor } = medians?;
+    let note = "ms of one core for the unrolls of one update (encode, loopback, decode, validate, batch); floor: the \
+                second between updates, so the ratio is the share of an actor's time";
+    Ok(Figure::new("actor.wire", "ms/update", Medians { value, floor }, note))
+}
+
+/// An unroll that passes validation.
+fn still_unroll(layout: &UnrollLayout) -> FinishedUnroll {
+    let mut buffer = UnrollBuffer::new(layout);
+    for t in 0..layout.rows(Field::Valid) {
+        buffer.row_mut(Field::Valid, t)[0] = 1.0;
+    }
+    let payload = buffer.into_bytes();
+    FinishedUnroll { payload, learner_epoch: 1, version: 1, demonstration: false, episodes: Vec::new() }
+}
+
+/// From the first unroll handed over to the last acknowledgement.
+async fn send(address: &str, unroll: &FinishedUnroll, unrolls: usize) -> Result<Duration, Error> {
+    let (_stop, stopped) = watch::channel(false);
+    let options = session::Options { learner: address.to_string(), cache: None };
+    let joined = session::join(&options, stopped.clone()).await?;
+    let (sender, receiver) = mpsc::channel(super::ENVIRONMENTS);
+    let limits = Limits { window: 2 * super::ENVIRONMENTS, parameters: 0, flush: Duration::ZERO };
+    let begin = Instant::now();
+    let session = tokio::spawn(joined.run(limits, receiver, Arc::new(Mailbox::default()), stopped));
+    for _ in 0..unrolls {
+        if sender.send(unroll.clone()).await.is_err() {
+            break;
+        }
+    }
+    drop(sender);
+    let settled = session.await.map_err(|_| Error::WorkerPanicked)??;
+    if settled.taken != unrolls as u64 {
+        return Err(Error::Usage(format!("{settled:?} of {unrolls} unrolls: nothing was measured")));
+    }
+    Ok(begin.elapsed())
+}
+
+async fn serve(receiver: Receiver) -> Result<String, Error> {
+    let listener = TcpListener::bind("127.0.0.1:0").await.map_err(Error::Thread)?;
+    let address = format!("http://{}", listener.local_addr().map_err(Error::Thread)?);
+    let limit = receiver.batcher.layout().message_limit();
+    let service = LearnerServer::new(receiver).max_decoding_message_size(limit);
+    // The windows of the learner: one unroll fits a stream's, and a connection's is larger.
+    let router = tonic::transport::Server::builder()
+        .initial_stream_window_size(1 << 20)
+        .initial_connection_window_size(2 << 20)
+        .add_service(service);
+    tokio::spawn(router.serve_with_incoming(TcpListenerStream::new(listener)));
+    Ok(address)
+}
+
+/// The learner's way in, and nothing behind it.
+struct Receiver {
+    batcher: Batcher,
+    reply: JoinReply,
+}
+
+type Reply<T> = Result<Response<T>, Status>;
+type Messages<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+async fn take(batcher: &Batcher, message: UnrollMessage) -> Result<UnrollAck, Status> {
+    let header = message.header.ok_or_else(|| Status::invalid_argument("no header"))?;
+    let expected = Expected { clips: 1, epoch: 1, newest_version: 1 };
+    validate(batcher.layout(), &header, &message.payload, &expected)
+        .map_err(|invalid| Status::invalid_argument(invalid.to_string()))?;
+    let verdict = match batcher.insert(&header, message.payload).await {
+        Outcome::Taken => Verdict::Taken,
+        _ => Verdict::Invalid,
+    };
+    Ok(UnrollAck { sequence: header.sequence, verdict: verdict.into(), detail: String::new() })
+}
+
+#[tonic::async_trait]
+impl Learner for Receiver {
+    async fn join(&self, request: Request<JoinRequest>) -> Reply<JoinReply> {
+        let JoinRequest { incarnation, actor, .. } = request.into_inner();
+        let joined = self
+            .batcher
+            .join(incarnation, actor)
+            .map_err(|refused| Status::failed_precondition(refused.to_string()))?;
+        Ok(Response::new(JoinReply { actor: joined.actor, ..self.reply.clone() }))
+    }
+
+    type SendUnrollsStream = Messages<UnrollAck>;
+    async fn send_unrolls(&self, request: Request<Streaming<UnrollMessage>>) -> Reply<Self::SendUnrollsStream> {
+        let batcher = self.batcher.clone();
+        let acks = request.into_inner().then(move |message| {
+            let batcher = batcher.clone();
+            async move { take(&batcher, message?).await }
+        });
+        Ok(Response::new(Box::pin(acks)))
+    }
+
+    type WatchParametersStream = Messages<ParametersChunk>;
+    async fn watch_parameters(&self, _request: Request<WatchRequest>) -> Reply<Self::WatchParametersStream> {
+        Ok(Response::new(Box::pin(futures::stream::pending())))
+    }
+
+    type FetchAssetStream = Messages<AssetChunk>;
+    async fn fetch_asset(&self, _request: Request<AssetRequest>) -> Reply<Self::FetchAssetStream> {
+        Err(Status::not_found("no assets here"))
+    }
+
+    async fn report_evaluation(&self, _request: Request<EvaluationReport>) -> Reply<EvaluationAck> {
+        Ok(Response::new(EvaluationAck {}))
+    }
+
+    async fn get_status(&self, _request: Request<StatusRequest>) -> Reply<comic_proto::v1::Status> {
+        Ok(Response::new(comic_proto::v1::Status::default()))
+    }
+}

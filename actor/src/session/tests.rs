@@ -1,0 +1,227 @@
+//! The session against a learner that does what a test tells it to, over real sockets.
+
+mod learner;
+
+use bytes::Bytes;
+use comic_proto::v1::Behaviour;
+
+use super::*;
+use crate::mailbox::{Conduct, Directive};
+use learner::{FakeLearner, Script};
+
+const LIMITS: Limits = Limits { window: 4, parameters: 1000, flush: Duration::from_secs(60) };
+
+/// An unroll that names itself by its version.
+fn unroll(number: u64) -> FinishedUnroll {
+    FinishedUnroll {
+        payload: Bytes::from(vec![7; 100]),
+        learner_epoch: 1,
+        version: number,
+        demonstration: false,
+        episodes: Vec::new(),
+    }
+}
+
+struct Running {
+    unrolls: mpsc::Sender<FinishedUnroll>,
+    mailbox: Arc<Mailbox>,
+    stop: watch::Sender<bool>,
+    session: tokio::task::JoinHandle<Result<Settled, Error>>,
+}
+
+async fn start(learner: &FakeLearner) -> Running {
+    let (stop, stopped) = watch::channel(false);
+    let options = Options { learner: learner.address(), cache: None };
+    let joined = join(&options, stopped.clone()).await.unwrap();
+    let (unrolls, receiver) = mpsc::channel(1);
+    let mailbox = Arc::new(Mailbox::default());
+    let session = tokio::spawn(joined.run(LIMITS, receiver, Arc::clone(&mailbox), stopped));
+    Running { unrolls, mailbox, stop, session }
+}
+
+async fn first_directive(mailbox: &Arc<Mailbox>) -> Arc<Directive> {
+    let mailbox = Arc::clone(mailbox);
+    tokio::task::spawn_blocking(move || mailbox.wait()).await.unwrap().unwrap()
+}
+
+#[tokio::test]
+async fn connections_dropped_in_mid_stream_lose_nothing_repeat_nothing_and_keep_the_order() {
+    // Each connection breaks after so many unrolls, some of which it took without a word.
+    let script = Script { breaks: vec![(3, 1), (1, 1), (5, 5), (0, 0), (2, 0)], ..Script::default() };
+    let learner = FakeLearner::start(script).await;
+    let running = start(&learner).await;
+    for number in 0..40 {
+        running.unrolls.send(unroll(number)).await.unwrap();
+    }
+    drop(running.unrolls);
+    let settled = running.session.await.unwrap().unwrap();
+
+    let seen = learner.seen();
+    assert_eq!(seen.taken, (0..40).map(|number| (number, number)).collect::<Vec<_>>(), "sequence and content");
+    // 2 + 0 + 0 + 0 + 2 were taken without an acknowledgement, and came again.
+    assert_eq!((settled.taken, settled.duplicate), (36, 4));
+    assert_eq!(seen.joins.len(), 6);
+    assert!(seen.joins.iter().all(|join| join.incarnation == seen.joins[0].incarnation), "one process, one incarnation");
+    assert_eq!(seen.joins[0].actor, None);
+    assert!(seen.joins[1..].iter().all(|join| join.actor == Some(learner::ACTOR)));
+}
+
+#[tokio::test]
+async fn a_learner_that_acknowledges_nothing_holds_the_actor_at_its_window() {
+    let learner = FakeLearner::start(Script { silent: true, ..Script::default() }).await;
+    let running = start(&learner).await;
+    // The window, one in the channel, and then no room.
+    for number in 0..LIMITS.window as u64 + 1 {
+        running.unrolls.send(unroll(number)).await.unwrap();
+    }
+    learner.until(|seen| seen.taken.len() == LIMITS.window).await;
+    assert!(running.unrolls.try_send(unroll(99)).is_err());
+    running.session.abort();
+}
+
+#[tokio::test]
+async fn parameters_reach_the_mailbox_and_leaving_ends_the_session() {
+    let learner = FakeLearner::start(Script::default()).await;
+    let running = start(&learner).await;
+    learner.publish(Behaviour::Policy, 5, b"parameters in pieces");
+    let expected = Directive {
+        learner_epoch: 1,
+        version: 5,
+        conduct: Conduct::Policy,
+        parameters: Bytes::from_static(b"parameters in pieces"),
+    };
+    assert_eq!(*first_directive(&running.mailbox).await, expected);
+    learner.publish(Behaviour::Leave, 6, b"");
+    running.session.await.unwrap().unwrap();
+}
+
+#[tokio::test]
+async fn parameters_that_break_the_protocol_cost_a_connection_and_nothing_else() {
+    let learner = FakeLearner::start(Script::default()).await;
+    let running = start(&learner).await;
+    learner.publish(Behaviour::Policy, 5, &[1; 2000]);
+    learner.until(|seen| seen.joins.len() >= 2).await;
+    learner.publish(Behaviour::Policy, 6, b"small enough");
+    assert_eq!(first_directive(&running.mailbox).await.version, 6);
+    running.session.abort();
+}
+
+#[tokio::test]
+async fn another_experiment_at_a_reconnect_is_an_error_that_a_restart_mends() {
+    let learner = FakeLearner::start(Script { breaks: vec![(1, 1)], ..Script::default() }).await;
+    let running = start(&learner).await;
+    learner.change_experiment();
+    running.unrolls.send(unroll(0)).await.unwrap();
+    let error = running.session.await.unwrap().unwrap_err();
+    assert!(matches!(error, Error::Changed), "{error}");
+    assert!(!error.is_configuration());
+}
+
+#[tokio::test]
+async fn stopping_flushes_what_is_finished() {
+    let learner = FakeLearner::start(Script::default()).await;
+    let running = start(&learner).await;
+    for number in 0..3 {
+        running.unrolls.send(unroll(number)).await.unwrap();
+    }
+    running.stop.send_replace(true);
+    drop(running.unrolls);
+    let settled = running.session.await.unwrap().unwrap();
+    assert_eq!(settled.taken, 3);
+}
+
+#[tokio::test]
+async fn stopping_does_not_wait_for_a_learner_for_ever() {
+    let learner = FakeLearner::start(Script { silent: true, ..Script::default() }).await;
+    let (stop, stopped) = watch::channel(false);
+    let options = Options { learner: learner.address(), cache: None };
+    let joined = join(&options, stopped.clone()).await.unwrap();
+    let (unrolls, receiver) = mpsc::channel(1);
+    let limits = Limits { flush: Duration::from_millis(20), ..LIMITS };
+    let session = tokio::spawn(joined.run(limits, receiver, Arc::default(), stopped));
+    unrolls.send(unroll(0)).await.unwrap();
+    stop.send_replace(true);
+    assert_eq!(session.await.unwrap().unwrap(), Settled::default());
+}
+
+#[tokio::test]
+async fn a_learner_that_comes_up_later_is_waited_for() {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap();
+    drop(listener);
+    let (_stop, stopped) = watch::channel(false);
+    let options = Options { learner: format!("http://{address}"), cache: None };
+    let joining = tokio::spawn(async move { join(&options, stopped).await });
+    let listener = tokio::net::TcpListener::bind(address).await.unwrap();
+    let _learner = FakeLearner::serve(listener, Script::default());
+    assert_eq!(joining.await.unwrap().unwrap().actor, learner::ACTOR);
+}
+
+#[tokio::test]
+async fn a_refusal_is_a_configuration_error_and_stopping_ends_the_wait() {
+    let refused = |script| async {
+        let learner = FakeLearner::start(script).await;
+        let options = Options { learner: learner.address(), cache: None };
+        let (_stop, stopped) = watch::channel(false);
+        join(&options, stopped).await.unwrap_err()
+    };
+    let error = refused(Script { refuse: true, ..Script::default() }).await;
+    assert!(matches!(error, Error::Refused { .. }) && error.is_configuration(), "{error}");
+    let error = refused(Script { wrong_layout: true, ..Script::default() }).await;
+    assert!(matches!(error, Error::Disagreement { .. }) && error.is_configuration(), "{error}");
+
+    let (stop, stopped) = watch::channel(false);
+    stop.send_replace(true);
+    // Nobody listens at port 1.
+    let options = Options { learner: "http://127.0.0.1:1".into(), cache: None };
+    assert!(matches!(join(&options, stopped).await, Err(Error::Stopped)));
+}
+
+#[tokio::test]
+async fn an_address_that_is_none_is_refused_at_once() {
+    let (_stop, stopped) = watch::channel(false);
+    for learner in ["host:7070", "https://host:7070", "", "http://", "not a url"] {
+        let options = Options { learner: learner.into(), cache: None };
+        let error = join(&options, stopped.clone()).await.unwrap_err();
+        assert!(matches!(error, Error::Url { .. }), "{learner}: {error}");
+    }
+}
+
+mod assets {
+    use super::*;
+
+    async fn fetch(learner: &FakeLearner, cache: &std::path::Path) -> Result<HashMap<String, PathBuf>, Error> {
+        let (_stop, stopped) = watch::channel(false);
+        let options = Options { learner: learner.address(), cache: Some(cache.to_path_buf()) };
+        Ok(join(&options, stopped).await?.assets)
+    }
+
+    #[tokio::test]
+    async fn are_fetched_once_and_a_damaged_copy_again() {
+        let learner = FakeLearner::start(Script { asset: Some(b"clips".to_vec()), ..Script::default() }).await;
+        let cache = tempfile::tempdir().unwrap();
+        let located = fetch(&learner, cache.path()).await.unwrap();
+        let path = &located["walks.h5"];
+        assert_eq!(std::fs::read(path).unwrap(), b"clips");
+        fetch(&learner, cache.path()).await.unwrap();
+        assert_eq!(learner.seen().assets, 1);
+
+        std::fs::write(path, b"clipz").unwrap();
+        fetch(&learner, cache.path()).await.unwrap();
+        assert_eq!(std::fs::read(path).unwrap(), b"clips");
+        assert_eq!(learner.seen().assets, 2);
+        assert_eq!(std::fs::read_dir(cache.path().join("assets")).unwrap().count(), 1, "no temporary file stays");
+    }
+
+    #[tokio::test]
+    async fn that_are_not_what_was_announced_are_refused() {
+        for sent in [b"clipz".as_slice(), b"longer than announced"] {
+            let asset = Some(b"clips".to_vec());
+            let learner = FakeLearner::start(Script { asset, asset_sent: Some(sent.to_vec()), ..Script::default() }).await;
+            let cache = tempfile::tempdir().unwrap();
+            let error = fetch(&learner, cache.path()).await.unwrap_err();
+            assert!(matches!(error, Error::Asset { .. }), "{error}");
+            assert_eq!(std::fs::read_dir(cache.path().join("assets")).unwrap().count(), 0);
+        }
+    }
+}

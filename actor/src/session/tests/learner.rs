@@ -1,0 +1,214 @@
+//! A learner without learning.
+
+use std::collections::HashSet;
+use std::pin::Pin;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+
+use comic_experiment::{Experiment, TaskSpec};
+use comic_proto::v1::learner_server::{Learner, LearnerServer};
+use comic_proto::v1::*;
+use comic_proto::{UnrollLayout, UnrollShape};
+use futures::{Stream, StreamExt as _};
+use sha2::{Digest as _, Sha256};
+use tokio::net::TcpListener;
+use tokio::sync::{mpsc, watch};
+use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
+use tonic::{Request, Response, Status, Streaming};
+
+pub(super) const ACTOR: u64 = 3;
+/// Bytes of parameters or assets in a message.
+const PIECE: usize = 7;
+
+/// What this learner does that others do not.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Script {
+    /// Connection k breaks after it took so many unrolls, of which it acknowledged so many.
+    pub(super) breaks: Vec<(usize, usize)>,
+    /// Takes and never acknowledges.
+    pub(super) silent: bool,
+    pub(super) refuse: bool,
+    pub(super) wrong_layout: bool,
+    pub(super) asset: Option<Vec<u8>>,
+    /// What comes in the asset's place.
+    pub(super) asset_sent: Option<Vec<u8>>,
+}
+
+/// What it saw.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Seen {
+    pub(super) joins: Vec<JoinRequest>,
+    /// Sequence and version of each unroll, the first time it came.
+    pub(super) taken: Vec<(u64, u64)>,
+    pub(super) assets: usize,
+}
+
+struct Inner {
+    script: Script,
+    seen: watch::Sender<Seen>,
+    numbers: Mutex<HashSet<u64>>,
+    connections: AtomicUsize,
+    experiment: Mutex<Experiment>,
+    parameters: watch::Sender<Vec<ParametersChunk>>,
+}
+
+#[derive(Clone)]
+pub(super) struct FakeLearner {
+    inner: Arc<Inner>,
+    address: String,
+}
+
+impl FakeLearner {
+    pub(super) async fn start(script: Script) -> Self {
+        Self::serve(TcpListener::bind("127.0.0.1:0").await.unwrap(), script)
+    }
+
+    pub(super) fn serve(listener: TcpListener, script: Script) -> Self {
+        let address = format!("http://{}", listener.local_addr().unwrap());
+        let inner = Arc::new(Inner {
+            script,
+            seen: watch::Sender::default(),
+            numbers: Mutex::default(),
+            connections: AtomicUsize::new(0),
+            experiment: Mutex::default(),
+            parameters: watch::Sender::default(),
+        });
+        let learner = Self { inner, address };
+        let router = tonic::transport::Server::builder().add_service(LearnerServer::new(learner.clone()));
+        tokio::spawn(router.serve_with_incoming(TcpListenerStream::new(listener)));
+        learner
+    }
+
+    pub(super) fn address(&self) -> String {
+        self.address.clone()
+    }
+
+    pub(super) fn seen(&self) -> Seen {
+        self.inner.seen.borrow().clone()
+    }
+
+    pub(super) async fn until(&self, condition: impl Fn(&Seen) -> bool) {
+        self.inner.seen.subscribe().wait_for(|seen| condition(seen)).await.unwrap();
+    }
+
+    pub(super) fn change_experiment(&self) {
+        self.inner.experiment.lock().unwrap().seed += 1;
+    }
+
+    pub(super) fn publish(&self, behaviour: Behaviour, version: u64, parameters: &[u8]) {
+        let total = parameters.len() as u64;
+        let piece = |(index, data): (usize, &[u8])| ParametersChunk {
+            learner_epoch: 1,
+            version,
+            behaviour: behaviour.into(),
+            total,
+            offset: (index * PIECE) as u64,
+            data: data.to_vec().into(),
+        };
+        let mut pieces: Vec<_> = parameters.chunks(PIECE).enumerate().map(piece).collect();
+        if pieces.is_empty() {
+            pieces.push(piece((0, &[])));
+        }
+        self.inner.parameters.send_replace(pieces);
+    }
+
+    /// Takes an unroll once.
+    fn take(&self, header: &UnrollHeader) -> Verdict {
+        if !self.inner.numbers.lock().unwrap().insert(header.sequence) {
+            return Verdict::Duplicate;
+        }
+        self.inner.seen.send_modify(|seen| seen.taken.push((header.sequence, header.version)));
+        Verdict::Taken
+    }
+}
+
+type Reply<T> = Result<Response<T>, Status>;
+type BoxStream<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+#[tonic::async_trait]
+impl Learner for FakeLearner {
+    async fn join(&self, request: Request<JoinRequest>) -> Reply<JoinReply> {
+        if self.inner.script.refuse {
+            return Err(Status::failed_precondition("another protocol"));
+        }
+        self.inner.seen.send_modify(|seen| seen.joins.push(request.into_inner()));
+        let experiment = self.inner.experiment.lock().unwrap().clone();
+        let spec = TaskSpec::tracking(&experiment.task, vec!["walk".into()]).unwrap();
+        let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
+        let layout_hash = if self.inner.script.wrong_layout { vec![0; 32] } else { layout.hash().to_vec() };
+        let asset = |bytes: &Vec<u8>| Asset {
+            source: "walks.h5".into(),
+            sha256: Sha256::digest(bytes).to_vec(),
+            size: bytes.len() as u64,
+        };
+        Ok(Response::new(JoinReply {
+            learner_epoch: 1,
+            actor: ACTOR,
+            seed: 11,
+            experiment: experiment.to_toml().unwrap(),
+            task_spec: toml::to_string(&spec).unwrap(),
+            assets: self.inner.script.asset.iter().map(asset).collect(),
+            layout_hash,
+            next_sequence: 0,
+        }))
+    }
+
+    type FetchAssetStream = BoxStream<AssetChunk>;
+    async fn fetch_asset(&self, _request: Request<AssetRequest>) -> Reply<Self::FetchAssetStream> {
+        self.inner.seen.send_modify(|seen| seen.assets += 1);
+        let script = &self.inner.script;
+        let sent = script.asset_sent.clone().or(script.asset.clone()).unwrap();
+        let pieces: Vec<_> = sent.chunks(PIECE).map(|data| Ok(AssetChunk { data: data.to_vec().into() })).collect();
+        Ok(Response::new(Box::pin(futures::stream::iter(pieces))))
+    }
+
+    type SendUnrollsStream = ReceiverStream<Result<UnrollAck, Status>>;
+    async fn send_unrolls(&self, request: Request<Streaming<UnrollMessage>>) -> Reply<Self::SendUnrollsStream> {
+        let connection = self.inner.connections.fetch_add(1, Ordering::Relaxed);
+        let breaks = self.inner.script.breaks.get(connection).copied();
+        let (acks, stream) = mpsc::channel(1);
+        let learner = self.clone();
+        let mut unrolls = request.into_inner();
+        tokio::spawn(async move {
+            let mut count = 0;
+            loop {
+                if breaks.is_some_and(|(taken, _)| count == taken) {
+                    let _ = acks.send(Err(Status::unavailable("broken on purpose"))).await;
+                    return;
+                }
+                let Ok(Some(message)) = unrolls.message().await else { return };
+                let header = message.header.unwrap();
+                let verdict = learner.take(&header);
+                count += 1;
+                if learner.inner.script.silent || breaks.is_some_and(|(_, acknowledged)| count > acknowledged) {
+                    continue;
+                }
+                let ack = UnrollAck { sequence: header.sequence, verdict: verdict.into(), detail: String::new() };
+                if acks.send(Ok(ack)).await.is_err() {
+                    return;
+                }
+            }
+        });
+        Ok(Response::new(ReceiverStream::new(stream)))
+    }
+
+    type WatchParametersStream = BoxStream<ParametersChunk>;
+    async fn watch_parameters(&self, _request: Request<WatchRequest>) -> Reply<Self::WatchParametersStream> {
+        let mut receiver = self.inner.parameters.subscribe();
+        receiver.mark_changed();
+        let versions = futures::stream::unfold(receiver, |mut receiver| async {
+            receiver.changed().await.ok()?;
+            let pieces = receiver.borrow_and_update().clone();
+            Some((futures::stream::iter(pieces.into_iter().map(Ok)), receiver))
+        });
+        Ok(Response::new(Box::pin(versions.flatten())))
+    }
+
+    async fn report_evaluation(&self, _request: Request<EvaluationReport>) -> Reply<EvaluationAck> {
+        Err(Status::unimplemented("no evaluations here"))
+    }
+
+    async fn get_status(&self, _request: Request<StatusRequest>) -> Reply<comic_proto::v1::Status> {
+        Err(Status::unimplemented("no status here"))
+    }
+}

@@ -1,0 +1,181 @@
+//! Values that parse but mean nothing. NaN is refused everywhere: every rule is put so that only sense passes.
+
+use std::fmt::{Debug, Display};
+
+use crate::{
+    Actor, Budget, ClipSource, Experiment, Learner, Network, Optimiser, Prior, SUBSETS, TRACKING_OBSERVATIONS,
+    Tracking, Unroll, Vmpo, WarmStart, tracking_observation_size,
+};
+
+/// A field whose value is outside its meaning.
+pub(crate) struct Fault {
+    pub(crate) field: String,
+    pub(crate) value: String,
+    pub(crate) remedy: String,
+}
+
+const AT_LEAST_ONE: &str = "must be at least 1";
+const POSITIVE: &str = "must be positive";
+const NOT_NEGATIVE: &str = "must be 0 or more";
+
+/// The first fault, in the order of the document.
+pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
+    ensure("clips", &experiment.clips, !experiment.clips.is_empty(), "name at least one clip source")?;
+    experiment.clips.iter().enumerate().try_for_each(|(index, source)| clips(index, source))?;
+    task(&experiment.task)?;
+    network(&experiment.network)?;
+    vmpo(&experiment.vmpo, experiment.unroll.batch)?;
+    optimiser(&experiment.optimiser)?;
+    unroll(&experiment.unroll)?;
+    actor(&experiment.actor)?;
+    warm_start(&experiment.warm_start)?;
+    learner(&experiment.learner)?;
+    budget(&experiment.budget)
+}
+
+fn ensure(field: &str, value: impl Debug, holds: bool, remedy: impl Display) -> Result<(), Fault> {
+    if holds {
+        return Ok(());
+    }
+    Err(Fault { field: field.to_string(), value: format!("{value:?}"), remedy: remedy.to_string() })
+}
+
+fn positive(number: f64) -> bool {
+    number > 0.0 && number.is_finite()
+}
+
+fn not_negative(number: f64) -> bool {
+    number >= 0.0 && number.is_finite()
+}
+
+fn clips(index: usize, source: &ClipSource) -> Result<(), Fault> {
+    let field = |name: &str| format!("clips.{index}.{name}");
+    let ClipSource { source, subset, ids: _, start_step, end_step, weight } = source;
+    ensure(&field("source"), source, !source.is_empty(), "must be a file or builtin:NAME")?;
+    if let Some(subset) = subset {
+        let remedy = format!("must be one of {}", SUBSETS.join(", "));
+        ensure(&field("subset"), subset, SUBSETS.contains(&subset.as_str()), remedy)?;
+    }
+    if let Some(end_step) = end_step {
+        ensure(&field("end_step"), end_step, end_step > start_step, "must exceed start_step")?;
+    }
+    ensure(&field("weight"), weight, not_negative(*weight), NOT_NEGATIVE)
+}
+
+fn task(task: &Tracking) -> Result<(), Fault> {
+    let Tracking { reference_steps, min_steps, termination_threshold, time_limit, observations, .. } = task;
+    ensure(
+        "task.reference_steps",
+        reference_steps,
+        (1..=64).contains(&reference_steps.len()) && reference_steps.iter().all(|step| (1..=1000).contains(step)),
+        "must be 1 to 64 numbers of frames ahead, each 1 to 1000",
+    )?;
+    ensure("task.min_steps", min_steps, (1..=100_000).contains(min_steps), "must be 1 to 100000")?;
+    ensure("task.termination_threshold", termination_threshold, *termination_threshold > 0.0, POSITIVE)?;
+    ensure("task.time_limit", time_limit, *time_limit > 0.0, "must be positive seconds")?;
+    for (index, name) in observations.iter().enumerate() {
+        let field = format!("task.observations.{index}");
+        let known = tracking_observation_size(name, 1).is_some();
+        ensure(&field, name, known, format!("must be one of {}", TRACKING_OBSERVATIONS.join(", ")))?;
+    }
+    Ok(())
+}
+
+fn network(network: &Network) -> Result<(), Fault> {
+    for (field, sizes) in [
+        ("network.encoder", &network.encoder),
+        ("network.low_level", &network.low_level),
+        ("network.value", &network.value),
+    ] {
+        let holds = !sizes.is_empty() && sizes.iter().all(|size| (1..=16384).contains(size));
+        ensure(field, sizes, holds, "must be one or more layers of 1 to 16384 units")?;
+    }
+    let Network { clip_embedding, initial_std, min_std, policy_head_scale, latent, .. } = network;
+    ensure("network.clip_embedding", clip_embedding, (1..=4096).contains(clip_embedding), "must be 1 to 4096")?;
+    ensure("network.min_std", min_std, positive(*min_std), POSITIVE)?;
+    let holds = positive(*initial_std) && initial_std > min_std;
+    ensure("network.initial_std", initial_std, holds, "must exceed network.min_std")?;
+    ensure("network.policy_head_scale", policy_head_scale, not_negative(*policy_head_scale), NOT_NEGATIVE)?;
+    ensure("network.latent.size", latent.size, (1..=4096).contains(&latent.size), "must be 1 to 4096")?;
+    ensure("network.latent.beta", latent.beta, not_negative(latent.beta), NOT_NEGATIVE)?;
+    ensure("network.latent.min_std", latent.min_std, positive(latent.min_std), POSITIVE)?;
+    let holds = positive(latent.initial_std) && latent.initial_std > latent.min_std;
+    ensure("network.latent.initial_std", latent.initial_std, holds, "must exceed network.latent.min_std")?;
+    match latent.prior {
+        Prior::Standard => Ok(()),
+        Prior::Ar1 { alpha } => {
+            ensure("network.latent.prior.ar1.alpha", alpha, (0.0..1.0).contains(&alpha), "must be in [0, 1)")
+        }
+    }
+}
+
+fn vmpo(vmpo: &Vmpo, batch: usize) -> Result<(), Fault> {
+    ensure("vmpo.discount", vmpo.discount, (0.0..1.0).contains(&vmpo.discount), "must be in [0, 1)")?;
+    for (field, number) in [
+        ("vmpo.epsilon_eta", vmpo.epsilon_eta),
+        ("vmpo.epsilon_mean", vmpo.epsilon_mean),
+        ("vmpo.epsilon_std", vmpo.epsilon_std),
+        ("vmpo.initial_temperature", vmpo.initial_temperature),
+        ("vmpo.initial_alpha_mean", vmpo.initial_alpha_mean),
+        ("vmpo.initial_alpha_std", vmpo.initial_alpha_std),
+    ] {
+        ensure(field, number, positive(number), POSITIVE)?;
+    }
+    let holds = vmpo.top_fraction > 0.0 && vmpo.top_fraction <= 1.0;
+    ensure("vmpo.top_fraction", vmpo.top_fraction, holds, "must be in (0, 1]")?;
+    ensure("vmpo.target_period", vmpo.target_period, vmpo.target_period > 0, AT_LEAST_ONE)?;
+    ensure("vmpo.gradient_steps", vmpo.gradient_steps, vmpo.gradient_steps > 0, AT_LEAST_ONE)?;
+    let holds = vmpo.minibatch_unrolls > 0 && batch.is_multiple_of(vmpo.minibatch_unrolls);
+    ensure("vmpo.minibatch_unrolls", vmpo.minibatch_unrolls, holds, format!("must divide unroll.batch, {batch}"))?;
+    ensure("vmpo.lambda", vmpo.lambda, (0.0..=1.0).contains(&vmpo.lambda), "must be in [0, 1]")?;
+    ensure("vmpo.entropy", vmpo.entropy, not_negative(vmpo.entropy), NOT_NEGATIVE)?;
+    ensure("vmpo.value_weight", vmpo.value_weight, not_negative(vmpo.value_weight), NOT_NEGATIVE)
+}
+
+fn optimiser(optimiser: &Optimiser) -> Result<(), Fault> {
+    for (field, number) in [
+        ("optimiser.learning_rate", optimiser.learning_rate),
+        ("optimiser.multiplier_learning_rate", optimiser.multiplier_learning_rate),
+        ("optimiser.epsilon", optimiser.epsilon),
+    ] {
+        ensure(field, number, positive(number), POSITIVE)?;
+    }
+    let share = optimiser.final_learning_rate_share;
+    ensure("optimiser.final_learning_rate_share", share, (0.0..=1.0).contains(&share), "must be in [0, 1]")?;
+    for (field, number) in [("optimiser.beta1", optimiser.beta1), ("optimiser.beta2", optimiser.beta2)] {
+        ensure(field, number, (0.0..1.0).contains(&number), "must be in [0, 1)")?;
+    }
+    let norm = optimiser.max_gradient_norm;
+    ensure("optimiser.max_gradient_norm", norm, not_negative(norm), "must be 0, which is off, or more")
+}
+
+fn unroll(unroll: &Unroll) -> Result<(), Fault> {
+    ensure("unroll.length", unroll.length, (1..=4096).contains(&unroll.length), "must be 1 to 4096")?;
+    ensure("unroll.batch", unroll.batch, (1..=65536).contains(&unroll.batch), "must be 1 to 65536")
+}
+
+fn actor(actor: &Actor) -> Result<(), Fault> {
+    ensure("actor.threads", actor.threads, (1..=1024).contains(&actor.threads), "must be 1 to 1024")?;
+    ensure("actor.environments", actor.environments, (1..=4096).contains(&actor.environments), "must be 1 to 4096")
+}
+
+fn warm_start(warm_start: &WarmStart) -> Result<(), Fault> {
+    let WarmStart { steps, demonstration_steps, noise, minibatch_unrolls, learning_rate, .. } = warm_start;
+    let holds = *steps == 0 || *demonstration_steps > 0;
+    ensure("warm_start.demonstration_steps", demonstration_steps, holds, AT_LEAST_ONE)?;
+    ensure("warm_start.noise", noise, positive(*noise), POSITIVE)?;
+    ensure("warm_start.minibatch_unrolls", minibatch_unrolls, *minibatch_unrolls > 0, AT_LEAST_ONE)?;
+    ensure("warm_start.learning_rate", learning_rate, positive(*learning_rate), POSITIVE)
+}
+
+fn learner(learner: &Learner) -> Result<(), Fault> {
+    let Learner { threads, checkpoint_seconds, checkpoints_kept, metrics_seconds, .. } = learner;
+    ensure("learner.threads", threads, (1..=1024).contains(threads), "must be 1 to 1024")?;
+    ensure("learner.checkpoint_seconds", checkpoint_seconds, *checkpoint_seconds > 0.0, POSITIVE)?;
+    ensure("learner.checkpoints_kept", checkpoints_kept, *checkpoints_kept > 0, AT_LEAST_ONE)?;
+    ensure("learner.metrics_seconds", metrics_seconds, *metrics_seconds > 0.0, POSITIVE)
+}
+
+fn budget(budget: &Budget) -> Result<(), Fault> {
+    ensure("budget.minutes", budget.minutes, not_negative(budget.minutes), "must be 0, which is no limit, or more")
+}

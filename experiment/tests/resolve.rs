@@ -1,0 +1,375 @@
+//! From a preset or a file, and overrides, to an experiment; and the words for what is wrong with one.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+
+use comic_experiment::{
+    ClipSource, Error, Experiment, InitialPose, Prior, TRACKING_OBSERVATIONS, TerminationError, presets, resolve,
+};
+use proptest::prelude::*;
+
+fn set(overrides: &[&str]) -> Result<Experiment, Error> {
+    resolve("tracking-mlp", &overrides.iter().map(|argument| argument.to_string()).collect::<Vec<_>>())
+}
+
+/// What one `--set` is answered with.
+fn refused(argument: &str) -> String {
+    set(&[argument]).expect_err("must be refused").to_string()
+}
+
+/// What a document is answered with.
+fn refused_text(text: &str) -> String {
+    Experiment::from_toml("run.toml", text).expect_err("must be refused").to_string()
+}
+
+// Presets and defaults
+
+#[test]
+fn every_preset_resolves_under_its_own_name_and_survives_writing_and_reading() {
+    for (name, _) in presets::ALL {
+        let experiment = resolve(name, &[]).unwrap();
+        assert_eq!(experiment.name, name);
+        let text = experiment.to_toml().unwrap();
+        assert_eq!(Experiment::from_toml("kept.toml", &text).unwrap(), experiment);
+    }
+}
+
+#[test]
+fn defaults_are_the_papers() {
+    let Experiment { vmpo, optimiser, unroll, network, task, .. } = resolve("tracking-mlp", &[]).unwrap();
+    // CoMic supplement, table 1 and section 1.
+    assert_eq!((unroll.batch, unroll.length), (128, 32));
+    assert_eq!(vmpo.discount, 0.95);
+    assert_eq!((optimiser.learning_rate, optimiser.multiplier_learning_rate), (1e-4, 1e-4));
+    assert_eq!((vmpo.epsilon_eta, vmpo.epsilon_mean, vmpo.epsilon_std), (0.1, 0.1, 1e-5));
+    assert_eq!((vmpo.initial_temperature, vmpo.initial_alpha_mean, vmpo.initial_alpha_std), (1.0, 1.0, 1.0));
+    assert_eq!(vmpo.top_fraction, 0.5);
+    assert_eq!((network.encoder, network.encoder_linear_path), (vec![1024, 1024], true));
+    assert_eq!((network.low_level, network.value), (vec![1024, 1024], vec![1024, 1024, 1024]));
+    assert_eq!((network.clip_embedding, network.latent.size, network.latent.beta), (30, 60, 5e-4));
+    assert_eq!((task.reference_steps, task.termination_threshold), (vec![1, 2, 3, 4, 5], 0.3));
+    // V-MPO: one gradient step on the whole batch, no entropy bonus, no clipping; a target network.
+    assert_eq!((vmpo.gradient_steps, vmpo.minibatch_unrolls, vmpo.target_period), (1, 128, 100));
+    assert_eq!((vmpo.entropy, optimiser.max_gradient_norm, vmpo.lambda), (0.0, 0.0, 1.0));
+    // What the paper does not have is off.
+    let Experiment { warm_start, network, task, optimiser, .. } = Experiment::default();
+    assert_eq!((warm_start.steps, network.normaliser_steps, task.preset_actuators), (0, 0, false));
+    assert_eq!((network.initial_pose, network.latent.prior), (InitialPose::MidRange, Prior::Standard));
+    assert_eq!((task.termination_error, optimiser.final_learning_rate_share), (TerminationError::DmControl, 1.0));
+}
+
+#[test]
+fn the_paper_preset_is_the_defaults() {
+    assert_eq!(resolve("tracking-mlp", &[]).unwrap(), Experiment::default());
+}
+
+#[test]
+fn an_empty_document_is_the_defaults() {
+    assert_eq!(Experiment::from_toml("empty.toml", "").unwrap(), Experiment::default());
+}
+
+// Files
+
+#[test]
+fn a_file_resolves_like_a_preset() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("mine.toml");
+    std::fs::write(&path, "name = \"mine\"\n[[clips]]\nsource = \"builtin:run\"\nweight = 2\n").unwrap();
+    let experiment = resolve(path.to_str().unwrap(), &["vmpo.discount=0.9".into()]).unwrap();
+    let run = ClipSource { weight: 2.0, ..ClipSource::whole("builtin:run") };
+    assert_eq!((experiment.name.as_str(), experiment.vmpo.discount, experiment.clips), ("mine", 0.9, vec![run]));
+}
+
+#[test]
+fn neither_preset_nor_file_lists_the_presets() {
+    let message = resolve("trackin-mlp", &[]).unwrap_err().to_string();
+    assert!(message.starts_with("no preset or file `trackin-mlp` ("), "{message}");
+    assert!(message.ends_with("presets are quickstart, tracking-mlp"), "{message}");
+}
+
+#[test]
+fn bad_syntax_names_file_line_and_column() {
+    let message = refused_text("name = \"mine\"\n\n[vmpo\ndiscount = 0.9\n");
+    assert!(message.starts_with("run.toml: TOML parse error at line 3, column 6"), "{message}");
+}
+
+#[test]
+fn a_wrong_type_names_file_line_and_field() {
+    let message = refused_text("name = \"mine\"\n\n[vmpo]\ndiscount = \"much\"\n");
+    assert!(message.starts_with("run.toml: TOML parse error at line 4, column 12"), "{message}");
+    assert!(message.contains("discount = \"much\""), "{message}");
+    assert!(message.ends_with("invalid type: string \"much\", expected f64"), "{message}");
+    let message = refused_text("[unroll]\nlength = -1\n");
+    assert!(message.contains("line 2") && message.contains("length = -1"), "{message}");
+    let message = refused_text("[task]\ntermination_error = \"dmcontrol\"\n");
+    assert!(message.contains("line 2") && message.contains("`dm-control`"), "{message}");
+    let message = refused_text("[[clips]]\nids = [\"CMU_007_01\"]\n");
+    assert!(message.contains("missing field `source`"), "{message}");
+}
+
+// Unknown fields
+
+#[test]
+fn an_unknown_field_is_refused_with_line_and_nearest_name() {
+    for (text, expected) in [
+        ("sead = 1", "run.toml:1: unknown field `sead`; did you mean `seed`?"),
+        (
+            "[vmpo]\nepsilon_eta = 0.2\nepsilon_etaa = 0.2",
+            "run.toml:3: unknown field `vmpo.epsilon_etaa`; did you mean `vmpo.epsilon_eta`?",
+        ),
+        (
+            "[network.latent]\n\nsise = 3",
+            "run.toml:3: unknown field `network.latent.sise`; did you mean `network.latent.size`?",
+        ),
+        ("vmpo = { discont = 0.9 }", "run.toml:1: unknown field `vmpo.discont`; did you mean `vmpo.discount`?"),
+        (
+            "network.latent.bata = 1",
+            "run.toml:1: unknown field `network.latent.bata`; did you mean `network.latent.beta`?",
+        ),
+        ("\n[optimizer]\nbeta1 = 0.9", "run.toml:2: unknown field `optimizer`; did you mean `optimiser`?"),
+    ] {
+        assert_eq!(refused_text(text), expected);
+    }
+}
+
+#[test]
+fn an_unknown_field_of_a_clip_names_which_clip() {
+    let clips = "[[clips]]\nsource = \"builtin:walk\"\n\n[[clips]]\nsource = \"builtin:run\"\nwieght = 2.0\n";
+    assert_eq!(refused_text(clips), "run.toml:6: unknown field `clips.1.wieght`; did you mean `clips.1.weight`?");
+    assert_eq!(
+        refused_text("clips = [{ source = \"builtin:walk\", end = 5 }]"),
+        "run.toml:1: unknown field `clips.0.end`; did you mean `clips.0.end_step`?"
+    );
+}
+
+#[test]
+fn a_field_in_the_wrong_section_is_found_where_it_belongs() {
+    assert_eq!(refused_text("discount = 0.9"), "run.toml:1: unknown field `discount`; did you mean `vmpo.discount`?");
+    assert_eq!(
+        refused_text("[vmpo]\nbeta = 0.1"),
+        "run.toml:2: unknown field `vmpo.beta`; did you mean `network.latent.beta`?"
+    );
+}
+
+#[test]
+fn a_field_like_no_other_lists_the_known_ones() {
+    assert_eq!(
+        refused_text("[budget]\nzzz = 1"),
+        "run.toml:2: unknown field `budget.zzz`; known here are environment_steps, minutes, updates"
+    );
+}
+
+#[test]
+fn an_unknown_field_of_the_prior_is_refused() {
+    let message = refused_text("[network.latent]\nprior = { ar1 = { alfa = 0.9 } }");
+    assert!(message.contains("line 2") && message.contains("alfa, available keys: alpha"), "{message}");
+}
+
+// Overrides
+
+#[test]
+fn overrides_reach_every_depth_and_are_applied_in_order() {
+    let experiment = set(&[
+        "name=mine",
+        "seed=7",
+        "vmpo.epsilon_eta=0.2",
+        " network.latent.size = 16 ",
+        "network.encoder=[64, 64]",
+        "vmpo.epsilon_eta=0.3",
+        "network.initial_pose=reference-mean",
+        "network.latent.prior.ar1.alpha=0.95",
+        "task.termination_error=\"supplement\"",
+    ])
+    .unwrap();
+    assert_eq!((experiment.name.as_str(), experiment.seed), ("mine", 7));
+    assert_eq!((experiment.vmpo.epsilon_eta, experiment.network.latent.size), (0.3, 16));
+    assert_eq!(
+        (experiment.network.encoder, experiment.network.initial_pose),
+        (vec![64, 64], InitialPose::ReferenceMean)
+    );
+    assert_eq!(experiment.network.latent.prior, Prior::Ar1 { alpha: 0.95 });
+    assert_eq!(experiment.task.termination_error, TerminationError::Supplement);
+}
+
+#[test]
+fn what_is_not_overridden_stays_as_the_document_has_it() {
+    let mut expected = resolve("quickstart", &[]).unwrap();
+    expected.vmpo.epsilon_eta = 0.2;
+    assert_eq!(resolve("quickstart", &["vmpo.epsilon_eta=0.2".into()]).unwrap(), expected);
+}
+
+#[test]
+fn whole_numbers_do_for_real_ones_and_anything_does_for_a_string() {
+    assert_eq!(set(&["vmpo.discount=0", "vmpo.value_weight=2"]).unwrap().vmpo.value_weight, 2.0);
+    for name in ["7", "true", "a = b", "[1]", "1\nseed = 2", ""] {
+        assert_eq!(set(&[&format!("name={name}")]).unwrap().name, name);
+    }
+}
+
+#[test]
+fn clips_are_replaced_whole_or_field_by_field() {
+    let experiment =
+        set(&["clips=[{source=\"builtin:run\"}, {source=\"cmu.h5\", subset=\"walk_tiny\"}]", "clips.1.weight=2"])
+            .unwrap();
+    let files = ClipSource { subset: Some("walk_tiny".into()), weight: 2.0, ..ClipSource::whole("cmu.h5") };
+    assert_eq!(experiment.clips, [ClipSource::whole("builtin:run"), files]);
+    assert_eq!(set(&["clips.0.source=builtin:jump"]).unwrap().clips, [ClipSource::whole("builtin:jump")]);
+    assert_eq!(set(&["clips.0.end_step=40"]).unwrap().clips[0].end_step, Some(40));
+    assert_eq!(refused("clips.3.weight=2"), "--set clips.3.weight=2: no element `clips.3.weight`");
+}
+
+#[test]
+fn an_override_that_is_none_shows_the_form() {
+    for argument in ["vmpo.discount", "=0.9", "vmpo..discount=0.9", ".name=x", "vmpo.=1", ""] {
+        assert_eq!(
+            refused(argument),
+            format!("--set {argument}: expected FIELD=VALUE, for instance --set vmpo.epsilon_eta=0.2")
+        );
+    }
+}
+
+#[test]
+fn an_override_of_an_unknown_field_names_itself_and_the_nearest() {
+    for (argument, nearest) in [
+        ("vmpo.epsilon_etta=0.2", "vmpo.epsilon_eta"),
+        ("epsilon_eta=0.2", "vmpo.epsilon_eta"),
+        ("network.latent.beeta=1", "network.latent.beta"),
+        ("clips.0.wait=2", "clips.0.weight"),
+    ] {
+        let field = argument.split_once('=').unwrap().0;
+        assert_eq!(refused(argument), format!("--set {argument}: unknown field `{field}`; did you mean `{nearest}`?"));
+    }
+}
+
+#[test]
+fn an_override_of_the_wrong_type_names_itself_and_the_field() {
+    assert_eq!(
+        refused("vmpo.discount=much"),
+        "--set vmpo.discount=much: invalid type: string \"much\", expected f64 in `vmpo.discount`"
+    );
+    let message = refused("unroll.length=1.5");
+    assert!(message.starts_with("--set unroll.length=1.5: invalid type: floating point"), "{message}");
+    let message = refused("name.first=x");
+    assert!(message.starts_with("--set name.first=x: invalid type: map"), "{message}");
+}
+
+// Values
+
+#[test]
+fn values_outside_their_meaning_are_refused_by_name() {
+    for (argument, remedy) in [
+        ("clips=[]", "name at least one clip source"),
+        ("clips.0.source=\"\"", "must be a file or builtin:NAME"),
+        ("clips.0.weight=-1.0", "must be 0 or more"),
+        ("clips.0.subset=\"walk\"", "must be one of walk_tiny, run_jump_tiny, get_up, locomotion_small, all"),
+        ("clips.0.end_step=0", "must exceed start_step"),
+        ("task.reference_steps=[]", "must be 1 to 64 numbers of frames ahead, each 1 to 1000"),
+        ("task.reference_steps=[0]", "must be 1 to 64 numbers of frames ahead, each 1 to 1000"),
+        ("task.min_steps=0", "must be 1 to 100000"),
+        ("task.termination_threshold=0.0", "must be positive"),
+        ("task.time_limit=-30.0", "must be positive seconds"),
+        ("network.encoder=[]", "must be one or more layers of 1 to 16384 units"),
+        ("network.value=[64, 0]", "must be one or more layers of 1 to 16384 units"),
+        ("network.clip_embedding=0", "must be 1 to 4096"),
+        ("network.initial_std=0.0", "must exceed network.min_std"),
+        ("network.min_std=0.0", "must be positive"),
+        ("network.latent.size=0", "must be 1 to 4096"),
+        ("network.latent.beta=-1.0", "must be 0 or more"),
+        ("network.latent.initial_std=0.0001", "must exceed network.latent.min_std"),
+        ("network.latent.prior.ar1.alpha=1.0", "must be in [0, 1)"),
+        ("vmpo.discount=1.0", "must be in [0, 1)"),
+        ("vmpo.lambda=1.5", "must be in [0, 1]"),
+        ("vmpo.top_fraction=0.0", "must be in (0, 1]"),
+        ("vmpo.epsilon_std=0.0", "must be positive"),
+        ("vmpo.initial_temperature=0.0", "must be positive"),
+        ("vmpo.target_period=0", "must be at least 1"),
+        ("vmpo.gradient_steps=0", "must be at least 1"),
+        ("vmpo.minibatch_unrolls=48", "must divide unroll.batch, 128"),
+        ("vmpo.entropy=-0.1", "must be 0 or more"),
+        ("optimiser.learning_rate=0.0", "must be positive"),
+        ("optimiser.multiplier_learning_rate=inf", "must be positive"),
+        ("optimiser.beta2=1.0", "must be in [0, 1)"),
+        ("optimiser.final_learning_rate_share=2.0", "must be in [0, 1]"),
+        ("optimiser.max_gradient_norm=-1.0", "must be 0, which is off, or more"),
+        ("unroll.length=0", "must be 1 to 4096"),
+        ("unroll.batch=0", "must be 1 to 65536"),
+        ("actor.threads=0", "must be 1 to 1024"),
+        ("actor.environments=5000", "must be 1 to 4096"),
+        ("warm_start.noise=0.0", "must be positive"),
+        ("warm_start.minibatch_unrolls=0", "must be at least 1"),
+        ("learner.threads=0", "must be 1 to 1024"),
+        ("learner.checkpoint_seconds=0.0", "must be positive"),
+        ("learner.checkpoints_kept=0", "must be at least 1"),
+        ("learner.metrics_seconds=-1.0", "must be positive"),
+        ("budget.minutes=-1.0", "must be 0, which is no limit, or more"),
+    ] {
+        let (field, value) = argument.split_once('=').unwrap();
+        assert_eq!(refused(argument), format!("--set {argument}: {field} = {value}: {remedy}"));
+    }
+}
+
+#[test]
+fn an_observation_that_the_task_does_not_have_is_refused() {
+    let message = refused("task.observations=[\"body_height\", \"head_height\"]");
+    assert!(message.contains("task.observations.1 = \"head_height\": must be one of body_height, "), "{message}");
+    for name in TRACKING_OBSERVATIONS {
+        set(&[&format!("task.observations=[\"{name}\"]")]).unwrap();
+    }
+}
+
+#[test]
+fn no_number_of_a_document_may_be_nan() {
+    let document = Experiment::default().to_toml().unwrap();
+    let mut section = String::new();
+    let mut numbers = 0;
+    for line in document.lines() {
+        if let Some(header) = line.strip_prefix('[') {
+            section = header.trim_matches(['[', ']']).replace("clips", "clips.0") + ".";
+        }
+        let Some((field, value)) = line.split_once(" = ") else { continue };
+        if value.parse::<f64>().is_ok() && value.contains(['.', 'e']) {
+            numbers += 1;
+            assert!(set(&[&format!("{section}{field}=nan")]).is_err(), "{section}{field}");
+        }
+    }
+    assert!(numbers > 25, "{numbers}");
+}
+
+#[test]
+fn a_value_in_a_file_is_refused_with_its_line() {
+    assert_eq!(
+        refused_text("name = \"mine\"\n[vmpo]\ndiscount = 1.5\n"),
+        "run.toml:3: vmpo.discount = 1.5: must be in [0, 1)"
+    );
+    assert_eq!(
+        refused_text("[[clips]]\nsource = \"a.h5\"\n[[clips]]\nsource = \"b.h5\"\nweight = -1.0"),
+        "run.toml:5: clips.1.weight = -1.0: must be 0 or more"
+    );
+    // The fault is where the batch was changed, not where the field has its default.
+    let message = refused_text("[unroll]\nbatch = 100\n");
+    assert_eq!(message, "run.toml: vmpo.minibatch_unrolls = 128: must divide unroll.batch, 100");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..Default::default() })]
+
+    #[test]
+    fn any_number_survives_overriding_writing_and_reading(
+        rate in 1e-12..1.0_f64,
+        discount in 0.0..1.0_f64,
+        seed in 0..i64::MAX as u64,
+        name in "\\PC*",
+    ) {
+        let overrides = [format!("optimiser.learning_rate={rate:e}"), format!("vmpo.discount={discount}"), format!("seed={seed}")];
+        let mut experiment = resolve("quickstart", &overrides).unwrap();
+        prop_assert_eq!(experiment.optimiser.learning_rate, rate);
+        prop_assert_eq!((experiment.vmpo.discount, experiment.seed), (discount, seed));
+        experiment.name = name;
+        let text = experiment.to_toml().unwrap();
+        prop_assert_eq!(Experiment::from_toml("kept", &text).unwrap(), experiment);
+    }
+
+    #[test]
+    fn no_document_and_no_override_panics(text in "\\PC*", argument in "[a-z.0-9\\[\\]{}\"= ]*") {
+        let _ = Experiment::from_toml("any", &text);
+        let _ = resolve("quickstart", &[argument]);
+    }
+}

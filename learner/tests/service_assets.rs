@@ -1,0 +1,73 @@
+//! Assets: announced at Join, fetched by hash, verified by whoever fetches them.
+
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+mod service_support;
+
+use std::path::Path;
+
+use comic_clips::Asset;
+use comic_proto::v1::AssetRequest;
+use service_support::World;
+use sha2::{Digest as _, Sha256};
+use tonic::{Code, Status};
+
+fn asset(folder: &Path, name: &str, size: usize) -> Asset {
+    let contents: Vec<u8> = (0..size).map(|place| (place * 31 % 251) as u8).collect();
+    let path = folder.join(name);
+    std::fs::write(&path, &contents).unwrap();
+    Asset { source: format!("clips/{name}"), path, sha256: Sha256::digest(&contents).into(), size: size as u64 }
+}
+
+async fn fetch(world: &World, sha256: Vec<u8>) -> Result<Vec<u8>, Status> {
+    let mut pieces = world.client().await.fetch_asset(AssetRequest { sha256 }).await?.into_inner();
+    let mut contents = Vec::new();
+    while let Some(piece) = pieces.message().await? {
+        assert!(piece.data.len() <= 256 * 1024);
+        contents.extend(&piece.data);
+    }
+    Ok(contents)
+}
+
+#[tokio::test]
+async fn a_fetched_asset_has_the_announced_hash_and_size() {
+    let folder = tempfile::tempdir().unwrap();
+    let assets = [("walk.h5", 700_001), ("run.h5", 256 * 1024), ("empty.h5", 0)];
+    let assets = assets.map(|(name, size)| asset(folder.path(), name, size)).to_vec();
+    let world = World::start_with(8, assets).await;
+    let announced = world.actor(70).await.reply.assets;
+    assert_eq!(announced.iter().map(|asset| asset.source.as_str()).collect::<Vec<_>>(), [
+        "clips/walk.h5",
+        "clips/run.h5",
+        "clips/empty.h5"
+    ]);
+    for asset in announced {
+        let contents = fetch(&world, asset.sha256.clone()).await.unwrap();
+        assert_eq!(contents.len() as u64, asset.size);
+        assert_eq!(Sha256::digest(&contents)[..], asset.sha256[..]);
+    }
+}
+
+#[tokio::test]
+async fn an_unknown_hash_is_not_found() {
+    let world = World::start().await;
+    for hash in [vec![0xab; 32], Vec::new(), vec![0; 100_000]] {
+        let refused = fetch(&world, hash).await.unwrap_err();
+        assert_eq!(refused.code(), Code::NotFound);
+    }
+    assert!(fetch(&world, vec![0xab; 32]).await.unwrap_err().message().contains("abab"));
+}
+
+#[tokio::test]
+async fn an_asset_that_shrank_or_vanished_after_the_start_is_an_error_and_no_short_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let (shrunk, gone) = (asset(folder.path(), "shrunk.h5", 600_000), asset(folder.path(), "gone.h5", 10));
+    let world = World::start_with(8, vec![shrunk.clone(), gone.clone()]).await;
+    std::fs::write(&shrunk.path, b"little").unwrap();
+    std::fs::remove_file(&gone.path).unwrap();
+    for asset in [shrunk, gone] {
+        let refused = fetch(&world, asset.sha256.to_vec()).await.unwrap_err();
+        assert_eq!(refused.code(), Code::DataLoss);
+        assert!(refused.message().contains(&asset.source), "{}", refused.message());
+    }
+}

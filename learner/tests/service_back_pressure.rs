@@ -1,0 +1,92 @@
+//! When the batches are full the learner stops reading: the actor stalls, its other calls do not, and nothing is lost.
+
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+mod service_support;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use comic_proto::v1::Verdict;
+use comic_replay::Next;
+use futures::{StreamExt as _, stream};
+use service_support::{BATCH, World, within};
+
+/// Slots without a trainer: the open batch and the full one.
+const SLOTS: usize = 2 * BATCH;
+const UNROLLS: usize = 200;
+/// Numbers of proprioception that make an unroll of 100 KB.
+const PROPRIOCEPTION: usize = 5000;
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_actor_stalls_while_the_batches_are_full_and_goes_on_afterwards() {
+    let world = World::start_with(PROPRIOCEPTION, Vec::new()).await;
+    let mut actor = world.actor(70).await;
+    let unrolls: Vec<_> = (0..UNROLLS as u64).map(|sequence| actor.unroll(sequence)).collect();
+    let size = unrolls[0].payload.len();
+    let made = Arc::new(AtomicUsize::new(0));
+    let counted = made.clone();
+    let source = stream::iter(unrolls).inspect(move |_| {
+        counted.fetch_add(1, Ordering::SeqCst);
+    });
+    let mut acks = actor.client.send_unrolls(source).await.unwrap().into_inner();
+    for sequence in 0..SLOTS as u64 {
+        let ack = within(Duration::from_secs(10), acks.message()).await.unwrap().unwrap();
+        assert_eq!((ack.sequence, ack.verdict()), (sequence, Verdict::Taken));
+    }
+
+    // The unread stream holds up no other call on its connection.
+    for _ in 0..300 {
+        let books = actor.books().await;
+        assert_eq!((books.produced, books.in_flight), (SLOTS as u64, SLOTS as u64));
+    }
+    // Beyond what has been taken: the stream's window, one unroll decoded, and the client's own send buffer of 1 MiB.
+    let under_way = (256 * 1024 + 1024 * 1024) / size + 3;
+    let made_now = made.load(Ordering::SeqCst);
+    assert!(made_now <= SLOTS + under_way, "{made_now} unrolls of {size} bytes left the actor");
+
+    let trainer = tokio::task::spawn_blocking({
+        let batcher = world.batcher.clone();
+        move || {
+            for _ in 0..UNROLLS / BATCH {
+                let Next::Batch(batch) = batcher.next_batch_within(Duration::from_secs(10)) else { panic!("no batch") };
+                batcher.trained(batch);
+            }
+        }
+    });
+    for sequence in SLOTS as u64..UNROLLS as u64 {
+        let ack = within(Duration::from_secs(10), acks.message()).await.unwrap().unwrap();
+        assert_eq!((ack.sequence, ack.verdict()), (sequence, Verdict::Taken));
+    }
+    trainer.await.unwrap();
+    assert!(acks.message().await.unwrap().is_none(), "the stream ends with the actor's");
+    let books = actor.books().await;
+    assert_eq!((books.produced, books.trained, books.in_flight), (UNROLLS as u64, UNROLLS as u64, 0));
+}
+
+#[tokio::test]
+async fn an_actor_that_dies_while_it_waits_leaves_no_trace_and_its_slot_to_others() {
+    let world = World::start().await;
+    let mut dying = world.actor(70).await;
+    let mut unrolls = dying.stream().await;
+    for sequence in 0..SLOTS as u64 {
+        assert_eq!(unrolls.verdict(dying.unroll(sequence)).await, Verdict::Taken);
+    }
+    unrolls.sender.send(dying.unroll(SLOTS as u64)).await.unwrap();
+    drop((dying, unrolls));
+
+    let mut living = world.actor(71).await;
+    let mut unrolls = living.stream().await;
+    unrolls.sender.send(living.unroll(0)).await.unwrap();
+    for _ in 0..2 {
+        let Next::Batch(batch) = world.batcher.next_batch_within(Duration::from_secs(10)) else { panic!("no batch") };
+        world.batcher.trained(batch);
+    }
+    let ack = within(Duration::from_secs(10), unrolls.acks.message()).await.unwrap().unwrap();
+    assert_eq!(ack.verdict(), Verdict::Taken);
+    let books = living.books().await;
+    // The dead actor's last unroll may or may not have come through before the end of its connection was noticed.
+    assert_eq!(books.produced, books.trained + books.in_flight);
+    assert!((SLOTS as u64 + 1..=SLOTS as u64 + 2).contains(&books.produced));
+}

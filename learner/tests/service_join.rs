@@ -1,0 +1,69 @@
+//! An actor that joins is told everything it needs.
+
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+mod service_support;
+
+use comic_experiment::{Experiment, TaskSpec};
+use comic_learner::publish::Publisher;
+use comic_learner::service::{Setup, Shared};
+use comic_proto::v1::JoinRequest;
+use comic_proto::{PROTOCOL_VERSION, UnrollLayout, UnrollShape};
+use service_support::{EPOCH, World};
+use tonic::Code;
+
+#[tokio::test]
+async fn the_reply_holds_experiment_task_layout_and_epoch() {
+    let world = World::start().await;
+    let reply = world.actor(70).await.reply;
+    let experiment = Experiment::from_toml("the reply", &reply.experiment).unwrap();
+    let spec: TaskSpec = toml::from_str(&reply.task_spec).unwrap();
+    assert_eq!((&experiment, &spec), (&world.experiment, &world.spec));
+    let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
+    assert_eq!(reply.layout_hash, layout.hash());
+    assert_eq!((reply.learner_epoch, reply.next_sequence), (EPOCH, 0));
+}
+
+#[tokio::test]
+async fn a_new_process_gets_a_new_index_and_seed_and_one_that_reconnects_its_own() {
+    let world = World::start().await;
+    let (one, mut other) = (world.actor(70).await, world.actor(71).await);
+    assert_ne!(one.reply.actor, other.reply.actor);
+    assert_ne!(one.reply.seed, other.reply.seed);
+    let again = JoinRequest { incarnation: 70, actor: Some(one.reply.actor), protocol: PROTOCOL_VERSION };
+    let again = other.client.join(again).await.unwrap().into_inner();
+    assert_eq!((again.actor, again.seed), (one.reply.actor, one.reply.seed));
+}
+
+#[tokio::test]
+async fn the_seed_depends_on_experiment_and_index_and_not_on_the_process() {
+    let (one, other) = (World::start().await, World::start().await);
+    assert_eq!(one.actor(70).await.reply.seed, other.actor(71).await.reply.seed);
+}
+
+#[tokio::test]
+async fn another_protocol_is_refused_with_the_remedy() {
+    let world = World::start().await;
+    let request = JoinRequest { incarnation: 70, actor: None, protocol: PROTOCOL_VERSION + 1 };
+    let refused = world.client().await.join(request).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    assert!(refused.message().contains("same release"), "{}", refused.message());
+}
+
+#[tokio::test]
+async fn a_service_whose_parts_disagree_does_not_start() {
+    let world = World::start().await;
+    let setup = || Setup {
+        experiment: world.experiment.clone(),
+        spec: world.spec.clone(),
+        assets: Vec::new(),
+        batcher: world.batcher.clone(),
+        publisher: world.publisher.clone(),
+    };
+    let (mut longer, mut later) = (setup(), setup());
+    longer.experiment.unroll.length += 1;
+    later.publisher = Publisher::new(EPOCH + 1);
+    assert!(Shared::new(longer).unwrap_err().to_string().contains("length: 5"));
+    assert!(Shared::new(later).unwrap_err().to_string().contains("epoch 3"));
+    assert!(Shared::new(setup()).is_ok());
+}

@@ -1,0 +1,81 @@
+//! On the signal every stream ends by itself, and the server with them, within a second.
+
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+mod service_support;
+
+use std::time::{Duration, Instant};
+
+use comic_proto::v1::{Behaviour, StatusRequest, Verdict, WatchRequest};
+use service_support::{BATCH, World, parameters, within};
+
+const SECOND: Duration = Duration::from_secs(1);
+
+#[tokio::test]
+async fn idle_streams_end_cleanly_within_a_second() {
+    let mut world = World::start().await;
+    let mut actor = world.actor(70).await;
+    let mut unrolls = actor.stream().await;
+    assert_eq!(unrolls.verdict(actor.unroll(0)).await, Verdict::Taken);
+    let mut watch = actor.client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
+    world.begin_shutdown();
+    assert!(within(SECOND, unrolls.acks.message()).await.unwrap().is_none());
+    assert!(within(SECOND, watch.message()).await.unwrap().is_none());
+    drop((actor, unrolls, watch));
+    within(SECOND, world.ended()).await.unwrap();
+}
+
+#[tokio::test]
+async fn an_unroll_that_waits_for_a_slot_is_let_go_unanswered() {
+    let mut world = World::start().await;
+    let mut actor = world.actor(70).await;
+    let mut unrolls = actor.stream().await;
+    for sequence in 0..2 * BATCH as u64 {
+        assert_eq!(unrolls.verdict(actor.unroll(sequence)).await, Verdict::Taken);
+    }
+    unrolls.sender.send(actor.unroll(2 * BATCH as u64)).await.unwrap();
+    // A round trip on the same connection: by now the unroll has most likely arrived, and it waits.
+    actor.books().await;
+    world.begin_shutdown();
+    assert!(within(SECOND, unrolls.acks.message()).await.unwrap().is_none());
+    let books = world.batcher.books();
+    assert_eq!((books.produced, books.in_flight), (4, 4));
+}
+
+#[tokio::test]
+async fn a_closed_batcher_ends_the_streams_of_unrolls_too() {
+    let world = World::start().await;
+    let mut actor = world.actor(70).await;
+    let mut unrolls = actor.stream().await;
+    world.batcher.close();
+    unrolls.sender.send(actor.unroll(0)).await.unwrap();
+    assert!(within(SECOND, unrolls.acks.message()).await.unwrap().is_none());
+    assert!(actor.client.get_status(StatusRequest {}).await.is_ok(), "the books can still be read");
+}
+
+#[tokio::test]
+async fn the_farewell_is_still_delivered() {
+    let mut world = World::start().await;
+    let mut client = world.client().await;
+    let mut watch = client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
+    world.publisher.publish(1, Behaviour::Policy, parameters(1, 10));
+    assert_eq!(watch.message().await.unwrap().unwrap().behaviour(), Behaviour::Policy);
+    world.publisher.publish(1, Behaviour::Leave, parameters(1, 0));
+    world.begin_shutdown();
+    let farewell = within(SECOND, watch.message()).await.unwrap().unwrap();
+    assert_eq!(farewell.behaviour(), Behaviour::Leave);
+    assert!(within(SECOND, watch.message()).await.unwrap().is_none());
+}
+
+#[tokio::test]
+async fn an_actor_that_does_not_read_cannot_hold_up_the_end() {
+    let mut world = World::start().await;
+    let mut client = world.client().await;
+    world.publisher.publish(1, Behaviour::Policy, parameters(1, 64 * 1024 * 1024));
+    let unread = client.watch_parameters(WatchRequest::default()).await.unwrap();
+    let begun = Instant::now();
+    world.begin_shutdown();
+    world.ended().await.unwrap();
+    assert!(begun.elapsed() < 2 * SECOND, "{:?}", begun.elapsed());
+    drop(unread);
+}

@@ -1,0 +1,44 @@
+//! The learner can be asked how it is, and told how good it is.
+
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+mod service_support;
+
+use comic_learner::service::Evaluation;
+use comic_proto::v1::{EvaluationReport, StatusRequest};
+use service_support::{EPOCH, World};
+use tonic::Code;
+
+#[tokio::test]
+async fn the_newest_metrics_are_what_is_answered() {
+    let world = World::start().await;
+    let mut client = world.client().await;
+    let status = client.get_status(StatusRequest {}).await.unwrap().into_inner();
+    assert_eq!((status.learner_epoch, status.metrics_json.as_str()), (EPOCH, "{}"));
+    world.shared.set_metrics(r#"{"updates": 7}"#.into());
+    let status = client.get_status(StatusRequest {}).await.unwrap().into_inner();
+    assert_eq!(status.metrics_json, r#"{"updates": 7}"#);
+}
+
+#[tokio::test]
+async fn reported_evaluations_wait_for_the_trainer_in_order_and_in_limited_number() {
+    let world = World::start().await;
+    let mut client = world.client().await;
+    let report = |version| EvaluationReport { learner_epoch: EPOCH, version, json: "{}".into() };
+    for version in 0..16 {
+        client.report_evaluation(report(version)).await.unwrap();
+    }
+    assert_eq!(client.report_evaluation(report(16)).await.unwrap_err().code(), Code::ResourceExhausted);
+    let expected: Vec<_> = (0..16).map(|version| Evaluation { epoch: EPOCH, version, json: "{}".into() }).collect();
+    assert_eq!(world.shared.take_evaluations(), expected);
+    assert!(client.report_evaluation(report(17)).await.is_ok());
+}
+
+#[tokio::test]
+async fn a_report_that_is_no_json_is_refused() {
+    let world = World::start().await;
+    let report = EvaluationReport { learner_epoch: EPOCH, version: 1, json: "{broken".into() };
+    let refused = world.client().await.report_evaluation(report).await.unwrap_err();
+    assert_eq!(refused.code(), Code::InvalidArgument);
+    assert!(world.shared.take_evaluations().is_empty());
+}

@@ -1,0 +1,181 @@
+//! A learner's service on a loopback port, and a real client of it.
+#![allow(dead_code, clippy::unwrap_used, clippy::expect_used)]
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Result;
+use bytes::Bytes;
+use comic_clips::Asset;
+use comic_experiment::{Experiment, TaskSpec};
+use comic_learner::publish::Publisher;
+use comic_learner::service::{Setup, Shared, serve};
+use comic_proto::v1::learner_client::LearnerClient;
+use comic_proto::v1::{JoinReply, JoinRequest, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict};
+use comic_proto::{Field, PROTOCOL_VERSION, UnrollBuffer, UnrollLayout, UnrollShape};
+use comic_replay::{Batcher, Config, Ledger, Phase};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinHandle;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::Channel;
+use tonic::{Status, Streaming};
+
+pub(crate) const EPOCH: u64 = 3;
+/// Unrolls a batch.
+pub(crate) const BATCH: usize = 2;
+
+/// A learner that serves, without a trainer.
+pub(crate) struct World {
+    pub(crate) experiment: Experiment,
+    pub(crate) spec: TaskSpec,
+    pub(crate) batcher: Batcher,
+    pub(crate) publisher: Publisher,
+    pub(crate) shared: Arc<Shared>,
+    pub(crate) address: String,
+    shutdown: Option<oneshot::Sender<()>>,
+    server: JoinHandle<Result<()>>,
+}
+
+impl World {
+    pub(crate) async fn start() -> Self {
+        Self::start_with(8, Vec::new()).await
+    }
+
+    /// With so many numbers of proprioception, and these assets.
+    pub(crate) async fn start_with(proprioception: usize, assets: Vec<Asset>) -> Self {
+        let mut experiment = Experiment::default();
+        experiment.unroll.length = 4;
+        experiment.unroll.batch = BATCH;
+        experiment.vmpo.minibatch_unrolls = BATCH;
+        experiment.network.latent.size = 2;
+        let spec = TaskSpec {
+            proprioception,
+            task: 3,
+            action: 2,
+            reward_terms: vec!["posture".into(), "progress".into()],
+            clips: vec!["walk".into(), "run".into()],
+        };
+        let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
+        let config = Config { unrolls: BATCH, max_staleness: 5 };
+        let phase = Phase { epoch: EPOCH, version: 0, demonstration: false };
+        let batcher = Batcher::new(layout, config, phase, Ledger::new());
+        let publisher = Publisher::new(EPOCH);
+        let setup = Setup {
+            experiment: experiment.clone(),
+            spec: spec.clone(),
+            assets,
+            batcher: batcher.clone(),
+            publisher: publisher.clone(),
+        };
+        let shared = Shared::new(setup).unwrap();
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = format!("http://{}", listener.local_addr().unwrap());
+        let (shutdown, signal) = oneshot::channel::<()>();
+        let server = tokio::spawn(serve(listener, shared.clone(), async move {
+            let _ = signal.await;
+        }));
+        Self { experiment, spec, batcher, publisher, shared, address, shutdown: Some(shutdown), server }
+    }
+
+    /// A client on a connection of its own.
+    pub(crate) async fn client(&self) -> LearnerClient<Channel> {
+        LearnerClient::connect(self.address.clone()).await.unwrap()
+    }
+
+    /// An actor that has joined.
+    pub(crate) async fn actor(&self, incarnation: u64) -> Actor {
+        let mut client = self.client().await;
+        let request = JoinRequest { incarnation, actor: None, protocol: PROTOCOL_VERSION };
+        let reply = client.join(request).await.unwrap().into_inner();
+        Actor { client, reply, incarnation, layout: self.batcher.layout().clone() }
+    }
+
+    /// Gives the signal to end.
+    pub(crate) fn begin_shutdown(&mut self) {
+        let _ = self.shutdown.take().unwrap().send(());
+    }
+
+    /// What [`serve`] returned after the signal.
+    pub(crate) async fn ended(self) -> Result<()> {
+        within(Duration::from_secs(5), self.server).await.unwrap()
+    }
+}
+
+pub(crate) struct Actor {
+    pub(crate) client: LearnerClient<Channel>,
+    pub(crate) reply: JoinReply,
+    pub(crate) incarnation: u64,
+    pub(crate) layout: Arc<UnrollLayout>,
+}
+
+impl Actor {
+    /// An unroll that is as it should be.
+    pub(crate) fn unroll(&self, sequence: u64) -> UnrollMessage {
+        let header = UnrollHeader {
+            actor: self.reply.actor,
+            incarnation: self.incarnation,
+            sequence,
+            learner_epoch: self.reply.learner_epoch,
+            version: 0,
+            layout_hash: self.layout.hash().to_vec(),
+            demonstration: false,
+            episodes: Vec::new(),
+        };
+        let mut unroll = UnrollBuffer::new(&self.layout);
+        for t in 0..self.layout.shape().length {
+            unroll.row_mut(Field::Valid, t).fill(1.0);
+            unroll.row_mut(Field::Discount, t).fill(1.0);
+            unroll.row_mut(Field::Reward, t).fill(sequence as f32);
+        }
+        UnrollMessage { header: Some(header), payload: unroll.into_bytes() }
+    }
+
+    /// An unroll spoilt in one place of its header.
+    pub(crate) fn unroll_with(&self, sequence: u64, change: impl FnOnce(&mut UnrollHeader)) -> UnrollMessage {
+        let mut unroll = self.unroll(sequence);
+        change(unroll.header.as_mut().unwrap());
+        unroll
+    }
+
+    /// Opens the stream of unrolls.
+    pub(crate) async fn stream(&mut self) -> Unrolls {
+        let (sender, receiver) = mpsc::channel(1);
+        let acks = self.client.send_unrolls(ReceiverStream::new(receiver)).await.unwrap().into_inner();
+        Unrolls { sender, acks }
+    }
+
+    pub(crate) async fn books(&mut self) -> comic_proto::v1::Books {
+        self.client.get_status(StatusRequest {}).await.unwrap().into_inner().books.unwrap()
+    }
+}
+
+/// A stream of unrolls and their acknowledgements.
+pub(crate) struct Unrolls {
+    pub(crate) sender: mpsc::Sender<UnrollMessage>,
+    pub(crate) acks: Streaming<UnrollAck>,
+}
+
+impl Unrolls {
+    /// Sends an unroll and waits for its answer.
+    pub(crate) async fn send(&mut self, unroll: UnrollMessage) -> Result<UnrollAck, Status> {
+        // The stream may have ended already: then the answer says why.
+        let _ = self.sender.send(unroll).await;
+        let answer = within(Duration::from_secs(10), self.acks.message()).await?;
+        Ok(answer.expect("an acknowledgement"))
+    }
+
+    /// The verdict on an unroll.
+    pub(crate) async fn verdict(&mut self, unroll: UnrollMessage) -> Verdict {
+        self.send(unroll).await.unwrap().verdict()
+    }
+}
+
+/// Fails the test, instead of hanging, when something takes so long.
+pub(crate) async fn within<T>(limit: Duration, future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(limit, future).await.expect("in time")
+}
+
+/// A payload that tells its version.
+pub(crate) fn parameters(version: u64, size: usize) -> Bytes {
+    Bytes::from(vec![version as u8; size])
+}

@@ -1,0 +1,137 @@
+//! Numbers of other people's code: rlax's `vmpo_loss`, PyTorch's distributions, rlax's returns.
+//!
+//! Reads every `vmpo_*.npz`, `gaussian_*.npz` and `returns_*.npz` of the folder that COMIC_VMPO_FIXTURES names, of
+//! `tests/fixtures/vmpo` without it. `tests/python/make_vmpo_fixtures.py` makes them.
+
+use std::path::{Path, PathBuf};
+
+use comic_experiment::Prior;
+use comic_learner::vmpo::{Evidence, Limits, Multipliers, policy_improvement, returns};
+use comic_networks::DiagonalGaussian;
+use npyz::npz::NpzArchive;
+use tch::{Device, Kind, Tensor};
+
+/// Of the larger of 1 and the largest expected number of the array.
+const TOLERANCE: f64 = 1e-5;
+
+struct Fixture {
+    path: PathBuf,
+    archive: NpzArchive<std::io::BufReader<std::fs::File>>,
+}
+
+impl Fixture {
+    fn open(path: &Path) -> Self {
+        let archive = NpzArchive::open(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+        Self { path: path.to_path_buf(), archive }
+    }
+
+    /// An array as float32, whatever float it was written as; `None` when the file has no such array.
+    fn find(&mut self, name: &str) -> Option<Tensor> {
+        let array = self.archive.by_name(name).unwrap_or_else(|error| panic!("{}: {name}: {error}", self.path.display()))?;
+        let shape: Vec<i64> = array.shape().iter().map(|size| *size as i64).collect();
+        let double = array.dtype().num_bytes() == Some(8);
+        let values: Vec<f64> = if double {
+            array.into_vec::<f64>().unwrap()
+        } else {
+            array.into_vec::<f32>().unwrap().into_iter().map(f64::from).collect()
+        };
+        assert!(values.iter().all(|value| value.is_finite()), "{}: {name} is not finite", self.path.display());
+        Some(Tensor::from_slice(&values).to_kind(Kind::Float).reshape(shape))
+    }
+
+    fn array(&mut self, name: &str) -> Tensor {
+        self.find(name).unwrap_or_else(|| panic!("{} has no array `{name}`", self.path.display()))
+    }
+
+    fn scalar(&mut self, name: &str) -> f64 {
+        self.array(name).double_value(&[])
+    }
+
+    fn compare(&mut self, name: &str, found: &Tensor) {
+        let expected = self.array(name);
+        assert_eq!(found.size(), expected.size(), "{}: shape of {name}", self.path.display());
+        let scale = expected.abs().max().double_value(&[]).max(1.0);
+        let error = (found.detach() - &expected).abs().max().double_value(&[]);
+        assert!(error <= TOLERANCE * scale, "{}: {name} is off by {error:e} at scale {scale}", self.path.display());
+    }
+}
+
+/// Every fixture of one kind. A folder without any is no failure as long as it has fixtures of another kind.
+fn fixtures(kind: &str) -> Vec<Fixture> {
+    let named = std::env::var_os("COMIC_VMPO_FIXTURES").map(PathBuf::from);
+    let folder = named.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fixtures/vmpo"));
+    let entries = std::fs::read_dir(&folder).unwrap_or_else(|error| panic!("{}: {error}", folder.display()));
+    let mut files: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
+    files.retain(|path| path.extension().is_some_and(|extension| extension == "npz"));
+    files.sort();
+    let is = |path: &Path, kind: &str| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(kind));
+    let known = files.iter().any(|path| ["vmpo_", "gaussian_", "returns_"].iter().any(|kind| is(path, kind)));
+    assert!(known, "{} holds no fixture; tests/python/make_vmpo_fixtures.py makes them", folder.display());
+    files.retain(|path| is(path, kind));
+    if files.is_empty() {
+        eprintln!("{} holds no {kind}*.npz: that comparison is skipped", folder.display());
+    }
+    files.iter().map(|path| Fixture::open(path)).collect()
+}
+
+#[test]
+fn losses_and_gradients_equal_rlax() {
+    for mut fixture in fixtures("vmpo_") {
+        let learnt = ["log_prob", "kl_mean", "kl_std"].map(|name| fixture.array(name).set_requires_grad(true));
+        let [log_prob, kl_mean, kl_std] = &learnt;
+        let advantage = fixture.array("advantage");
+        let [temperature, alpha_mean, alpha_std] =
+            ["temperature", "alpha_mean", "alpha_std"].map(|name| fixture.scalar(name) as f32);
+        let multipliers = Multipliers::new(temperature, alpha_mean, alpha_std, Device::Cpu);
+        let limits = Limits {
+            epsilon_eta: fixture.scalar("epsilon_eta"),
+            epsilon_mean: fixture.scalar("epsilon_mean"),
+            epsilon_std: fixture.scalar("epsilon_std"),
+            top_fraction: fixture.scalar("top_fraction"),
+        };
+        let valid = advantage.ones_like();
+        let evidence = Evidence { log_prob, advantage: &advantage, kl_mean, kl_std, valid: &valid };
+        let improvement = policy_improvement(&evidence, &multipliers, &limits);
+        fixture.compare("policy_loss", &improvement.policy);
+        fixture.compare("temperature_loss", &improvement.temperature);
+        fixture.compare("alpha_loss", &improvement.alpha);
+        let inputs = [log_prob, kl_mean, kl_std, multipliers.parameter()];
+        let gradients = Tensor::run_backward(&[improvement.total()], &inputs, false, false);
+        for (name, gradient) in ["grad_log_prob", "grad_kl_mean", "grad_kl_std"].into_iter().zip(&gradients) {
+            fixture.compare(name, gradient);
+        }
+        for (index, name) in ["grad_temperature", "grad_alpha_mean", "grad_alpha_std"].into_iter().enumerate() {
+            fixture.compare(name, &gradients[3].select(0, index as i64));
+        }
+    }
+}
+
+#[test]
+fn gaussians_equal_pytorchs_distributions() {
+    for mut fixture in fixtures("gaussian_") {
+        let policy = DiagonalGaussian { mean: fixture.array("mean"), std: fixture.array("std") };
+        let behaviour = DiagonalGaussian { mean: fixture.array("other_mean"), std: fixture.array("other_std") };
+        let action = fixture.array("action");
+        fixture.compare("log_prob", &policy.log_prob(&action));
+        fixture.compare("entropy", &policy.entropy());
+        fixture.compare("kl", &behaviour.kl(&policy));
+        fixture.compare("kl_mean", &policy.kl_mean(&behaviour));
+        fixture.compare("kl_std", &policy.kl_std(&behaviour));
+        fixture.compare("kl_standard", &policy.kl_to_standard_normal());
+        if let Some(previous) = fixture.find("previous") {
+            let prior = Prior::Ar1 { alpha: fixture.scalar("alpha") };
+            let first = previous.select(-1, 0).zeros_like();
+            fixture.compare("kl_ar1", &policy.kl_to_prior(&prior, &previous, &first));
+        }
+    }
+}
+
+#[test]
+fn returns_equal_rlax_on_each_episodes_piece() {
+    for mut fixture in fixtures("returns_") {
+        let arrays = ["reward", "discount", "valid", "values"].map(|name| fixture.array(name));
+        let [reward, discount, valid, values] = &arrays;
+        let gamma = fixture.scalar("gamma");
+        fixture.compare("returns", &returns(reward, discount, valid, values, gamma, 1.0));
+    }
+}

@@ -1,0 +1,225 @@
+//! Laws of a whole V-MPO step.
+
+mod vmpo_support;
+
+use comic_experiment::Prior;
+use comic_learner::vmpo::{Error, Losses, MULTIPLIER_FLOOR, MinibatchTensors};
+use proptest::prelude::*;
+use tch::{Device, Tensor};
+use vmpo_support::{LENGTH, UNROLLS, Unrolls, difference, experiment, learner, state, values};
+
+/// Unrolls with a termination, a truncation, and an episode of a single step between two ends.
+fn unrolls(seed: u64) -> Unrolls {
+    Unrolls::random(seed, UNROLLS).end_episode(0, 3, true).end_episode(1, 5, false).end_episode(1, 7, true)
+}
+
+#[test]
+fn kl_to_an_unchanged_policy_is_exactly_zero_with_equal_batch_shapes() {
+    let mut learner = learner(&experiment(), 1);
+    let mut unrolls = unrolls(2);
+    unrolls.behave(&learner, UNROLLS * LENGTH);
+    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_metrics();
+    // Rows that are no transition are blanked to another distribution, and still do not count.
+    assert_eq!((metrics.kl_mean, metrics.kl_std), (0.0, 0.0));
+}
+
+#[test]
+fn kl_to_an_unchanged_policy_is_zero_to_1e_6_with_other_batch_shapes() {
+    let mut learner = learner(&experiment(), 1);
+    let mut unrolls = unrolls(2);
+    unrolls.behave(&learner, 5);
+    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_metrics();
+    assert!(metrics.kl_mean.abs() < 1e-6 && metrics.kl_std.abs() < 1e-6, "{metrics:?}");
+}
+
+#[test]
+fn a_changed_policy_has_a_kl() {
+    let mut learner = learner(&experiment(), 1);
+    let mut unrolls = unrolls(2);
+    unrolls.behave(&learner, UNROLLS * LENGTH);
+    let minibatch = unrolls.minibatch();
+    learner.step(&minibatch).unwrap();
+    let metrics = learner.step(&minibatch).unwrap().to_metrics();
+    assert!(metrics.kl_mean > 0.0 && metrics.kl_std > 0.0, "{metrics:?}");
+}
+
+/// Steps two learners, one on each minibatch, and gives the difference of everything they hold.
+fn compare(left: &MinibatchTensors, right: &MinibatchTensors) -> f64 {
+    let mut experiment = experiment();
+    experiment.network.latent.prior = Prior::Ar1 { alpha: 0.95 };
+    experiment.vmpo.entropy = 0.01;
+    let (mut one, mut other) = (learner(&experiment, 1), learner(&experiment, 1));
+    one.step(left).unwrap();
+    other.step(right).unwrap();
+    difference(&one, &other)
+}
+
+#[test]
+fn the_contents_of_a_row_that_is_no_transition_change_nothing() {
+    let base = unrolls(3);
+    let mut other = base.clone();
+    for (row, valid) in base.valid.iter().enumerate().filter(|(_, valid)| **valid == 0.0) {
+        assert_eq!(*valid, 0.0);
+        for (field, width) in [
+            (&mut other.action, 3),
+            (&mut other.mean, 3),
+            (&mut other.reward, 2),
+            (&mut other.previous_latent, 2),
+            (&mut other.latent_noise, 2),
+            (&mut other.discount, 1),
+        ] {
+            field[row * width..(row + 1) * width].fill(1e30);
+        }
+        other.std[row * 3..(row + 1) * 3].fill(0.0);
+    }
+    assert_eq!(compare(&base.minibatch(), &other.minibatch()), 0.0);
+}
+
+#[test]
+fn the_last_observation_of_a_terminated_episode_changes_nothing() {
+    let base = unrolls(3);
+    let mut other = base.clone();
+    let row = 3; // of unroll 0
+    other.proprioception[row * 5..(row + 1) * 5].fill(0.7);
+    other.task[row * 4..(row + 1) * 4].fill(-0.7);
+    assert!(compare(&base.minibatch(), &other.minibatch()) < 1e-6);
+}
+
+#[test]
+fn the_last_observation_of_a_truncated_episode_is_bootstrapped_from() {
+    let base = unrolls(3);
+    let mut other = base.clone();
+    let row = LENGTH + 1 + 5; // row 5 of unroll 1
+    other.proprioception[row * 5..(row + 1) * 5].fill(0.7);
+    assert!(compare(&base.minibatch(), &other.minibatch()) > 1e-4);
+}
+
+#[test]
+fn an_unroll_of_nothing_but_masked_rows_changes_nothing() {
+    let base = unrolls(4);
+    let padding = Unrolls::random(5, 1);
+    let mut padded = base.clone();
+    padded.count += 1;
+    padded.proprioception.extend(padding.proprioception);
+    padded.task.extend(padding.task);
+    padded.previous_latent.extend(padding.previous_latent);
+    padded.latent_noise.extend(padding.latent_noise);
+    padded.action.extend(padding.action);
+    padded.mean.extend(padding.mean);
+    padded.std.extend(padding.std);
+    padded.reward.extend(padding.reward);
+    padded.discount.extend(padding.discount);
+    padded.valid.extend([0.0; LENGTH]);
+    padded.first.extend(padding.first);
+    padded.clip.extend(padding.clip);
+    assert!(compare(&base.minibatch(), &padded.minibatch()) < 1e-6);
+}
+
+#[test]
+fn a_batch_without_a_transition_is_survived() {
+    let mut learner = learner(&experiment(), 1);
+    let mut unrolls = unrolls(6);
+    unrolls.valid.fill(0.0);
+    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_metrics();
+    assert!(metrics.is_finite(), "{metrics:?}");
+    assert!(state(&learner).iter().all(|(_, values)| values.iter().all(|value| value.is_finite())));
+}
+
+#[test]
+fn a_clipped_action_would_be_scored_differently() {
+    // The policy is trained on the action that was drawn, wherever it lies; only the simulator sees the clipped one.
+    let base = unrolls(7);
+    let loss = |size: f32| {
+        let mut unrolls = base.clone();
+        unrolls.action.fill(size);
+        learner(&experiment(), 1).step(&unrolls.minibatch()).unwrap().to_metrics().policy_loss
+    };
+    assert!(loss(3.0) > loss(1.0) + 1.0);
+}
+
+#[test]
+fn the_same_clip_index_is_refused_where_the_task_has_fewer_clips() {
+    let mut learner = learner(&experiment(), 1);
+    let before = state(&learner);
+    let mut unrolls = unrolls(8);
+    unrolls.clip[4] = 3;
+    assert!(matches!(learner.step(&unrolls.minibatch()), Err(Error::Shape { clips: 4, known: 3, .. })));
+    assert_eq!(state(&learner), before);
+}
+
+#[test]
+fn a_field_of_the_wrong_length_is_named() {
+    let mut unrolls = unrolls(8);
+    unrolls.reward.pop();
+    let error = MinibatchTensors::new(&unrolls.source(), &unrolls.shape(), Device::Cpu).unwrap_err();
+    assert!(matches!(error, Error::Length { field: "reward", .. }));
+}
+
+#[test]
+fn a_selection_holds_the_unrolls_asked_for() {
+    let unrolls = unrolls(9);
+    let whole = unrolls.minibatch();
+    let every: Vec<i64> = (0..UNROLLS as i64).collect();
+    assert_eq!(compare(&whole, &whole.select(&Tensor::from_slice(&every))), 0.0);
+    assert_eq!(whole.select(&Tensor::from_slice(&[4i64, 1])).shape().unrolls, 2);
+    assert!(compare(&whole, &whole.select(&Tensor::from_slice(&[4i64, 1]))) > 0.0);
+}
+
+#[test]
+fn the_report_of_several_steps_is_their_mean() {
+    let minibatch = unrolls(10).minibatch();
+    let mut learner = learner(&experiment(), 1);
+    let steps: Vec<Losses> = (0..3).map(|_| learner.step(&minibatch).unwrap()).collect();
+    let mean = Losses::mean(&steps).unwrap().to_metrics().entries();
+    for (index, (name, value)) in mean.into_iter().enumerate() {
+        let expected = steps.iter().map(|step| step.to_metrics().entries()[index].1).sum::<f32>() / 3.0;
+        assert!((value - expected).abs() <= 1e-5 * expected.abs().max(1.0), "{name}");
+    }
+    assert!(Losses::mean(&[]).is_none());
+}
+
+#[test]
+fn gradients_are_clipped_only_when_asked() {
+    let minibatch = unrolls(11).minibatch();
+    let moved = |limit: f64| {
+        let mut experiment = experiment();
+        experiment.optimiser.max_gradient_norm = limit;
+        let (untouched, mut stepped) = (learner(&experiment, 1), learner(&experiment, 1));
+        let norm = f64::from(stepped.step(&minibatch).unwrap().to_metrics().gradient_norm);
+        (norm, difference(&untouched, &stepped))
+    };
+    let (norm, free) = moved(0.0);
+    assert_eq!(moved(norm * 2.0), (norm, free));
+    let (reported, held) = moved(norm / 1e4);
+    assert_eq!(reported, norm, "the norm is reported as it was before clipping");
+    assert!(held < free);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn permuting_a_batch_changes_nothing(seed in 0u64..1000, order in Just((0..UNROLLS as i64).collect::<Vec<_>>()).prop_shuffle()) {
+        let minibatch = unrolls(seed).minibatch();
+        let permuted = minibatch.select(&Tensor::from_slice(&order));
+        prop_assert!(compare(&minibatch, &permuted) < 2e-6);
+    }
+
+    #[test]
+    fn multipliers_stay_at_least_1e_8(seed in 0u64..1000, rate in 0.0f64..100.0) {
+        let mut experiment = experiment();
+        experiment.optimiser.epsilon = 1e-8;
+        experiment.optimiser.learning_rate = 1e-4;
+        experiment.optimiser.multiplier_learning_rate = rate.max(1e-6);
+        let mut learner = learner(&experiment, 1);
+        let mut unrolls = unrolls(seed);
+        // Far inside its limits, so α falls as fast as it can.
+        unrolls.behave(&learner, UNROLLS * LENGTH);
+        let minibatch = unrolls.minibatch();
+        for _ in 0..4 {
+            prop_assert!(learner.step(&minibatch).unwrap().to_metrics().is_finite());
+            let multipliers = values(&learner.multipliers().parameter().detach());
+            prop_assert!(multipliers.iter().all(|value| *value >= MULTIPLIER_FLOOR as f32), "{multipliers:?}");
+        }
+    }
+}

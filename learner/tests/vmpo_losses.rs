@@ -1,0 +1,185 @@
+//! The known mistakes of public V-MPO code, each with the number that tells it apart.
+
+use comic_learner::vmpo::{Evidence, Improvement, Limits, Multipliers, masked_mean, policy_improvement};
+use proptest::prelude::*;
+use tch::{Device, Kind, Tensor};
+
+const LIMITS: Limits = Limits { epsilon_eta: 0.1, epsilon_mean: 0.2, epsilon_std: 0.3, top_fraction: 0.5 };
+
+/// Four steps, all valid unless said otherwise, whose every tensor can be differentiated.
+struct Case {
+    log_prob: Tensor,
+    advantage: Tensor,
+    kl_mean: Tensor,
+    kl_std: Tensor,
+    valid: Tensor,
+    multipliers: Multipliers,
+}
+
+impl Case {
+    fn new(advantage: &[f32]) -> Self {
+        let steps = advantage.len() as i64;
+        let learnt = |tensor: Tensor| tensor.set_requires_grad(true);
+        let numbers = Tensor::arange(steps, (Kind::Float, Device::Cpu));
+        Self {
+            log_prob: learnt(&numbers * 0.5 - 1.0),
+            advantage: learnt(Tensor::from_slice(advantage)),
+            kl_mean: learnt(&numbers * 0.1),
+            kl_std: learnt(&numbers * 0.2),
+            valid: Tensor::ones([steps], (Kind::Float, Device::Cpu)),
+            multipliers: Multipliers::new(1.0, 2.0, 3.0, Device::Cpu),
+        }
+    }
+
+    fn masked(mut self, valid: &[f32]) -> Self {
+        self.valid = Tensor::from_slice(valid);
+        self
+    }
+
+    fn losses(&self) -> Improvement {
+        let evidence = Evidence {
+            log_prob: &self.log_prob,
+            advantage: &self.advantage,
+            kl_mean: &self.kl_mean,
+            kl_std: &self.kl_std,
+            valid: &self.valid,
+        };
+        policy_improvement(&evidence, &self.multipliers, &LIMITS)
+    }
+
+    fn gradient(&self, loss: &Tensor, input: &Tensor) -> Vec<f32> {
+        let gradient = Tensor::run_backward(&[loss], &[input], true, false).remove(0);
+        if gradient.defined() { values(&gradient) } else { vec![0.0; input.numel()] }
+    }
+}
+
+fn values(tensor: &Tensor) -> Vec<f32> {
+    Vec::try_from(tensor.detach().view(-1)).unwrap()
+}
+
+fn number(tensor: &Tensor) -> f32 {
+    tensor.double_value(&[]) as f32
+}
+
+fn assert_close(found: f32, expected: f32) {
+    assert!((found - expected).abs() <= 1e-5 * expected.abs().max(1.0), "{found} where {expected} is right");
+}
+
+#[test]
+fn the_temperatures_divisor_is_the_top_half_not_the_batch() {
+    // η ε + η ln((e + e) / 2); with the batch of four as divisor it would be ln 2 less.
+    assert_close(number(&Case::new(&[1.0, 1.0, 0.0, -1.0]).losses().temperature), 0.1 + 1.0);
+}
+
+#[test]
+fn the_policy_imitates_the_top_half_in_proportion_to_exp_advantage() {
+    let case = Case::new(&[2.0, 0.0, 1.0, -3.0]);
+    let (first, second) = (1f32.exp() / (1.0 + 1f32.exp()), 1.0 / (1.0 + 1f32.exp()));
+    let losses = case.losses();
+    assert_close(number(&losses.policy), -(first * -1.0 + second * 0.0));
+    let gradient = case.gradient(&losses.policy, &case.log_prob);
+    for (found, expected) in gradient.into_iter().zip([-first, 0.0, -second, 0.0]) {
+        assert_close(found, expected);
+    }
+}
+
+#[test]
+fn the_weights_are_no_path_for_gradients() {
+    let case = Case::new(&[2.0, 0.0, 1.0, -3.0]);
+    let losses = case.losses();
+    // ψ depends on η and on A (so on the value function), and teaches neither.
+    assert!(!losses.policy.requires_grad() || case.gradient(&losses.policy, case.multipliers.parameter()) == [0.0; 3]);
+    assert_eq!(case.gradient(&losses.total(), &case.advantage), [0.0; 4]);
+}
+
+#[test]
+fn alpha_learns_only_from_its_constraint_and_the_policy_only_from_the_penalty() {
+    let case = Case::new(&[2.0, 0.0, 1.0, -3.0]);
+    let losses = case.losses();
+    let multipliers = case.gradient(&losses.alpha, case.multipliers.parameter());
+    // Mean KLs are 0.15 and 0.3: dL/dα = ε − KL, without the penalty's + KL.
+    assert_close(multipliers[1], 0.2 - 0.15);
+    assert_close(multipliers[2], 0.3 - 0.3);
+    // dL/dKL = α / N, without the constraint's − α / N.
+    case.gradient(&losses.alpha, &case.kl_mean).into_iter().for_each(|gradient| assert_close(gradient, 2.0 / 4.0));
+    case.gradient(&losses.alpha, &case.kl_std).into_iter().for_each(|gradient| assert_close(gradient, 3.0 / 4.0));
+}
+
+#[test]
+fn the_temperature_learns_only_from_its_own_loss() {
+    let case = Case::new(&[2.0, 0.0, 1.0, -3.0]);
+    let losses = case.losses();
+    let own = case.gradient(&losses.temperature, case.multipliers.parameter())[0];
+    let all = case.gradient(&losses.total(), case.multipliers.parameter())[0];
+    assert_eq!(own, all);
+    assert!(own != 0.0);
+}
+
+#[test]
+fn the_top_half_is_of_the_valid_steps() {
+    // Of six steps two are masked: two of the four others are the top half, not three, and not the masked best.
+    let case = Case::new(&[9.0, 1.0, 1.0, 0.0, -1.0, 8.0]).masked(&[0.0, 1.0, 1.0, 1.0, 1.0, 0.0]);
+    let losses = case.losses();
+    assert_close(number(&losses.temperature), 0.1 + 1.0);
+    let selected: Vec<bool> = case.gradient(&losses.policy, &case.log_prob).iter().map(|value| *value != 0.0).collect();
+    assert_eq!(selected, [false, true, true, false, false, false]);
+}
+
+#[test]
+fn masked_steps_may_hold_anything() {
+    let plain = Case::new(&[2.0, 0.0, 1.0, -3.0]).masked(&[1.0, 1.0, 1.0, 0.0]);
+    let mut wild = Case::new(&[2.0, 0.0, 1.0, f32::NAN]).masked(&[1.0, 1.0, 1.0, 0.0]);
+    let nan = Tensor::from_slice(&[0.0, 0.0, 0.0, f32::NAN]);
+    wild.log_prob = (plain.log_prob.detach() + &nan).set_requires_grad(true);
+    wild.kl_mean = (plain.kl_mean.detach() + &nan).set_requires_grad(true);
+    wild.kl_std = (plain.kl_std.detach() + &nan).set_requires_grad(true);
+    let (plain_losses, wild_losses) = (plain.losses(), wild.losses());
+    assert_eq!(number(&plain_losses.total()), number(&wild_losses.total()));
+    for (left, right) in [(&plain.log_prob, &wild.log_prob), (&plain.kl_mean, &wild.kl_mean), (&plain.kl_std, &wild.kl_std)] {
+        assert_eq!(plain.gradient(&plain_losses.total(), left), wild.gradient(&wild_losses.total(), right));
+    }
+}
+
+#[test]
+fn large_advantages_and_tiny_temperatures_do_not_overflow() {
+    let mut case = Case::new(&[2000.0, 1999.0, -2000.0, -1e4]);
+    case.multipliers = Multipliers::new(1e-8, 1.0, 1.0, Device::Cpu);
+    let losses = case.losses();
+    assert!(number(&losses.total()).is_finite());
+    assert!(case.gradient(&losses.total(), case.multipliers.parameter()).iter().all(|value| value.is_finite()));
+}
+
+#[test]
+fn the_mean_over_no_step_is_zero() {
+    let none = Tensor::zeros([3], (Kind::Float, Device::Cpu));
+    assert_eq!(number(&masked_mean(&Tensor::from_slice(&[1f32, 2.0, 3.0]), &none)), 0.0);
+}
+
+proptest! {
+    #[test]
+    fn the_weights_are_a_distribution_over_at_least_the_top_share(
+        advantage in prop::collection::vec(-5f32..5.0, 1..40),
+    ) {
+        let case = Case::new(&advantage);
+        let losses = case.losses();
+        let weights: Vec<f32> = case.gradient(&losses.policy, &case.log_prob).iter().map(|value| -value).collect();
+        prop_assert!((weights.iter().sum::<f32>() - 1.0).abs() < 1e-5);
+        prop_assert!(weights.iter().filter(|weight| **weight > 0.0).count() <= (advantage.len() / 2).max(1).max(
+            // Steps that tie with the smallest of the top half belong to it.
+            advantage.iter().filter(|value| advantage.iter().filter(|other| other > value).count() < (advantage.len() / 2).max(1)).count(),
+        ));
+    }
+
+    #[test]
+    fn the_order_of_steps_does_not_matter(
+        advantage in prop::collection::vec((-3i8..3).prop_map(f32::from), 2..30),
+    ) {
+        // Whole numbers: ties are frequent, and a rank would break them by position.
+        let forward = Case::new(&advantage);
+        let mut backward = Case::new(&advantage.iter().rev().copied().collect::<Vec<_>>());
+        backward.log_prob = forward.log_prob.detach().flip([0]);
+        let (left, right) = (forward.losses(), backward.losses());
+        prop_assert!((number(&left.policy) - number(&right.policy)).abs() < 1e-5);
+        prop_assert!((number(&left.temperature) - number(&right.temperature)).abs() < 1e-5);
+    }
+}

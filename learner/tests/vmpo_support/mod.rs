@@ -1,0 +1,203 @@
+//! Small tasks and made-up unrolls for the tests of V-MPO.
+#![allow(dead_code, reason = "each test uses its part")]
+
+use comic_experiment::{Experiment, TaskSpec};
+use comic_learner::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
+use tch::{Device, Tensor};
+
+pub const UNROLLS: usize = 6;
+pub const LENGTH: usize = 8;
+const WIDTHS: Widths = Widths { proprioception: 5, task: 4, action: 3, latent: 2, reward_terms: 2 };
+
+struct Widths {
+    proprioception: usize,
+    task: usize,
+    action: usize,
+    latent: usize,
+    reward_terms: usize,
+}
+
+pub fn spec() -> TaskSpec {
+    TaskSpec {
+        proprioception: WIDTHS.proprioception,
+        task: WIDTHS.task,
+        action: WIDTHS.action,
+        reward_terms: vec!["near".into(), "far".into()],
+        clips: vec!["walk".into(), "run".into(), "jump".into()],
+    }
+}
+
+/// Small networks. ε of Adam is large, so that a step is nearly the gradient times a number: parameters that agree after
+/// a step mean gradients that agree, which Adam's usual division by its own size would hide.
+pub fn experiment() -> Experiment {
+    let mut experiment = Experiment::default();
+    experiment.network.encoder = vec![16, 16];
+    experiment.network.low_level = vec![16, 16];
+    experiment.network.value = vec![16, 16];
+    experiment.network.latent.size = WIDTHS.latent;
+    experiment.optimiser.epsilon = 10.0;
+    experiment.optimiser.learning_rate = 1.0;
+    experiment.optimiser.multiplier_learning_rate = 1.0;
+    experiment
+}
+
+/// libtorch's generator is the process's: tests that seed it take turns.
+static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
+
+pub fn learner(experiment: &Experiment, seed: i64) -> VmpoLearner {
+    let _guard = GENERATOR.lock().unwrap();
+    tch::manual_seed(seed);
+    VmpoLearner::new(&spec(), experiment, &[0.1, -0.2, 0.3], Device::Cpu).unwrap()
+}
+
+/// Unrolls as the wire has them; every field may be changed by a test.
+#[derive(Clone)]
+pub struct Unrolls {
+    pub count: usize,
+    pub proprioception: Vec<f32>,
+    pub task: Vec<f32>,
+    pub previous_latent: Vec<f32>,
+    pub latent_noise: Vec<f32>,
+    pub action: Vec<f32>,
+    pub mean: Vec<f32>,
+    pub std: Vec<f32>,
+    pub reward: Vec<f32>,
+    pub discount: Vec<f32>,
+    pub valid: Vec<f32>,
+    pub first: Vec<f32>,
+    pub clip: Vec<u32>,
+}
+
+/// A reproducible stream of numbers in [−1, 1], so that no test depends on libtorch's generator.
+pub struct Numbers(u64);
+
+impl Numbers {
+    pub fn new(seed: u64) -> Self {
+        Self(seed.wrapping_mul(2).wrapping_add(1))
+    }
+
+    pub fn next(&mut self) -> f32 {
+        // Knuth's MMIX generator; the high bits are the good ones.
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+    }
+
+    pub fn take(&mut self, count: usize) -> Vec<f32> {
+        (0..count).map(|_| self.next()).collect()
+    }
+}
+
+impl Unrolls {
+    /// `count` unrolls without an episode's end.
+    pub fn random(seed: u64, count: usize) -> Self {
+        let mut numbers = Numbers::new(seed);
+        let (rows, observations) = (count * LENGTH, count * (LENGTH + 1));
+        Self {
+            count,
+            proprioception: numbers.take(observations * WIDTHS.proprioception),
+            task: numbers.take(observations * WIDTHS.task),
+            previous_latent: numbers.take(rows * WIDTHS.latent),
+            latent_noise: numbers.take(rows * WIDTHS.latent),
+            action: numbers.take(rows * WIDTHS.action),
+            mean: numbers.take(rows * WIDTHS.action),
+            std: numbers.take(rows * WIDTHS.action).iter().map(|value| 0.6 + 0.3 * value).collect(),
+            reward: numbers.take(rows * WIDTHS.reward_terms),
+            discount: vec![1.0; rows],
+            valid: vec![1.0; rows],
+            first: vec![0.0; observations],
+            clip: (0..observations).map(|row| (row / (LENGTH + 1) % 3) as u32).collect(),
+        }
+    }
+
+    /// Ends the episode of `unroll` with the step into `row`, which then holds its last observation.
+    pub fn end_episode(mut self, unroll: usize, row: usize, terminated: bool) -> Self {
+        self.valid[unroll * LENGTH + row] = 0.0;
+        self.discount[unroll * LENGTH + row - 1] = if terminated { 0.0 } else { 1.0 };
+        self.first[unroll * (LENGTH + 1) + row + 1] = 1.0;
+        self
+    }
+
+    pub fn shape(&self) -> MinibatchShape {
+        MinibatchShape {
+            unrolls: self.count,
+            length: LENGTH,
+            proprioception: WIDTHS.proprioception,
+            task: WIDTHS.task,
+            action: WIDTHS.action,
+            latent: WIDTHS.latent,
+            reward_terms: WIDTHS.reward_terms,
+        }
+    }
+
+    pub fn source(&self) -> MinibatchSource<'_> {
+        MinibatchSource {
+            proprioception: &self.proprioception,
+            task: &self.task,
+            previous_latent: &self.previous_latent,
+            latent_noise: &self.latent_noise,
+            action: &self.action,
+            mean: &self.mean,
+            std: &self.std,
+            reward: &self.reward,
+            discount: &self.discount,
+            valid: &self.valid,
+            first: &self.first,
+            clip: &self.clip,
+        }
+    }
+
+    pub fn minibatch(&self) -> MinibatchTensors {
+        MinibatchTensors::new(&self.source(), &self.shape(), Device::Cpu).unwrap()
+    }
+
+    /// Replaces actions and behaviour by what `learner`'s policy does in these observations, `rows` at a time.
+    pub fn behave(&mut self, learner: &VmpoLearner, rows: usize) {
+        let total = self.count * LENGTH;
+        let unrolled = |values: &[f32], width: usize, length: usize| {
+            let tensor = Tensor::from_slice(values).reshape([self.count as i64, length as i64, width as i64]);
+            tensor.narrow(1, 0, LENGTH as i64).reshape([total as i64, width as i64])
+        };
+        let inputs = [
+            unrolled(&self.proprioception, WIDTHS.proprioception, LENGTH + 1),
+            unrolled(&self.task, WIDTHS.task, LENGTH + 1),
+            unrolled(&self.previous_latent, WIDTHS.latent, LENGTH),
+            unrolled(&self.latent_noise, WIDTHS.latent, LENGTH),
+        ];
+        let (mut means, mut stds) = (Vec::new(), Vec::new());
+        for start in (0..total).step_by(rows) {
+            let [s, x, z, noise] = inputs.each_ref().map(|input| input.narrow(0, start as i64, rows.min(total - start) as i64));
+            let acting = tch::no_grad(|| learner.policy().act(&s, &x, &z, &noise));
+            means.extend(values(&acting.action.mean));
+            stds.extend(values(&acting.action.std));
+        }
+        let noise = Numbers::new(77).take(means.len());
+        self.action = means.iter().zip(&stds).zip(noise).map(|((mean, std), noise)| mean + std * 1.7 * noise).collect();
+        (self.mean, self.std) = (means, stds);
+    }
+}
+
+pub fn values(tensor: &Tensor) -> Vec<f32> {
+    Vec::try_from(tensor.contiguous().view(-1)).unwrap()
+}
+
+/// The learner's state as numbers, by name.
+pub fn state(learner: &VmpoLearner) -> Vec<(String, Vec<f64>)> {
+    learner
+        .state()
+        .into_iter()
+        .map(|(name, tensor)| (name, Vec::try_from(tensor.to_kind(tch::Kind::Double).contiguous().view(-1)).unwrap()))
+        .collect()
+}
+
+/// The largest difference between two states, relative to the largest number of the same tensor (at least 1e-3).
+pub fn difference(left: &VmpoLearner, right: &VmpoLearner) -> f64 {
+    let mut worst = 0f64;
+    for ((name, left), (_, right)) in state(left).into_iter().zip(state(right)) {
+        let scale = left.iter().fold(1e-3, |scale: f64, value| scale.max(value.abs()));
+        for (left, right) in left.iter().zip(&right) {
+            assert!(left.is_finite() && right.is_finite(), "{name}");
+            worst = worst.max((left - right).abs() / scale);
+        }
+    }
+    worst
+}

@@ -1,0 +1,204 @@
+//! The learner over several steps: its state, the warm start, and that it learns.
+
+mod vmpo_support;
+
+use comic_experiment::{Experiment, Prior};
+use comic_learner::vmpo::{Error, VmpoLearner};
+use tch::{Kind, Tensor};
+use vmpo_support::{LENGTH, Numbers, UNROLLS, Unrolls, experiment, learner, state, values};
+
+/// Adam as it is used: its own ε, and learning rates that suit small networks.
+fn training() -> Experiment {
+    let mut experiment = experiment();
+    experiment.optimiser.epsilon = 1e-8;
+    experiment.optimiser.learning_rate = 3e-3;
+    experiment.optimiser.multiplier_learning_rate = 1e-2;
+    experiment.network.latent.prior = Prior::Ar1 { alpha: 0.95 };
+    experiment
+}
+
+fn unrolls(seed: u64) -> Unrolls {
+    Unrolls::random(seed, UNROLLS).end_episode(2, 4, true)
+}
+
+#[test]
+fn a_restored_learner_goes_on_bit_for_bit() {
+    let mut original = learner(&training(), 1);
+    for seed in 0..3 {
+        original.step(&unrolls(seed).minibatch()).unwrap();
+    }
+    original.set_learning_rates(1e-3, 5e-3);
+    let saved = original.state();
+    let mut restored = learner(&training(), 2);
+    assert_ne!(state(&restored), state(&original));
+    restored.load_state(&saved).unwrap();
+    for seed in 3..6 {
+        let (left, right) = (original.step(&unrolls(seed).minibatch()), restored.step(&unrolls(seed).minibatch()));
+        assert_eq!(left.unwrap().to_metrics(), right.unwrap().to_metrics());
+    }
+    assert_eq!(state(&restored), state(&original));
+}
+
+#[test]
+fn a_saved_state_does_not_change_with_the_learner() {
+    let mut learner = learner(&training(), 1);
+    let saved = learner.state();
+    let before: Vec<Vec<f32>> = saved.iter().map(|(_, tensor)| values(&tensor.to_kind(Kind::Float))).collect();
+    learner.step(&unrolls(1).minibatch()).unwrap();
+    let after: Vec<Vec<f32>> = saved.iter().map(|(_, tensor)| values(&tensor.to_kind(Kind::Float))).collect();
+    assert_eq!(before, after);
+}
+
+fn refused(alter: impl FnOnce(&mut Vec<(String, Tensor)>)) -> String {
+    let mut learner = learner(&training(), 1);
+    let before = state(&learner);
+    let mut other = self::learner(&training(), 2).state();
+    alter(&mut other);
+    let error: Error = learner.load_state(&other).unwrap_err();
+    assert_eq!(state(&learner), before, "a refused state changed the learner");
+    error.to_string()
+}
+
+#[test]
+fn a_state_that_does_not_fit_changes_nothing_and_names_what_is_wrong() {
+    let missing = refused(|state| state.retain(|(name, _)| name != "multipliers"));
+    assert!(missing.contains("multipliers"), "{missing}");
+    let unknown = refused(|state| state.push(("intruder".into(), Tensor::from(1f32))));
+    assert!(unknown.contains("intruder"), "{unknown}");
+    let reshaped = refused(|state| {
+        let entry = state.iter_mut().find(|(name, _)| name == "multipliers").unwrap();
+        entry.1 = Tensor::ones([4], (Kind::Float, tch::Device::Cpu));
+    });
+    assert!(reshaped.contains("multipliers") && reshaped.contains("[4]"), "{reshaped}");
+    let converted = refused(|state| {
+        let entry = state.iter_mut().find(|(name, _)| name == "multipliers").unwrap();
+        entry.1 = entry.1.to_kind(Kind::Double);
+    });
+    assert!(converted.contains("Double"), "{converted}");
+}
+
+#[test]
+fn a_state_holds_everything_that_is_trained() {
+    let learner = learner(&training(), 1);
+    let names: Vec<String> = learner.state().into_iter().map(|(name, _)| name).collect();
+    for (name, tensor) in learner.policy_store().variables() {
+        assert!(names.contains(&format!("policy.{name}")));
+        assert_eq!(names.contains(&format!("adam.first.policy.{name}")), tensor.requires_grad(), "{name}");
+    }
+    assert!(names.iter().any(|name| name == "value.clip_embedding"));
+}
+
+/// A task of one step: the nearer the action to a target, the higher the reward.
+fn reach(learner: &VmpoLearner, seed: u64) -> (Unrolls, f32) {
+    const TARGET: [f32; 3] = [0.6, -0.5, 0.0];
+    let mut unrolls = Unrolls::random(seed, 48);
+    unrolls.behave(learner, 48 * LENGTH);
+    let noise = Numbers::new(seed + 1).take(unrolls.mean.len());
+    for (index, action) in unrolls.action.iter_mut().enumerate() {
+        *action = unrolls.mean[index] + unrolls.std[index] * 1.7 * noise[index];
+    }
+    unrolls.discount.fill(0.0);
+    let mut total = 0.0;
+    for (row, action) in unrolls.action.chunks_exact(3).enumerate() {
+        let distance: f32 = action.iter().zip(TARGET).map(|(action, target)| (action - target).powi(2)).sum();
+        unrolls.reward[row * 2] = -distance;
+        unrolls.reward[row * 2 + 1] = 0.0;
+        total -= distance;
+    }
+    let rows = unrolls.valid.len() as f32;
+    (unrolls, total / rows)
+}
+
+#[test]
+fn rewarded_actions_become_likelier() {
+    let mut experiment = training();
+    experiment.network.initial_std = 0.4;
+    experiment.vmpo.epsilon_mean = 1.0;
+    let mut learner = learner(&experiment, 1);
+    let (_, before) = reach(&learner, 0);
+    for seed in 0..60 {
+        let (unrolls, _) = reach(&learner, seed);
+        let minibatch = unrolls.minibatch();
+        for _ in 0..4 {
+            assert!(learner.step(&minibatch).unwrap().to_metrics().is_finite());
+        }
+    }
+    let (_, after) = reach(&learner, 0);
+    // What remains at best is the noise: three dimensions of variance σ².
+    assert!(after > 0.5 * before, "mean reward went from {before} to {after}");
+}
+
+#[test]
+fn the_value_function_learns_its_targets() {
+    let mut learner = learner(&training(), 1);
+    let minibatch = unrolls(1).minibatch();
+    let first = learner.step(&minibatch).unwrap().to_metrics();
+    for _ in 0..300 {
+        learner.step(&minibatch).unwrap();
+    }
+    let last = learner.step(&minibatch).unwrap().to_metrics();
+    assert!(last.value_loss < 0.2 * first.value_loss, "{first:?} {last:?}");
+    assert!(last.variance_explained > 0.6 && last.variance_explained <= 1.0, "{last:?}");
+}
+
+#[test]
+fn a_warm_start_moves_the_mean_to_the_demonstrations_and_leaves_deviation_and_multipliers() {
+    let mut learner = learner(&training(), 1);
+    let mut unrolls = unrolls(1);
+    unrolls.mean = [0.3f32, -0.4, 0.5].repeat(UNROLLS * LENGTH);
+    let minibatch = unrolls.minibatch();
+    let head = |learner: &VmpoLearner| values(&learner.policy_store().variables()["low_level.head.weight"].detach());
+    let multipliers = |learner: &VmpoLearner| values(&learner.multipliers().parameter().detach());
+    let (head_before, multipliers_before) = (head(&learner), multipliers(&learner));
+    let first = learner.regress(&minibatch).unwrap().0.to_metrics();
+    for _ in 0..200 {
+        learner.regress(&minibatch).unwrap();
+    }
+    let last = learner.regress(&minibatch).unwrap().0.to_metrics();
+    assert!(last.regression_loss < 0.05 * first.regression_loss, "{first:?} {last:?}");
+    assert!(last.value_loss < first.value_loss);
+    let half = head_before.len() / 2;
+    assert_ne!(head(&learner)[..half], head_before[..half]);
+    assert_eq!(head(&learner)[half..], head_before[half..], "the deviation's head was trained");
+    assert_eq!(multipliers(&learner), multipliers_before);
+}
+
+#[test]
+fn a_warm_starts_masked_rows_change_nothing() {
+    let base = unrolls(1);
+    let mut other = base.clone();
+    let row = 2 * LENGTH + 4;
+    other.mean[row * 3..(row + 1) * 3].fill(50.0);
+    let after = |unrolls: &Unrolls| {
+        let mut learner = learner(&training(), 1);
+        learner.regress(&unrolls.minibatch()).unwrap();
+        state(&learner)
+    };
+    assert_eq!(after(&base), after(&other));
+}
+
+#[test]
+fn refreshed_demonstrations_carry_each_steps_own_latent_forward() {
+    let mut learner = learner(&training(), 1);
+    let unrolls = unrolls(1);
+    let mut all = unrolls.minibatch();
+    let indices = Tensor::from_slice(&[5i64, 2]);
+    let (_, latents) = learner.regress(&all.select(&indices)).unwrap();
+    assert_eq!(latents.size(), [2, LENGTH as i64, 2]);
+    all.refresh_previous_latent(&indices, &latents);
+    let previous = values(all.previous_latent());
+    let latents = values(&latents);
+    let row = |unroll: usize, step: usize| &previous[(unroll * LENGTH + step) * 2..][..2];
+    let latent = |index: usize, step: usize| &latents[(index * LENGTH + step) * 2..][..2];
+    assert_eq!(row(5, 0), &unrolls.previous_latent[5 * LENGTH * 2..][..2], "the step before the unroll is unknown");
+    for step in 1..LENGTH {
+        assert_eq!(row(5, step), latent(0, step - 1));
+    }
+    // Unroll 2 ends an episode at row 4: nothing before it reaches the next episode's first row.
+    assert_eq!(row(2, 3), latent(1, 2));
+    assert_eq!(row(2, 4), [0.0, 0.0]);
+    assert_eq!(row(2, 5), [0.0, 0.0]);
+    assert_eq!(row(2, 6), latent(1, 5));
+    // The others are untouched.
+    assert_eq!(row(0, 3), &unrolls.previous_latent[3 * 2..][..2]);
+}

@@ -1,0 +1,117 @@
+//! Parameters over a wire: what goes in comes out, and nothing hostile gets in.
+
+use std::collections::HashMap;
+
+use comic_experiment::{Network, TaskSpec};
+use comic_networks::{Error, Policy, from_safetensors, to_safetensors};
+use proptest::prelude::*;
+use safetensors::tensor::{Dtype, TensorView};
+use tch::{Device, nn};
+
+fn store() -> nn::VarStore {
+    let spec = TaskSpec { proprioception: 3, task: 4, action: 2, reward_terms: vec!["a".into()], clips: vec!["x".into()] };
+    let mut network = Network { encoder: vec![8], low_level: vec![8], normaliser_steps: 1, ..Network::default() };
+    network.latent.size = 2;
+    let store = nn::VarStore::new(Device::Cpu);
+    Policy::new(&store.root(), &spec, &network, &[0.0; 2]).unwrap();
+    store
+}
+
+struct Entry {
+    kind: Dtype,
+    shape: Vec<usize>,
+    bytes: Vec<u8>,
+}
+
+/// The document of a fresh policy, altered by `alter`.
+fn altered(alter: impl FnOnce(&mut HashMap<String, Entry>)) -> Vec<u8> {
+    let bytes = to_safetensors(&store()).unwrap();
+    let document = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+    let mut entries: HashMap<String, Entry> = document
+        .tensors()
+        .into_iter()
+        .map(|(name, view)| {
+            (name, Entry { kind: view.dtype(), shape: view.shape().to_vec(), bytes: view.data().to_vec() })
+        })
+        .collect();
+    alter(&mut entries);
+    let views = entries
+        .iter()
+        .map(|(name, entry)| (name, TensorView::new(entry.kind, entry.shape.clone(), &entry.bytes).unwrap()));
+    safetensors::serialize(views, None).unwrap()
+}
+
+fn refused(bytes: &[u8]) -> Error {
+    let mut store = store();
+    let before = to_safetensors(&store).unwrap();
+    let error = from_safetensors(&mut store, bytes).unwrap_err();
+    assert_eq!(to_safetensors(&store).unwrap(), before, "a refused document changed the parameters");
+    error
+}
+
+#[test]
+fn what_goes_out_comes_in() {
+    let (from, mut to) = (store(), store());
+    let bytes = to_safetensors(&from).unwrap();
+    from_safetensors(&mut to, &bytes).unwrap();
+    assert_eq!(to_safetensors(&to).unwrap(), bytes);
+}
+
+#[test]
+fn a_missing_parameter_is_named() {
+    let bytes = altered(|entries| drop(entries.remove("low_level.head.bias")));
+    assert!(matches!(refused(&bytes), Error::Missing { name } if name == "low_level.head.bias"));
+}
+
+#[test]
+fn an_unknown_parameter_is_named() {
+    let bytes = altered(|entries| {
+        let entry = entries.remove("low_level.head.bias").unwrap();
+        let copy = Entry { kind: entry.kind, shape: entry.shape.clone(), bytes: entry.bytes.clone() };
+        entries.insert("low_level.head.bias".into(), entry);
+        entries.insert("intruder".into(), copy);
+    });
+    assert!(matches!(refused(&bytes), Error::Unknown { name } if name == "intruder"));
+}
+
+#[test]
+fn a_shape_of_as_many_elements_is_still_another_shape() {
+    let bytes = altered(|entries| entries.get_mut("low_level.layers.0.weight").unwrap().shape.reverse());
+    assert!(matches!(refused(&bytes), Error::Shape { name, .. } if name == "low_level.layers.0.weight"));
+}
+
+#[test]
+fn integers_are_no_parameters() {
+    let bytes = altered(|entries| entries.get_mut("low_level.head.bias").unwrap().kind = Dtype::I32);
+    assert!(matches!(refused(&bytes), Error::Kind { .. }));
+}
+
+#[test]
+fn infinities_and_nans_are_refused() {
+    for number in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let bytes = altered(|entries| {
+            entries.get_mut("low_level.head.bias").unwrap().bytes[4..8].copy_from_slice(&number.to_le_bytes());
+        });
+        assert!(matches!(refused(&bytes), Error::Number { .. }));
+    }
+}
+
+#[test]
+fn a_normaliser_that_divides_by_zero_is_refused() {
+    let bytes = altered(|entries| entries.get_mut("normaliser.task_std").unwrap().bytes.fill(0));
+    assert!(matches!(refused(&bytes), Error::Number { .. }));
+}
+
+proptest! {
+    #[test]
+    fn any_bytes_are_refused_without_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+        prop_assert!(from_safetensors(&mut store(), &bytes).is_err());
+    }
+
+    #[test]
+    fn a_cut_document_is_refused(cut in 1usize..1000) {
+        let bytes = to_safetensors(&store()).unwrap();
+        let length = bytes.len().saturating_sub(cut);
+        prop_assert!(from_safetensors(&mut store(), &bytes[..length]).is_err());
+    }
+}

@@ -1,0 +1,184 @@
+//! The policy and the value function: where they start, and that acting and learning are one function.
+
+use comic_experiment::{Network, TaskSpec};
+use comic_networks::{Error, NORMALISED_LIMIT, NormaliserStatistics, Policy, Value};
+use tch::{Device, Kind, Tensor, nn};
+
+const ROWS: i64 = 24;
+
+fn spec() -> TaskSpec {
+    TaskSpec {
+        proprioception: 7,
+        task: 11,
+        action: 3,
+        reward_terms: vec!["a".into(), "b".into()],
+        clips: vec!["x".into(), "y".into(), "z".into()],
+    }
+}
+
+fn network() -> Network {
+    let mut network = Network { encoder: vec![16, 16], low_level: vec![16], value: vec![16, 16], ..Network::default() };
+    network.latent.size = 5;
+    network
+}
+
+fn policy(network: &Network, seed: i64, pose: &[f32]) -> (nn::VarStore, Policy) {
+    let store = nn::VarStore::new(Device::Cpu);
+    let _guard = GENERATOR.lock().unwrap();
+    tch::manual_seed(seed);
+    let policy = Policy::new(&store.root(), &spec(), network, pose).unwrap();
+    (store, policy)
+}
+
+/// libtorch's generator is the process's: tests that seed it take turns.
+static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
+
+fn inputs() -> [Tensor; 4] {
+    [7, 11, 5, 5].map(|width| {
+        let values: Vec<f32> = (0..ROWS * width).map(|index| ((index * 37 % 101) as f32 / 50.0) - 1.0).collect();
+        Tensor::from_slice(&values).reshape([ROWS, width])
+    })
+}
+
+fn act(policy: &Policy) -> comic_networks::Acting {
+    let [proprioception, task, previous, noise] = inputs();
+    policy.act(&proprioception, &task, &previous, &noise)
+}
+
+#[test]
+fn acting_and_learning_give_the_same_numbers_bit_for_bit() {
+    let (_store, policy) = policy(&network(), 1, &[0.0; 3]);
+    let learning = act(&policy);
+    let acting = tch::no_grad(|| act(&policy));
+    assert!(learning.action.mean.requires_grad() && !acting.action.mean.requires_grad());
+    assert_eq!(learning.latent, acting.latent);
+    assert_eq!(learning.action.mean, acting.action.mean);
+    assert_eq!(learning.action.std, acting.action.std);
+}
+
+#[test]
+fn rows_of_an_unroll_are_the_same_rows() {
+    let (_store, policy) = policy(&network(), 1, &[0.0; 3]);
+    let [proprioception, task, previous, noise] = inputs();
+    let unrolled = |tensor: &Tensor| tensor.reshape([4, 6, -1]);
+    let observation = policy.normalise(&unrolled(&proprioception), &unrolled(&task));
+    let acting = policy.act_normalised(&observation, &unrolled(&previous), &unrolled(&noise));
+    assert_eq!(acting.action.mean, act(&policy).action.mean);
+}
+
+#[test]
+fn the_latent_is_its_mean_plus_its_deviation_times_the_noise() {
+    let (_store, policy) = policy(&network(), 1, &[0.0; 3]);
+    let acting = act(&policy);
+    let [.., noise] = inputs();
+    let expected = &acting.latent_posterior.mean + &acting.latent_posterior.std * noise;
+    assert!(acting.latent.allclose(&expected, 1e-6, 1e-6, false));
+}
+
+#[test]
+fn the_actions_log_probability_sends_its_gradient_into_the_encoder() {
+    let (store, policy) = policy(&network(), 1, &[0.0; 3]);
+    let action = Tensor::ones([ROWS, 3], (Kind::Float, Device::Cpu));
+    act(&policy).action.log_prob(&action).sum(Kind::Float).backward();
+    for name in ["encoder.layers.0.weight", "encoder.head.weight", "encoder.linear_path", "low_level.head.bias"] {
+        let variables = store.variables();
+        assert!(variables[name].grad().abs().max().double_value(&[]) > 0.0, "{name}");
+    }
+}
+
+#[test]
+fn the_mean_starts_at_the_pose_and_both_deviations_at_their_initial_values() {
+    let mut network = Network { policy_head_scale: 0.0, initial_std: 0.1, ..network() };
+    network.latent.initial_std = 0.3;
+    let (mut store, policy) = policy(&network, 1, &[0.5, -0.25, 0.0]);
+    let acting = act(&policy);
+    let pose = Tensor::from_slice(&[0.5f32, -0.25, 0.0]).expand([ROWS, 3], false);
+    assert_eq!(acting.action.mean, pose);
+    assert!((&acting.action.std - 0.1).abs().max().double_value(&[]) < 1e-6);
+    // The encoder's head is not scaled down; without its weights the latent's deviation is the initial one too.
+    let mut weights = store.variables().remove("encoder.head.weight").unwrap();
+    let _ = tch::no_grad(|| weights.zero_());
+    assert!((act(&policy).latent_posterior.std - 0.3).abs().max().double_value(&[]) < 1e-6);
+    store.freeze();
+}
+
+#[test]
+fn deviations_never_fall_below_their_floor() {
+    let (store, policy) = policy(&network(), 1, &[0.0; 3]);
+    let mut bias = store.variables().remove("low_level.head.bias").unwrap();
+    let _ = tch::no_grad(|| bias.fill_(-1e4));
+    let smallest = act(&policy).action.std.min().double_value(&[]);
+    assert!((smallest - Network::default().min_std).abs() < 1e-9);
+}
+
+#[test]
+fn a_seed_decides_every_initial_parameter() {
+    let bytes = |seed| comic_networks::to_safetensors(&policy(&network(), seed, &[0.0; 3]).0).unwrap();
+    assert_eq!(bytes(3), bytes(3));
+    assert_ne!(bytes(3), bytes(4));
+}
+
+#[test]
+fn a_pose_of_another_body_is_refused() {
+    let store = nn::VarStore::new(Device::Cpu);
+    let error = Policy::new(&store.root(), &spec(), &network(), &[0.0; 4]).unwrap_err();
+    assert!(matches!(error, Error::Length { expected: 3, found: 4, .. }));
+}
+
+#[test]
+fn the_normaliser_travels_is_not_trained_and_clamps() {
+    let network = Network { normaliser_steps: 1, ..network() };
+    let (store, policy) = policy(&network, 1, &[0.0; 3]);
+    let before = act(&policy).action.mean;
+    let statistics = NormaliserStatistics {
+        proprioception_mean: vec![0.5; 7],
+        proprioception_std: vec![0.0; 7],
+        task_mean: vec![-1.0; 11],
+        task_std: vec![2.0; 11],
+    };
+    policy.set_normaliser(&statistics).unwrap();
+    assert_ne!(act(&policy).action.mean, before);
+    assert!(store.variables().contains_key("normaliser.proprioception_mean"));
+    let trained: i64 = store.trainable_variables().iter().map(|tensor| tensor.numel() as i64).sum();
+    let all: i64 = store.variables().values().map(|tensor| tensor.numel() as i64).sum();
+    assert_eq!(all - trained, 2 * (7 + 11));
+    // Proprioception is now divided by the floor of the deviation; only the clamp keeps 1e3 and 1e6 the same.
+    let [_, task, previous, noise] = inputs();
+    let far = |value: f64| {
+        let proprioception = Tensor::full([ROWS, 7], value, (Kind::Float, Device::Cpu));
+        policy.act(&proprioception, &task, &previous, &noise).action.mean
+    };
+    const { assert!(NORMALISED_LIMIT < 1e3) };
+    assert_eq!(far(1e3), far(1e6));
+}
+
+#[test]
+fn statistics_that_do_not_fit_change_nothing() {
+    let (store, policy) = policy(&Network { normaliser_steps: 1, ..network() }, 1, &[0.0; 3]);
+    let before = comic_networks::to_safetensors(&store).unwrap();
+    let fitting = NormaliserStatistics {
+        proprioception_mean: vec![0.5; 7],
+        proprioception_std: vec![1.0; 7],
+        task_mean: vec![0.0; 11],
+        task_std: vec![1.0; 11],
+    };
+    let short = NormaliserStatistics { task_std: vec![1.0; 10], ..fitting.clone() };
+    let infinite = NormaliserStatistics { task_mean: vec![f32::INFINITY; 11], ..fitting.clone() };
+    let negative = NormaliserStatistics { task_std: vec![-1.0; 11], ..fitting };
+    for statistics in [short, infinite, negative] {
+        assert!(policy.set_normaliser(&statistics).is_err());
+    }
+    assert_eq!(comic_networks::to_safetensors(&store).unwrap(), before);
+}
+
+#[test]
+fn the_value_has_one_output_per_reward_term_and_sees_the_clip() {
+    let (_store, policy) = policy(&network(), 1, &[0.0; 3]);
+    let store = nn::VarStore::new(Device::Cpu);
+    let value = Value::new(&store.root(), &spec(), &network());
+    let [proprioception, task, ..] = inputs();
+    let observation = policy.normalise(&proprioception, &task);
+    let of = |clip: i64| value.forward(&observation, &Tensor::full([ROWS], clip, (Kind::Int64, Device::Cpu)));
+    assert_eq!(of(0).size(), [ROWS, 2]);
+    assert_ne!(of(0), of(2));
+}

@@ -1,0 +1,320 @@
+//! How episodes begin, go on and end.
+
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
+use std::sync::Arc;
+
+use comic_clips::{Catalogue, pose_to_action};
+use comic_experiment::{ClipSource, TRACKING_MAX_REWARD, TRACKING_OBSERVATIONS, TaskSpec, TerminationError, Tracking};
+use comic_tasks::{Environment, Error, Outcome, TrackingEnvironment, TrackingTask};
+
+fn catalogue(names: &[&str]) -> Catalogue {
+    let sources: Vec<ClipSource> = names.iter().map(|name| ClipSource::whole(format!("builtin:{name}"))).collect();
+    Catalogue::open(&sources).unwrap()
+}
+
+fn task_of(config: &Tracking, clips: &[&str]) -> Arc<TrackingTask> {
+    Arc::new(TrackingTask::new(config, &catalogue(clips)).unwrap())
+}
+
+fn lenient() -> Tracking {
+    Tracking { termination_threshold: 1e9, ..Tracking::default() }
+}
+
+/// The f32 observation: proprioception, then task.
+fn observation(task: &TrackingTask, environment: &TrackingEnvironment) -> (Vec<f32>, Vec<f32>) {
+    let mut proprioception = vec![f32::NAN; task.spec().proprioception];
+    let mut rest = vec![f32::NAN; task.spec().task];
+    environment.observe(&mut proprioception, &mut rest);
+    (proprioception, rest)
+}
+
+/// Actions that no pose asks for, the same ones every time.
+fn wild(step: usize) -> [f32; 56] {
+    std::array::from_fn(|joint| (((step * 56 + joint) * 7919) % 2001) as f32 / 1000.0 - 1.0)
+}
+
+#[test]
+fn the_default_observation_has_the_papers_sizes() {
+    let task = task_of(&Tracking::default(), &["walk"]);
+    assert_eq!((task.spec().proprioception, task.spec().task, task.spec().action), (205, 1086, 56));
+    assert_eq!(task.spec().reward_terms.len(), 5);
+}
+
+#[test]
+fn the_policy_sees_dm_controls_numbers_in_the_configured_order() {
+    let mut names: Vec<String> = TRACKING_OBSERVATIONS.map(String::from).to_vec();
+    names.reverse();
+    let task = task_of(&Tracking { observations: names.clone(), ..lenient() }, &["walk"]);
+    let mut environment = task.environment(3);
+    for step in 0..5 {
+        environment.step(&wild(step));
+    }
+    let dictionary = environment.dictionary();
+    let numbers = |name: &str| {
+        let full = format!("walker/{name}");
+        dictionary.iter().find(|(known, _)| *known == full).unwrap().1.iter().map(|value| *value as f32)
+    };
+    let proprioception = [
+        "joints_pos",
+        "joints_vel",
+        "sensors_velocimeter",
+        "sensors_gyro",
+        "end_effectors_pos",
+        "world_zaxis",
+        "actuator_activation",
+        "sensors_touch",
+        "sensors_torque",
+    ];
+    let expected: (Vec<f32>, Vec<f32>) =
+        (proprioception.into_iter().flat_map(numbers).collect(), names.iter().flat_map(|name| numbers(name)).collect());
+    assert_eq!(observation(&task, &environment), expected);
+    // The learner computes the same sizes without a simulator.
+    let spec = TaskSpec::tracking(&Tracking { observations: names, ..lenient() }, task.spec().clips.clone());
+    assert_eq!(task.spec(), &spec.unwrap());
+}
+
+#[test]
+fn an_episode_begins_in_the_clips_pose_with_filters_at_zero() {
+    let task = task_of(&Tracking::default(), &["walk"]);
+    let mut environment = task.environment(0);
+    environment.reset_to(0, 17).unwrap();
+    let clip = catalogue(&["walk"]).load(0).unwrap();
+    let data = environment.simulation();
+    assert_eq!(data.qpos()[..3], clip.motion.position[17]);
+    assert_eq!(data.qpos()[7..], clip.motion.joints[17]);
+    assert_eq!(data.qvel()[3..6], clip.motion.angular_velocity[17]);
+    assert!(data.act().iter().all(|value| *value == 0.0));
+    assert!(environment.termination_error() < 1e-9);
+    assert_eq!((environment.episode().clip, environment.episode().start), (0, 17));
+}
+
+#[test]
+fn presetting_the_actuators_keeps_the_first_step_close() {
+    let config = Tracking { preset_actuators: true, ..Tracking::default() };
+    let after_one_servo_step = |config: &Tracking| {
+        let mut environment = task_of(config, &["walk"]).environment(0);
+        environment.reset_to(0, 20).unwrap();
+        let mut action = [0.0f32; 56];
+        environment.servo_action(&mut action);
+        environment.step(&action);
+        environment.termination_error()
+    };
+    assert!(2.0 * after_one_servo_step(&config) < after_one_servo_step(&Tracking::default()));
+
+    let mut environment = task_of(&config, &["walk"]).environment(0);
+    environment.reset_to(0, 20).unwrap();
+    let clip = catalogue(&["walk"]).load(0).unwrap();
+    assert_eq!(environment.simulation().act(), pose_to_action(&clip.motion.joints[20]));
+}
+
+#[test]
+fn the_servo_action_aims_at_the_next_frame() {
+    let mut environment = task_of(&Tracking::default(), &["run"]).environment(0);
+    environment.reset_to(0, 5).unwrap();
+    let clip = catalogue(&["run"]).load(0).unwrap();
+    for frame in 6..9 {
+        let mut action = [0.0f32; 56];
+        environment.servo_action(&mut action);
+        assert_eq!(action, pose_to_action(&clip.motion.joints[frame]).map(|value| value as f32));
+        environment.step(&action);
+    }
+}
+
+#[test]
+fn an_episode_is_truncated_at_the_clips_end_with_discount_one() {
+    let task = task_of(&lenient(), &["walk"]);
+    let mut environment = task.environment(0);
+    let last_start = task.starts()[0].frames.end - 1;
+    environment.reset_to(0, last_start).unwrap();
+    assert_eq!(environment.episode().steps_left, 10);
+    for _ in 1..10 {
+        assert_eq!(environment.step(&[0.0; 56]).outcome, Outcome::Running);
+    }
+    let last = environment.step(&[0.0; 56]);
+    assert_eq!((last.outcome, last.discount), (Outcome::Truncated, 1.0));
+}
+
+#[test]
+fn an_episode_is_truncated_at_the_time_limit_with_discount_one() {
+    let mut environment = task_of(&Tracking { time_limit: 0.1, ..lenient() }, &["walk"]).environment(0);
+    let outcomes: Vec<_> = (0..4).map(|_| environment.step(&[0.0; 56])).collect();
+    assert!(outcomes[..3].iter().all(|step| step.outcome == Outcome::Running));
+    assert_eq!((outcomes[3].outcome, outcomes[3].discount), (Outcome::Truncated, 1.0));
+}
+
+#[test]
+fn an_episode_is_terminated_beyond_the_threshold_with_discount_zero_and_its_reward() {
+    let task = task_of(&Tracking::default(), &["walk"]);
+    let mut environment = task.environment(0);
+    environment.reset_to(0, 0).unwrap();
+    for step in 0..60 {
+        let result = environment.step(&wild(step));
+        assert_eq!(result.outcome == Outcome::Terminated, environment.termination_error() > 0.3);
+        let distance_term = 0.5 * (1.0 - environment.termination_error() / 0.3);
+        assert!((result.reward_terms[4] - distance_term).abs() < 1e-15);
+        if result.outcome == Outcome::Terminated {
+            assert_eq!(result.discount, 0.0);
+            assert!(result.reward_terms[4] < 0.0 && result.reward_terms[0] > 0.0);
+            return;
+        }
+        assert_eq!(result.discount, 1.0);
+    }
+    panic!("60 wild actions did not make it fall");
+}
+
+#[test]
+fn no_step_pays_more_than_the_maximum() {
+    let mut environment =
+        task_of(&Tracking { preset_actuators: true, ..Tracking::default() }, &["stand"]).environment(0);
+    let mut action = [0.0f32; 56];
+    environment.servo_action(&mut action);
+    let reward = environment.step(&action).reward();
+    assert!(reward > 0.3 && reward < TRACKING_MAX_REWARD, "{reward}");
+}
+
+#[test]
+fn an_action_that_is_no_number_diverges_and_a_reset_recovers() {
+    let task = task_of(&Tracking::default(), &["walk"]);
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let mut environment = task.environment(0);
+        let mut action = [0.0f32; 56];
+        action[13] = bad;
+        for attempt in [&action[..], &[0.0; 56]] {
+            let step = environment.step(attempt);
+            assert_eq!((step.outcome, step.discount, step.reward()), (Outcome::Diverged, 0.0, 0.0));
+        }
+        let (proprioception, rest) = observation(&task, &environment);
+        assert!(proprioception.iter().chain(&rest).all(|value| *value == 0.0));
+        environment.reset();
+        assert_ne!(environment.step(&[0.0; 56]).outcome, Outcome::Diverged);
+    }
+}
+
+#[test]
+fn an_action_of_another_length_diverges() {
+    let mut environment = task_of(&Tracking::default(), &["walk"]).environment(0);
+    assert_eq!(environment.step(&[0.0; 55]).outcome, Outcome::Diverged);
+}
+
+#[test]
+fn stepping_on_after_the_end_never_panics() {
+    let mut environment = task_of(&Tracking::default(), &["walk"]).environment(0);
+    for step in 0..400 {
+        environment.step(&wild(step));
+        assert_eq!(environment.dictionary().len(), 28);
+    }
+}
+
+#[test]
+fn a_seed_decides_an_environments_whole_life() {
+    let task = task_of(&Tracking::default(), &["walk", "run", "jump"]);
+    let life = |seed: u64| {
+        let mut environment = task.environment(seed);
+        let mut seen = Vec::new();
+        for step in 0..40 {
+            let result = environment.step(&wild(step));
+            if result.outcome != Outcome::Running {
+                environment.reset();
+            }
+            seen.push((environment.episode().clip, environment.episode().start, result.reward().to_bits()));
+        }
+        seen
+    };
+    // The same in another thread, beside others on the same model.
+    let elsewhere = std::thread::scope(|scope| {
+        let threads: Vec<_> = [1, 1, 2].map(|seed| scope.spawn(move || (seed, life(seed)))).into_iter().collect();
+        threads.into_iter().map(|thread| thread.join().unwrap()).collect::<Vec<_>>()
+    });
+    assert_eq!(elsewhere[0].1, life(1));
+    assert_eq!(elsewhere[1].1, life(1));
+    assert_ne!(elsewhere[2].1, life(1));
+}
+
+#[test]
+fn episodes_start_where_the_law_says() {
+    let task = task_of(&Tracking::default(), &["walk", "run"]);
+    let mut environment = task.environment(5);
+    for _ in 0..200 {
+        environment.reset();
+        let episode = environment.episode();
+        assert!(task.starts()[episode.clip].frames.contains(&episode.start));
+        assert!(episode.steps_left >= 10);
+    }
+}
+
+#[test]
+fn a_sub_range_is_a_clip_of_its_own() {
+    let source = ClipSource { start_step: 20, end_step: Some(60), ..ClipSource::whole("builtin:walk") };
+    let catalogue = Catalogue::open(&[source]).unwrap();
+    let task = Arc::new(TrackingTask::new(&lenient(), &catalogue).unwrap());
+    assert_eq!(task.starts()[0].frames, 20..45);
+    let mut environment = task.environment(0);
+    environment.reset_to(0, 20).unwrap();
+    // 41 frames, as dm_control slices them: the end is inclusive. The last five are references only.
+    assert_eq!(environment.episode().steps_left, 35);
+    let time = |environment: &TrackingEnvironment| environment.dictionary().pop().unwrap().1[0];
+    assert_eq!(time(&environment), 0.0);
+    environment.step(&[0.0; 56]);
+    assert!((time(&environment) - 1.0 / 40.0).abs() < 1e-12);
+    assert!(matches!(environment.reset_to(0, 19), Err(Error::Start { .. })));
+    assert!(matches!(environment.reset_to(0, 55), Err(Error::Start { .. })));
+    assert!(matches!(environment.reset_to(1, 20), Err(Error::Start { .. })));
+}
+
+#[test]
+fn starting_always_at_the_clips_start_is_an_option() {
+    let config = Tracking { always_start_at_clip_start: true, ..Tracking::default() };
+    let mut environment = task_of(&config, &["walk", "run"]).environment(9);
+    for _ in 0..50 {
+        environment.reset();
+        assert_eq!(environment.episode().start, 0);
+    }
+}
+
+#[test]
+fn the_supplements_termination_error_adds_what_the_codes_averages() {
+    let run = |kind: TerminationError| {
+        let config = Tracking { termination_error: kind, ..lenient() };
+        let mut environment = task_of(&config, &["walk"]).environment(0);
+        environment.reset_to(0, 3).unwrap();
+        (0..20).map(|step| (environment.step(&wild(step)), environment.termination_error()).1).collect::<Vec<_>>()
+    };
+    for (sum, mean) in run(TerminationError::Supplement).into_iter().zip(run(TerminationError::DmControl)) {
+        // mean = bodies / 186 + joints / 112, sum = bodies + joints.
+        assert!(112.0 * mean <= sum * (1.0 + 1e-12) && sum <= 186.0 * mean * (1.0 + 1e-12), "{sum} {mean}");
+    }
+}
+
+#[test]
+fn an_unknown_observation_is_refused_with_the_nearest_known_one() {
+    let config = Tracking { observations: vec!["reference_rel_joint".into()], ..Tracking::default() };
+    let error = TrackingTask::new(&config, &catalogue(&["walk"])).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "task.observations: no observation `reference_rel_joint`; did you mean `reference_rel_joints`?"
+    );
+}
+
+#[test]
+fn clips_too_short_for_their_look_ahead_are_refused_by_name() {
+    let config = Tracking { min_steps: 5000, ..Tracking::default() };
+    let error = TrackingTask::new(&config, &catalogue(&["stand"])).unwrap_err();
+    assert!(error.to_string().contains("`stand` is too short"), "{error}");
+}
+
+#[test]
+fn clips_of_the_2019_body_are_compared_but_not_trained_on() {
+    let setup = concat!(env!("CARGO_MANIFEST_DIR"), "/../.deps/dm_control").to_string();
+    let path = std::env::var("COMIC_DM_CONTROL_DIR").unwrap_or(setup) + "/test_trajectories.h5";
+    let catalogue = Catalogue::open(&[ClipSource::whole(path)]).unwrap();
+    let config = Tracking { min_steps: 1, ..Tracking::default() };
+    let error = TrackingTask::new(&config, &catalogue).unwrap_err();
+    assert!(error.to_string().contains("cmuv2019_001"), "{error}");
+    let task = Arc::new(TrackingTask::comparison(&config, &catalogue).unwrap());
+    assert_eq!(task.spec().proprioception, 149);
+    let mut environment = task.environment(0);
+    environment.step(&[0.0; 56]);
+    let (proprioception, rest) = observation(&task, &environment);
+    assert!(proprioception.iter().chain(&rest).all(|value| value.is_finite()));
+}
