@@ -56,7 +56,9 @@ pub fn run(options: &Options) -> Result<(), Error> {
         .build()
         .map_err(Error::Thread)?;
     let mailbox = Arc::new(Mailbox::default());
-    let stop = stop_on_signal(&runtime, &mailbox)?;
+    let (stopping, stop) = watch::channel(false);
+    let closing = Closing { mailbox: Arc::clone(&mailbox), stopping };
+    stop_on_signal(&runtime, closing.clone())?;
     let session = session::Options { learner: options.learner.clone(), cache: options.cache.clone() };
     let joined = match runtime.block_on(session::join(&session, stop.clone())) {
         Err(Error::Stopped) => return Ok(()),
@@ -76,7 +78,7 @@ pub fn run(options: &Options) -> Result<(), Error> {
     let session = runtime.spawn(joined.run(limits, unrolls, Arc::clone(&mailbox), stop));
     let reporter = runtime.spawn(report(Arc::clone(&progress)));
 
-    let handles = start(workers, &mailbox, sender, &progress)?;
+    let handles = start(workers, &closing, sender, &progress)?;
     let settled = runtime.block_on(session);
     mailbox.close();
     reporter.abort();
@@ -88,25 +90,20 @@ pub fn run(options: &Options) -> Result<(), Error> {
     Ok(())
 }
 
-/// Becomes true at SIGTERM or SIGINT, and closes the mailbox so that the workers stop.
-fn stop_on_signal(runtime: &Runtime, mailbox: &Arc<Mailbox>) -> Result<watch::Receiver<bool>, Error> {
+/// Stops everything at SIGTERM or SIGINT.
+fn stop_on_signal(runtime: &Runtime, closing: Closing) -> Result<(), Error> {
     let _context = runtime.enter();
     let mut terminate = signal(SignalKind::terminate()).map_err(Error::Thread)?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Error::Thread)?;
-    let (sender, receiver) = watch::channel(false);
-    let mailbox = Arc::clone(mailbox);
     runtime.spawn(async move {
         tokio::select! {
             _ = terminate.recv() => {}
             _ = interrupt.recv() => {}
         }
         tracing::info!("told to stop: delivering what is finished");
-        mailbox.close();
-        sender.send_replace(true);
-        // The sender lives on, or waiting for a change would end in an error.
-        std::future::pending::<()>().await;
+        drop(closing);
     });
-    Ok(receiver)
+    Ok(())
 }
 
 /// The workers, and the bytes that the acting parameters take.
@@ -136,7 +133,7 @@ type WorkerThread = thread::JoinHandle<Result<(), Error>>;
 
 fn start(
     workers: Vec<TrackingWorker>,
-    mailbox: &Arc<Mailbox>,
+    closing: &Closing,
     unrolls: mpsc::Sender<FinishedUnroll>,
     progress: &Arc<Progress>,
 ) -> Result<Vec<WorkerThread>, Error> {
@@ -144,24 +141,30 @@ fn start(
         .into_iter()
         .enumerate()
         .map(|(index, worker)| {
-            let (closing, unrolls, progress) = (Closing(Arc::clone(mailbox)), unrolls.clone(), Arc::clone(progress));
+            let (closing, unrolls, progress) = (closing.clone(), unrolls.clone(), Arc::clone(progress));
             thread::Builder::new()
                 .name(format!("worker-{index}"))
                 .spawn(move || {
                     let closing = closing;
-                    worker.run(&closing.0, &unrolls, &progress)
+                    worker.run(&closing.mailbox, &unrolls, &progress)
                 })
                 .map_err(Error::Thread)
         })
         .collect()
 }
 
-/// Stops the other workers when one ends, be it by an error or a panic: half an actor is none.
-struct Closing(Arc<Mailbox>);
+/// Dropped, it stops the workers after their step and the session after its flush. Every worker holds one, so that
+/// none goes on alone when another ends by an error or a panic: half an actor is none.
+#[derive(Clone)]
+struct Closing {
+    mailbox: Arc<Mailbox>,
+    stopping: watch::Sender<bool>,
+}
 
 impl Drop for Closing {
     fn drop(&mut self) {
-        self.0.close();
+        self.mailbox.close();
+        self.stopping.send_replace(true);
     }
 }
 

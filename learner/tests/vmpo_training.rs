@@ -152,7 +152,7 @@ fn a_warm_start_moves_the_mean_to_the_demonstrations_and_leaves_deviation_and_mu
     let (head_before, multipliers_before) = (head(&learner), multipliers(&learner));
     let first = learner.regress(&minibatch).unwrap().0.to_metrics();
     for _ in 0..200 {
-        learner.regress(&minibatch).unwrap();
+        let _ = learner.regress(&minibatch).unwrap();
     }
     let last = learner.regress(&minibatch).unwrap().0.to_metrics();
     assert!(last.regression_loss < 0.05 * first.regression_loss, "{first:?} {last:?}");
@@ -171,7 +171,7 @@ fn a_warm_starts_masked_rows_change_nothing() {
     other.mean[row * 3..(row + 1) * 3].fill(50.0);
     let after = |unrolls: &Unrolls| {
         let mut learner = learner(&training(), 1);
-        learner.regress(&unrolls.minibatch()).unwrap();
+        let _ = learner.regress(&unrolls.minibatch()).unwrap();
         state(&learner)
     };
     assert_eq!(after(&base), after(&other));

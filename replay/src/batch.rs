@@ -64,8 +64,8 @@ pub struct Batch {
 }
 
 impl Batch {
-    pub(crate) fn new(layout: Arc<UnrollLayout>, buffer: Box<Buffer>, owner: Batcher) -> Self {
-        Self { layout, unrolls: buffer.len(), buffer: Some(buffer), owner: Some(owner) }
+    pub(crate) fn new(layout: Arc<UnrollLayout>, buffer: Buffer, owner: Batcher) -> Self {
+        Self { layout, unrolls: buffer.len(), buffer: Some(Box::new(buffer)), owner: Some(owner) }
     }
 
     /// A batch of these unrolls that belongs to no batcher, for instance from a recording.
@@ -77,7 +77,7 @@ impl Batch {
         unrolls: impl IntoIterator<Item = (UnrollHeader, impl AsRef<[u8]>), IntoIter: ExactSizeIterator>,
     ) -> Result<Self, Invalid> {
         let unrolls = unrolls.into_iter();
-        let mut buffer = Box::new(Buffer::new(&layout, unrolls.len()));
+        let mut buffer = Buffer::new(&layout, unrolls.len());
         for (header, payload) in unrolls {
             let payload = payload.as_ref();
             if payload.len() != layout.size() {
@@ -85,7 +85,7 @@ impl Batch {
             }
             buffer.push(&layout, header, payload);
         }
-        Ok(Self { layout, unrolls: buffer.len(), buffer: Some(buffer), owner: None })
+        Ok(Self { layout, unrolls: buffer.len(), buffer: Some(Box::new(buffer)), owner: None })
     }
 
     /// A field of `f32`, `[B, rows, width]`; empty for [`Field::Clip`], which is [`clip`](Self::clip).
@@ -110,7 +110,7 @@ impl Batch {
 
     fn give_back(&mut self, end: Option<Reason>) {
         if let (Some(buffer), Some(owner)) = (self.buffer.take(), self.owner.take()) {
-            owner.take_back(buffer, end);
+            owner.take_back(*buffer, end);
         }
     }
 }

@@ -69,9 +69,9 @@ pub enum Next {
 struct State {
     ledger: Ledger,
     phase: Phase,
-    open: Option<Box<Buffer>>,
-    full: Option<Box<Buffer>>,
-    free: Vec<Box<Buffer>>,
+    open: Option<Buffer>,
+    full: Option<Buffer>,
+    free: Vec<Buffer>,
     /// Unrolls in batches the trainer holds.
     taken: usize,
     closed: bool,
@@ -98,7 +98,7 @@ impl Batcher {
     /// An empty batcher that carries on these books.
     pub fn new(layout: Arc<UnrollLayout>, config: Config, phase: Phase, ledger: Ledger) -> Self {
         let config = Config { unrolls: config.unrolls.max(1), ..config };
-        let mut free: Vec<_> = (0..BUFFERS).map(|_| Box::new(Buffer::new(&layout, config.unrolls))).collect();
+        let mut free: Vec<_> = (0..BUFFERS).map(|_| Buffer::new(&layout, config.unrolls)).collect();
         let open = free.pop();
         let state = Mutex::new(State { ledger, phase, open, full: None, free, taken: 0, closed: false });
         let slots = Semaphore::new(config.unrolls);
@@ -253,7 +253,7 @@ impl Batcher {
     }
 
     /// Takes a buffer back from a [`Batch`] whose unrolls were trained on, or dropped for a reason.
-    pub(crate) fn take_back(&self, mut buffer: Box<Buffer>, end: Option<Reason>) {
+    pub(crate) fn take_back(&self, mut buffer: Buffer, end: Option<Reason>) {
         let mut state = self.lock();
         let unrolls = buffer.len();
         state.taken -= unrolls;
@@ -310,7 +310,7 @@ impl Batcher {
 
 impl State {
     fn in_flight(&self) -> u64 {
-        let waiting: usize = [&self.open, &self.full].into_iter().flatten().map(|buffer| buffer.len()).sum();
+        let waiting: usize = [&self.open, &self.full].into_iter().flatten().map(Buffer::len).sum();
         (waiting + self.taken) as u64
     }
 }

@@ -5,8 +5,8 @@ use comic_experiment::{Experiment, TaskSpec};
 use comic_learner::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
 use tch::{Device, Tensor};
 
-pub const UNROLLS: usize = 6;
-pub const LENGTH: usize = 8;
+pub(crate) const UNROLLS: usize = 6;
+pub(crate) const LENGTH: usize = 8;
 const WIDTHS: Widths = Widths { proprioception: 5, task: 4, action: 3, latent: 2, reward_terms: 2 };
 
 struct Widths {
@@ -17,7 +17,7 @@ struct Widths {
     reward_terms: usize,
 }
 
-pub fn spec() -> TaskSpec {
+pub(crate) fn spec() -> TaskSpec {
     TaskSpec {
         proprioception: WIDTHS.proprioception,
         task: WIDTHS.task,
@@ -29,7 +29,7 @@ pub fn spec() -> TaskSpec {
 
 /// Small networks. ε of Adam is large, so that a step is nearly the gradient times a number: parameters that agree after
 /// a step mean gradients that agree, which Adam's usual division by its own size would hide.
-pub fn experiment() -> Experiment {
+pub(crate) fn experiment() -> Experiment {
     let mut experiment = Experiment::default();
     experiment.network.encoder = vec![16, 16];
     experiment.network.low_level = vec![16, 16];
@@ -44,52 +44,54 @@ pub fn experiment() -> Experiment {
 /// libtorch's generator is the process's: tests that seed it take turns.
 static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
-pub fn learner(experiment: &Experiment, seed: i64) -> VmpoLearner {
+pub(crate) fn learner(experiment: &Experiment, seed: i64) -> VmpoLearner {
     let _guard = GENERATOR.lock().unwrap();
+    // Tests run side by side, on networks too small to share among threads.
+    tch::set_num_threads(1);
     tch::manual_seed(seed);
     VmpoLearner::new(&spec(), experiment, &[0.1, -0.2, 0.3], Device::Cpu).unwrap()
 }
 
 /// Unrolls as the wire has them; every field may be changed by a test.
 #[derive(Clone)]
-pub struct Unrolls {
-    pub count: usize,
-    pub proprioception: Vec<f32>,
-    pub task: Vec<f32>,
-    pub previous_latent: Vec<f32>,
-    pub latent_noise: Vec<f32>,
-    pub action: Vec<f32>,
-    pub mean: Vec<f32>,
-    pub std: Vec<f32>,
-    pub reward: Vec<f32>,
-    pub discount: Vec<f32>,
-    pub valid: Vec<f32>,
-    pub first: Vec<f32>,
-    pub clip: Vec<u32>,
+pub(crate) struct Unrolls {
+    pub(crate) count: usize,
+    pub(crate) proprioception: Vec<f32>,
+    pub(crate) task: Vec<f32>,
+    pub(crate) previous_latent: Vec<f32>,
+    pub(crate) latent_noise: Vec<f32>,
+    pub(crate) action: Vec<f32>,
+    pub(crate) mean: Vec<f32>,
+    pub(crate) std: Vec<f32>,
+    pub(crate) reward: Vec<f32>,
+    pub(crate) discount: Vec<f32>,
+    pub(crate) valid: Vec<f32>,
+    pub(crate) first: Vec<f32>,
+    pub(crate) clip: Vec<u32>,
 }
 
 /// A reproducible stream of numbers in [−1, 1], so that no test depends on libtorch's generator.
-pub struct Numbers(u64);
+pub(crate) struct Numbers(u64);
 
 impl Numbers {
-    pub fn new(seed: u64) -> Self {
+    pub(crate) fn new(seed: u64) -> Self {
         Self(seed.wrapping_mul(2).wrapping_add(1))
     }
 
-    pub fn next(&mut self) -> f32 {
+    pub(crate) fn next(&mut self) -> f32 {
         // Knuth's MMIX generator; the high bits are the good ones.
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 40) as f32 / (1u64 << 23) as f32 - 1.0
     }
 
-    pub fn take(&mut self, count: usize) -> Vec<f32> {
+    pub(crate) fn take(&mut self, count: usize) -> Vec<f32> {
         (0..count).map(|_| self.next()).collect()
     }
 }
 
 impl Unrolls {
     /// `count` unrolls without an episode's end.
-    pub fn random(seed: u64, count: usize) -> Self {
+    pub(crate) fn random(seed: u64, count: usize) -> Self {
         let mut numbers = Numbers::new(seed);
         let (rows, observations) = (count * LENGTH, count * (LENGTH + 1));
         Self {
@@ -110,14 +112,14 @@ impl Unrolls {
     }
 
     /// Ends the episode of `unroll` with the step into `row`, which then holds its last observation.
-    pub fn end_episode(mut self, unroll: usize, row: usize, terminated: bool) -> Self {
+    pub(crate) fn end_episode(mut self, unroll: usize, row: usize, terminated: bool) -> Self {
         self.valid[unroll * LENGTH + row] = 0.0;
         self.discount[unroll * LENGTH + row - 1] = if terminated { 0.0 } else { 1.0 };
         self.first[unroll * (LENGTH + 1) + row + 1] = 1.0;
         self
     }
 
-    pub fn shape(&self) -> MinibatchShape {
+    pub(crate) fn shape(&self) -> MinibatchShape {
         MinibatchShape {
             unrolls: self.count,
             length: LENGTH,
@@ -129,7 +131,7 @@ impl Unrolls {
         }
     }
 
-    pub fn source(&self) -> MinibatchSource<'_> {
+    pub(crate) fn source(&self) -> MinibatchSource<'_> {
         MinibatchSource {
             proprioception: &self.proprioception,
             task: &self.task,
@@ -146,12 +148,12 @@ impl Unrolls {
         }
     }
 
-    pub fn minibatch(&self) -> MinibatchTensors {
+    pub(crate) fn minibatch(&self) -> MinibatchTensors {
         MinibatchTensors::new(&self.source(), &self.shape(), Device::Cpu).unwrap()
     }
 
     /// Replaces actions and behaviour by what `learner`'s policy does in these observations, `rows` at a time.
-    pub fn behave(&mut self, learner: &VmpoLearner, rows: usize) {
+    pub(crate) fn behave(&mut self, learner: &VmpoLearner, rows: usize) {
         let total = self.count * LENGTH;
         let unrolled = |values: &[f32], width: usize, length: usize| {
             let tensor = Tensor::from_slice(values).reshape([self.count as i64, length as i64, width as i64]);
@@ -165,7 +167,8 @@ impl Unrolls {
         ];
         let (mut means, mut stds) = (Vec::new(), Vec::new());
         for start in (0..total).step_by(rows) {
-            let [s, x, z, noise] = inputs.each_ref().map(|input| input.narrow(0, start as i64, rows.min(total - start) as i64));
+            let length = rows.min(total - start) as i64;
+            let [s, x, z, noise] = inputs.each_ref().map(|input| input.narrow(0, start as i64, length));
             let acting = tch::no_grad(|| learner.policy().act(&s, &x, &z, &noise));
             means.extend(values(&acting.action.mean));
             stds.extend(values(&acting.action.std));
@@ -176,12 +179,12 @@ impl Unrolls {
     }
 }
 
-pub fn values(tensor: &Tensor) -> Vec<f32> {
+pub(crate) fn values(tensor: &Tensor) -> Vec<f32> {
     Vec::try_from(tensor.contiguous().view(-1)).unwrap()
 }
 
 /// The learner's state as numbers, by name.
-pub fn state(learner: &VmpoLearner) -> Vec<(String, Vec<f64>)> {
+pub(crate) fn state(learner: &VmpoLearner) -> Vec<(String, Vec<f64>)> {
     learner
         .state()
         .into_iter()
@@ -190,7 +193,7 @@ pub fn state(learner: &VmpoLearner) -> Vec<(String, Vec<f64>)> {
 }
 
 /// The largest difference between two states, relative to the largest number of the same tensor (at least 1e-3).
-pub fn difference(left: &VmpoLearner, right: &VmpoLearner) -> f64 {
+pub(crate) fn difference(left: &VmpoLearner, right: &VmpoLearner) -> f64 {
     let mut worst = 0f64;
     for ((name, left), (_, right)) in state(left).into_iter().zip(state(right)) {
         let scale = left.iter().fold(1e-3, |scale: f64, value| scale.max(value.abs()));

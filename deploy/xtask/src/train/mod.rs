@@ -57,7 +57,7 @@ struct Job {
     document: Vec<String>,
     actors: u16,
     episodes: Option<u32>,
-    port: u16,
+    port: Option<u16>,
     directory: RunDirectory,
 }
 
@@ -68,9 +68,11 @@ pub(crate) fn run(options: Options) -> Result<()> {
     workspace::build(&["comic-learner", "comic-actor"])?;
     let interrupt = Interrupt::install()?;
     job.directory.make()?;
+    // Chosen only now: the build takes minutes, and a port that was free before it may be taken.
+    let port = job.port.map_or_else(free_port, Ok)?;
     let mut display = Display::new(&job.experiment.budget);
-    display.event("starting", &[("run", job.directory.path().display().to_string()), ("port", job.port.to_string())]);
-    let outcome = Supervisor::start(&job, &mut display, &interrupt).and_then(|mut supervisor| {
+    display.event("starting", &[("run", job.directory.path().display().to_string()), ("port", port.to_string())]);
+    let outcome = Supervisor::start(&job, port, &mut display, &interrupt).and_then(|mut supervisor| {
         let outcome = supervisor.watch(&mut display, &interrupt);
         supervisor.stop(&mut display);
         outcome
@@ -110,7 +112,7 @@ impl Job {
             document,
             actors: options.actors,
             episodes: options.episodes,
-            port: options.port.map_or_else(free_port, Ok)?,
+            port: options.port,
             directory,
         })
     }

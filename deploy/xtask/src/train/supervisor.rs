@@ -25,6 +25,7 @@ const DEATHS: u32 = 5;
 /// One learner and its actors.
 pub(super) struct Supervisor<'a> {
     job: &'a Job,
+    port: u16,
     learner: Process,
     actors: Vec<Actor>,
     metrics: Tail,
@@ -41,15 +42,15 @@ struct Actor {
 
 impl<'a> Supervisor<'a> {
     /// Starts the learner, waits until it serves, and starts the actors.
-    pub(super) fn start(job: &'a Job, display: &mut Display, interrupt: &Interrupt) -> Result<Self> {
+    pub(super) fn start(job: &'a Job, port: u16, display: &mut Display, interrupt: &Interrupt) -> Result<Self> {
         let metrics = Tail::new(job.directory.metrics());
         let mut command = Command::new(workspace::program("comic-learner")?);
-        command.args(&job.document).args(["--address", "127.0.0.1", "--port", &job.port.to_string()]);
+        command.args(&job.document).args(["--address", "127.0.0.1", "--port", &port.to_string()]);
         command.arg("--run").arg(job.directory.path());
         let mut learner = Process::start("comic-learner", &mut command, job.directory.log("learner"))?;
         await_serving(&mut learner, interrupt)?;
-        display.event("learner serves", &[("address", format!("127.0.0.1:{}", job.port))]);
-        let mut supervisor = Self { job, learner, actors: Vec::new(), metrics };
+        display.event("learner serves", &[("address", format!("127.0.0.1:{port}"))]);
+        let mut supervisor = Self { job, port, learner, actors: Vec::new(), metrics };
         for number in 0..usize::from(job.actors) {
             let process = Some(supervisor.start_actor(number)?);
             supervisor.actors.push(Actor { number, process, deaths: 0, again: None });
@@ -60,7 +61,7 @@ impl<'a> Supervisor<'a> {
 
     fn start_actor(&self, number: usize) -> Result<Process> {
         let mut command = Command::new(workspace::program("comic-actor")?);
-        command.args(["--learner", &format!("http://127.0.0.1:{}", self.job.port)]);
+        command.args(["--learner", &format!("http://127.0.0.1:{}", self.port)]);
         let name = format!("actor-{number}");
         let log = self.job.directory.log(&name);
         Process::start(name, &mut command, log)
@@ -145,7 +146,7 @@ impl<'a> Supervisor<'a> {
 /// Waits for the line `{"listening": …}` by which the learner says that it serves.
 fn await_serving(learner: &mut Process, interrupt: &Interrupt) -> Result<()> {
     while learner.age() < START_LIMIT {
-        if learner.output().lines().any(|line| line.starts_with("{\"listening\"")) {
+        if learner.output().lines().any(says_it_serves) {
             return Ok(());
         }
         if let Some(status) = learner.ended()? {
@@ -157,4 +158,8 @@ fn await_serving(learner: &mut Process, interrupt: &Interrupt) -> Result<()> {
         std::thread::sleep(Duration::from_millis(50));
     }
     bail!("comic-learner does not serve after {} s; {}", START_LIMIT.as_secs(), learner.last_words())
+}
+
+fn says_it_serves(line: &str) -> bool {
+    serde_json::from_str::<serde_json::Value>(line).is_ok_and(|said| said.get("listening").is_some())
 }
