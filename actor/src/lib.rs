@@ -20,6 +20,7 @@ mod error;
 pub mod evaluate;
 pub mod mailbox;
 pub mod policy;
+pub mod round;
 pub mod run;
 mod seeds;
 pub mod session;

@@ -30,36 +30,61 @@ pub struct Directive {
 /// Holds one directive, always the newest: a slow worker skips the ones in between. Closing it stops the workers.
 #[derive(Debug, Default)]
 pub struct Mailbox {
-    newest: Mutex<Option<Arc<Directive>>>,
+    state: Mutex<State>,
     changed: Condvar,
     closed: AtomicBool,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    newest: Option<Arc<Directive>>,
+    /// Learner epoch and version that are known to be out, though they may still be on their way.
+    announced: (u64, u64),
 }
 
 impl Mailbox {
     /// Replaces the directive.
     pub fn publish(&self, directive: Directive) {
-        *self.newest.lock().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(directive));
+        self.lock().newest = Some(Arc::new(directive));
         self.changed.notify_all();
     }
 
-    /// The newest directive, waiting for the first one; `None` once the mailbox is closed.
+    /// A new connection: what was announced on the last one may never come.
+    pub fn reconnected(&self) {
+        self.lock().announced = (0, 0);
+        self.changed.notify_all();
+    }
+
+    /// Says that this version is out: nobody gets an older directive from now on.
+    pub fn announce(&self, learner_epoch: u64, version: u64) {
+        let mut state = self.lock();
+        state.announced = state.announced.max((learner_epoch, version));
+    }
+
+    /// The newest directive, waiting for the one that was announced; `None` once the mailbox is closed.
     pub fn wait(&self) -> Option<Arc<Directive>> {
-        let mut newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = self.lock();
         loop {
             if self.is_closed() {
                 return None;
             }
-            if let Some(directive) = &*newest {
-                return Some(Arc::clone(directive));
+            match &state.newest {
+                Some(directive) if (directive.learner_epoch, directive.version) >= state.announced => {
+                    return Some(Arc::clone(directive));
+                }
+                _ => state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
             }
-            newest = self.changed.wait(newest).unwrap_or_else(PoisonError::into_inner);
         }
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Tells the workers to stop after the step they are in.
     pub fn close(&self) {
         // Under the lock, or a waiter between its check and its wait would sleep for ever.
-        let _newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        let _state = self.lock();
         self.closed.store(true, Ordering::Release);
         self.changed.notify_all();
     }
@@ -85,6 +110,19 @@ mod tests {
         mailbox.publish(directive(2));
         assert_eq!(mailbox.wait().unwrap().version, 2);
         assert_eq!(mailbox.wait().unwrap().version, 2);
+    }
+
+    #[test]
+    fn nobody_gets_an_older_directive_than_was_announced() {
+        let mailbox = Arc::new(Mailbox::default());
+        mailbox.publish(directive(1));
+        mailbox.announce(1, 2);
+        let waiter = std::thread::spawn({
+            let mailbox = Arc::clone(&mailbox);
+            move || mailbox.wait().unwrap().version
+        });
+        mailbox.publish(directive(2));
+        assert_eq!(waiter.join().unwrap(), 2);
     }
 
     #[test]

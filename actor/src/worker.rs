@@ -28,6 +28,7 @@ use tokio::sync::mpsc;
 use crate::Error;
 use crate::acting::{ActingBatch, ActingSizes, ForwardPass};
 use crate::mailbox::{Conduct, Directive, Mailbox};
+use crate::round::{Round, Ticket};
 use lane::Lane;
 
 /// A full unroll, without what only the connection knows (actor, incarnation, sequence number).
@@ -43,6 +44,8 @@ pub struct FinishedUnroll {
     pub demonstration: bool,
     /// Episodes that ended in this unroll.
     pub episodes: Vec<EpisodeStatistics>,
+    /// Held until the learner has answered for it, if somebody waits for that.
+    pub ticket: Option<Arc<Ticket>>,
 }
 
 /// What a process has done so far, for its log.
@@ -96,7 +99,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     }
 
     /// Acts by the newest directive and hands every full unroll to `unrolls`, until the mailbox is closed or nobody
-    /// takes unrolls any more. A full channel holds the environments still.
+    /// takes unrolls any more. The environments stand still until every unroll of the last round is answered for.
     ///
     /// # Errors
     /// Parameters that do not fit, or a failing forward pass.
@@ -109,11 +112,14 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         while let Some(directive) = mailbox.wait() {
             self.adopt(&directive)?;
             let Some(finished) = self.unroll(&|| mailbox.is_closed(), progress)? else { return Ok(()) };
-            for unroll in finished {
+            let round = Round::default();
+            for mut unroll in finished {
+                unroll.ticket = Some(round.ticket());
                 if unrolls.blocking_send(unroll).is_err() {
                     return Ok(());
                 }
             }
+            round.wait();
         }
         Ok(())
     }
@@ -200,7 +206,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
                 if lane.at_episode_end() {
                     lane.begin_episode(&mut batch.row(index));
                 }
-                FinishedUnroll { payload, learner_epoch, version, demonstration, episodes }
+                FinishedUnroll { payload, learner_epoch, version, demonstration, episodes, ticket: None }
             })
             .collect()
     }

@@ -324,11 +324,13 @@ pub struct Unroll {
     pub batch: usize,
     /// An unroll whose parameters are more than so many published versions old is refused as stale (D).
     pub max_staleness: u64,
+    /// Batches assembled while one is trained on: 1 keeps the device busy (D), 0 keeps the experience fresh.
+    pub ahead: usize,
 }
 
 impl Default for Unroll {
     fn default() -> Self {
-        Self { length: 32, batch: 128, max_staleness: 1000 }
+        Self { length: 32, batch: 128, max_staleness: 1000, ahead: 1 }
     }
 }
 

@@ -68,11 +68,15 @@ impl Metrics {
         self.since.elapsed().as_secs_f64()
     }
 
-    /// Counts one trained batch.
-    pub fn absorb(&mut self, headers: &[UnrollHeader], environment_steps: u64, version: u64) {
+    /// Counts environment steps that a batch held.
+    pub fn count_steps(&mut self, steps: u64) {
+        self.window.environment_steps += steps;
+    }
+
+    /// Counts a batch's episodes, and the age of its unrolls where `version` is the newest.
+    pub fn absorb(&mut self, headers: &[UnrollHeader], version: u64) {
         let window = &mut self.window;
         window.updates += 1;
-        window.environment_steps += environment_steps;
         window.returns.resize(self.terms.len(), 0.0);
         for header in headers {
             window.unrolls += 1;

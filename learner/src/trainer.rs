@@ -92,7 +92,7 @@ pub struct Trainer {
     pub(crate) batcher: Batcher,
     publisher: Publisher,
     shared: Arc<Shared>,
-    metrics: Metrics,
+    pub(crate) metrics: Metrics,
     pub(crate) writer: Writer,
     checkpointed: Instant,
 }
@@ -174,8 +174,9 @@ impl Trainer {
             self.set_normaliser()?;
             if unseen {
                 // Numbers of any size would teach the networks nothing: the first batch only sets the scale.
+                self.publish(Behaviour::Policy)?;
                 self.book(batch);
-                return self.publish(Behaviour::Policy);
+                return Ok(());
             }
         }
         self.schedule_learning_rate();
@@ -187,10 +188,12 @@ impl Trainer {
             self.report(&losses.to_metrics())?;
         }
         self.progress.updates += 1;
-        self.book(batch);
+        self.metrics.absorb(batch.headers(), self.progress.version);
+        // Published before the batch goes back: whoever waits for its room goes on with these parameters.
         if self.progress.updates.is_multiple_of(self.experiment.vmpo.target_period) {
             self.publish(Behaviour::Policy)?;
         }
+        self.book(batch);
         self.after_update()
     }
 }
@@ -261,11 +264,11 @@ impl Trainer {
         (0..steps).map(move |step| tensors.select(&Tensor::from_slice(&order[step * size..(step + 1) * size])))
     }
 
-    /// Counts a batch's steps and episodes, and gives its memory back.
+    /// Counts a batch's steps, and gives its memory back.
     pub(crate) fn book(&mut self, batch: Batch) {
         let steps = batch.f32(Field::Valid).iter().filter(|valid| **valid > 0.5).count() as u64;
         self.progress.environment_steps += steps;
-        self.metrics.absorb(batch.headers(), steps, self.progress.version);
+        self.metrics.count_steps(steps);
         self.batcher.trained(batch);
     }
 

@@ -48,6 +48,7 @@ impl Trainer {
                 Wait::Batch(batch) => {
                     demonstrations.push(self.tensors(&batch)?);
                     self.absorb(&batch);
+                    self.metrics.absorb(batch.headers(), 0);
                     self.book(batch);
                 }
                 Wait::Nothing => {}

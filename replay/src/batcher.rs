@@ -13,9 +13,6 @@ use crate::batch::{Batch, Buffer};
 use crate::ledger::{Books, JoinError, Joined, Ledger, Reason, Sighting};
 use crate::snapshot::Snapshot;
 
-/// One batch is open, one is full, one is being trained on.
-const BUFFERS: usize = 3;
-
 /// What does not change while a batcher lives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
@@ -23,6 +20,9 @@ pub struct Config {
     pub unrolls: usize,
     /// An unroll may be so many published versions old.
     pub max_staleness: u64,
+    /// Batches that may be assembled while one is trained on. With 0 nothing is taken meanwhile, and what waits is as
+    /// fresh as can be; with 1 the next batch is ready when the trainer is.
+    pub ahead: usize,
 }
 
 /// What the trainer wants at this moment.
@@ -98,7 +98,7 @@ impl Batcher {
     /// An empty batcher that carries on these books.
     pub fn new(layout: Arc<UnrollLayout>, config: Config, phase: Phase, ledger: Ledger) -> Self {
         let config = Config { unrolls: config.unrolls.max(1), ..config };
-        let mut free: Vec<_> = (0..BUFFERS).map(|_| Buffer::new(&layout, config.unrolls)).collect();
+        let mut free: Vec<_> = (0..=config.ahead).map(|_| Buffer::new(&layout, config.unrolls)).collect();
         let open = free.pop();
         let state = Mutex::new(State { ledger, phase, open, full: None, free, taken: 0, closed: false });
         let slots = Semaphore::new(config.unrolls);

@@ -30,7 +30,7 @@
 //! # Invariants
 //! - `produced = trained + dropped + in flight` whenever anyone looks; *in flight* is counted in the buffers, not
 //!   computed from the others.
-//! - Memory is three batches, whatever the number of actors: one open, one full, one at the trainer.
+//! - Memory is [`Config::ahead`] batches and the one at the trainer, whatever the number of actors.
 //! - No unroll is in two batches, or twice in one.
 
 mod batch;

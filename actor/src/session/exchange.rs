@@ -47,6 +47,7 @@ impl Exchange<'_> {
         let request = WatchRequest { actor, incarnation };
         streams.spawn(watch(client, request, Assembler::new(self.limits.parameters), Arc::clone(self.mailbox)));
 
+        self.mailbox.reconnected();
         self.outbox.rewind();
         let mut producing = true;
         let ended = loop {
@@ -54,7 +55,11 @@ impl Exchange<'_> {
                 break Ended::Drained;
             }
             tokio::select! {
-                Some(ack) = acks.recv() => self.outbox.settle(&ack),
+                Some(ack) = acks.recv() => {
+                    // Before the ticket comes back: the worker that waits for it goes on with this version or a newer.
+                    self.mailbox.announce(ack.learner_epoch, ack.version);
+                    self.outbox.settle(&ack);
+                }
                 Ok(permit) = up.reserve(), if self.outbox.has_unsent() => {
                     if let Some(message) = self.outbox.send(actor, incarnation) {
                         permit.send(message);

@@ -141,11 +141,12 @@ mod tests {
             version: 1,
             demonstration: false,
             episodes: Vec::new(),
+            ticket: None,
         }
     }
 
     fn ack(sequence: u64, verdict: Verdict) -> UnrollAck {
-        UnrollAck { sequence, verdict: verdict.into(), detail: String::new() }
+        UnrollAck { sequence, verdict: verdict.into(), ..UnrollAck::default() }
     }
 
     fn sent(outbox: &mut Outbox) -> Vec<u64> {

@@ -19,6 +19,7 @@ fn unroll(number: u64) -> FinishedUnroll {
         version: number,
         demonstration: false,
         episodes: Vec::new(),
+        ticket: None,
     }
 }
 

@@ -61,7 +61,7 @@ async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAc
     let UnrollMessage { header, payload } = message;
     let Some(header) = header else {
         shared.batcher.refuse_unattributed();
-        return Ok(Some(ack(0, Verdict::Invalid, Invalid::Header.to_string())));
+        return Ok(Some(ack(shared, 0, Verdict::Invalid, Invalid::Header.to_string())));
     };
     let expected = Expected {
         clips: shared.clips,
@@ -77,17 +77,17 @@ async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAc
     };
     let sequence = header.sequence;
     Ok(Some(match outcome {
-        Outcome::Taken => ack(sequence, Verdict::Taken, String::new()),
-        Outcome::Duplicate => ack(sequence, Verdict::Duplicate, String::new()),
-        Outcome::Superseded => ack(sequence, Verdict::Superseded, superseded(&header, shared)),
+        Outcome::Taken => ack(shared, sequence, Verdict::Taken, String::new()),
+        Outcome::Duplicate => ack(shared, sequence, Verdict::Duplicate, String::new()),
+        Outcome::Superseded => ack(shared, sequence, Verdict::Superseded, superseded(&header, shared)),
         Outcome::Stale => {
             let newest = shared.batcher.phase().version;
-            ack(sequence, Verdict::Stale, format!("version {} is too old, the newest is {newest}", header.version))
+            ack(shared, sequence, Verdict::Stale, format!("version {} is too old, the newest is {newest}", header.version))
         }
         Outcome::Invalid => {
             let reason = invalid.map_or_else(|| "its numbers fit no account".into(), |invalid| invalid.to_string());
             shared.complaints.about(header.actor, sequence, &reason);
-            ack(sequence, Verdict::Invalid, reason)
+            ack(shared, sequence, Verdict::Invalid, reason)
         }
         Outcome::NotJoined => {
             return Err(Status::failed_precondition(format!(
@@ -108,6 +108,7 @@ fn superseded(header: &UnrollHeader, shared: &Shared) -> String {
     format!("the learner wants {wanted} now")
 }
 
-fn ack(sequence: u64, verdict: Verdict, detail: String) -> UnrollAck {
-    UnrollAck { sequence, verdict: verdict.into(), detail }
+fn ack(shared: &Shared, sequence: u64, verdict: Verdict, detail: String) -> UnrollAck {
+    let (learner_epoch, version) = (shared.publisher.epoch(), shared.publisher.newest_version());
+    UnrollAck { sequence, verdict: verdict.into(), detail, learner_epoch, version }
 }

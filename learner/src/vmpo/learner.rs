@@ -28,9 +28,9 @@ pub enum Error {
     #[error("batch is {found:?} with clips below {clips} where the networks take {expected:?} and {known} clips")]
     Shape {
         /// The networks' sizes; unrolls and length are the batch's own.
-        expected: MinibatchShape,
+        expected: Box<MinibatchShape>,
         /// The batch's sizes.
-        found: MinibatchShape,
+        found: Box<MinibatchShape>,
         /// One more than the largest clip index of the batch.
         clips: usize,
         /// Clips the value function knows.
@@ -255,7 +255,7 @@ impl VmpoLearner {
         if found == expected && minibatch.clips <= known {
             return Ok(());
         }
-        Err(Error::Shape { expected, found, clips: minibatch.clips, known })
+        Err(Error::Shape { expected: Box::new(expected), found: Box::new(found), clips: minibatch.clips, known })
     }
 
     fn forward(&self, minibatch: &MinibatchTensors) -> Pass {

@@ -27,7 +27,7 @@ pub fn returns(
         let discount = (discount * gamma).unsqueeze(-1);
         let mut base = reward.shallow_clone();
         if lambda < 1.0 {
-            base = base + &discount * values.narrow(1, 1, steps) * (1.0 - lambda);
+            base = &discount * values.narrow(1, 1, steps) * (1.0 - lambda) + base;
         }
         let passed_on = discount * lambda;
         let mut target = values.select(1, steps);

@@ -183,7 +183,7 @@ impl Learner for FakeLearner {
                 if learner.inner.script.silent || breaks.is_some_and(|(_, acknowledged)| count > acknowledged) {
                     continue;
                 }
-                let ack = UnrollAck { sequence: header.sequence, verdict: verdict.into(), detail: String::new() };
+                let ack = UnrollAck { sequence: header.sequence, verdict: verdict.into(), ..UnrollAck::default() };
                 if acks.send(Ok(ack)).await.is_err() {
                     return;
                 }

@@ -47,6 +47,13 @@ impl Display {
         }
     }
 
+    /// The learner wrote a line into its log.
+    pub(super) fn learner(&mut self, line: &str) {
+        // Its own date and level say nothing that a panel does not.
+        let said = line.split_once(" INFO ").map_or(line, |(_, said)| said);
+        self.event("learner", &[("says", said.trim().to_owned())]);
+    }
+
     /// A line of metrics came.
     pub(super) fn metrics(&mut self, text: &str) {
         let Ok(line) = serde_json::from_str::<Line>(text) else {

@@ -29,6 +29,7 @@ pub(super) struct Supervisor<'a> {
     learner: Process,
     actors: Vec<Actor>,
     metrics: Tail,
+    log: Tail,
 }
 
 /// One actor's place; the process in it may change.
@@ -44,13 +45,14 @@ impl<'a> Supervisor<'a> {
     /// Starts the learner, waits until it serves, and starts the actors.
     pub(super) fn start(job: &'a Job, port: u16, display: &mut Display, interrupt: &Interrupt) -> Result<Self> {
         let metrics = Tail::new(job.directory.metrics());
+        let log = Tail::new(job.directory.log("learner"));
         let mut command = Command::new(workspace::program("comic-learner")?);
         command.args(&job.document).args(["--address", "127.0.0.1", "--port", &port.to_string()]);
         command.arg("--run").arg(job.directory.path());
         let mut learner = Process::start("comic-learner", &mut command, job.directory.log("learner"))?;
         await_serving(&mut learner, interrupt)?;
         display.event("learner serves", &[("address", format!("127.0.0.1:{port}"))]);
-        let mut supervisor = Self { job, port, learner, actors: Vec::new(), metrics };
+        let mut supervisor = Self { job, port, learner, actors: Vec::new(), metrics, log };
         for number in 0..usize::from(job.actors) {
             let process = Some(supervisor.start_actor(number)?);
             supervisor.actors.push(Actor { number, process, deaths: 0, again: None });
@@ -70,9 +72,7 @@ impl<'a> Supervisor<'a> {
     /// Shows the run until the learner has finished or a stop is asked for.
     pub(super) fn watch(&mut self, display: &mut Display, interrupt: &Interrupt) -> Result<()> {
         loop {
-            for line in self.metrics.lines() {
-                display.metrics(&line);
-            }
+            self.show(display);
             if interrupt.requested() {
                 display.event("stopping", &[("reason", "asked to".into())]);
                 return Ok(());
@@ -135,6 +135,16 @@ impl<'a> Supervisor<'a> {
         for process in actors {
             if !process.wait(ACTOR_LEAVES) {
                 display.event("actor killed", &[("name", process.name.clone())]);
+            }
+        }
+        self.show(display);
+    }
+
+    /// New metrics, and what the learner says beside them: the phases before the first update take a while.
+    fn show(&mut self, display: &mut Display) {
+        for line in self.log.lines() {
+            if !line.contains(" metrics: ") && !says_it_serves(&line) {
+                display.learner(&line);
             }
         }
         for line in self.metrics.lines() {
