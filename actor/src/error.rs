@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-/// An actor's errors. [`Error::is_configuration`] tells those that no restart can mend.
+/// An actor's errors; what a variant holds as its source is not repeated in its message. [`Error::is_configuration`] tells those that no restart can mend.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -29,10 +29,10 @@ pub enum Error {
         message: String,
     },
     /// The learner's experiment document is not one that this actor understands.
-    #[error("the learner's experiment cannot be used: {0}")]
+    #[error("the learner's experiment cannot be used")]
     Experiment(#[from] comic_experiment::Error),
     /// The task's specification does not parse.
-    #[error("the learner's task specification cannot be used: {0}")]
+    #[error("the learner's task specification cannot be used")]
     Spec(#[from] toml::de::Error),
     /// Both sides computed different sizes from the same document.
     #[error("learner and actor disagree on {what}: build both from the same release")]
@@ -67,7 +67,7 @@ pub enum Error {
         reason: String,
     },
     /// A file or directory.
-    #[error("{}: {source}", path.display())]
+    #[error("cannot use {}", path.display())]
     File {
         /// Which.
         path: PathBuf,
@@ -95,13 +95,13 @@ pub enum Error {
     #[error(transparent)]
     Task(#[from] comic_tasks::Error),
     /// libtorch.
-    #[error("libtorch: {0}")]
+    #[error("libtorch failed")]
     Torch(#[from] tch::TchError),
     /// A worker thread ended by a panic; its message went to stderr.
     #[error("a worker thread panicked")]
     WorkerPanicked,
-    /// A thread or the runtime could not be started.
-    #[error("cannot start a thread: {0}")]
+    /// A thread, the runtime, a listener or a signal handler could not be set up.
+    #[error("the operating system refused a thread, a socket or a signal handler")]
     Thread(#[source] std::io::Error),
 }
 

@@ -172,11 +172,7 @@ pub(crate) fn restore(entries: Vec<(String, Tensor)>, state: &[(String, Tensor)]
     for (name, entry) in &entries {
         let found = saved.get(name.as_str()).ok_or_else(|| StateError::Missing { name: name.clone() })?;
         if describe(found) != describe(entry) {
-            return Err(StateError::Mismatch {
-                name: name.clone(),
-                expected: describe(entry),
-                found: describe(found),
-            });
+            return Err(StateError::Mismatch { name: name.clone(), expected: describe(entry), found: describe(found) });
         }
     }
     if entries.len() != state.len() {

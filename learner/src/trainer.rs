@@ -154,7 +154,10 @@ impl Trainer {
         if !self.progress.warm_started && self.warm_start()?.is_none() {
             return Ok(Ending::Stopped);
         }
-        self.publish(Behaviour::Policy)?;
+        match self.progress.version {
+            0 => self.publish(Behaviour::Policy)?,
+            _ => self.announce(Behaviour::Policy),
+        }
         while !self.budget_used_up() {
             match self.next_batch()? {
                 Wait::Batch(batch) => self.learn(batch)?,
@@ -276,11 +279,16 @@ impl Trainer {
     pub(crate) fn publish(&mut self, behaviour: Behaviour) -> Result<()> {
         self.target = Bytes::from(to_safetensors(self.learner.policy_store())?);
         self.progress.version += 1;
+        self.announce(behaviour);
+        Ok(())
+    }
+
+    /// Tells actors and batcher of the newest version, for instance after a restart.
+    fn announce(&self, behaviour: Behaviour) {
         let version = self.progress.version;
         let demonstration = behaviour == Behaviour::Demonstrate;
         self.batcher.set_phase(Phase { epoch: self.epoch, version, demonstration });
         self.publisher.publish(version, behaviour, self.target.clone());
-        Ok(())
     }
 
     fn normalises_still(&self) -> bool {

@@ -33,6 +33,7 @@ impl Trainer {
         }
         self.learner.reset_optimiser();
         self.progress.warm_started = true;
+        self.publish(Behaviour::Policy)?;
         self.writer.write(Name::WarmStarted, self.snapshot()?)?;
         Ok(Some(()))
     }

@@ -1,5 +1,7 @@
 //! Adam against its textbook definition, and its state.
 
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
 use comic_experiment::Optimiser;
 use comic_learner::adam::{Adam, clip_by_global_norm, global_norm};
 use proptest::prelude::*;

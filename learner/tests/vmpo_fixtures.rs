@@ -3,6 +3,8 @@
 //! Reads every `vmpo_*.npz`, `gaussian_*.npz` and `returns_*.npz` of the folder that COMIC_VMPO_FIXTURES names, of
 //! `tests/fixtures/vmpo` without it. `tests/python/make_vmpo_fixtures.py` makes them.
 
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
 use std::path::{Path, PathBuf};
 
 use comic_experiment::Prior;
@@ -27,7 +29,8 @@ impl Fixture {
 
     /// An array as float32, whatever float it was written as; `None` when the file has no such array.
     fn find(&mut self, name: &str) -> Option<Tensor> {
-        let array = self.archive.by_name(name).unwrap_or_else(|error| panic!("{}: {name}: {error}", self.path.display()))?;
+        let array =
+            self.archive.by_name(name).unwrap_or_else(|error| panic!("{}: {name}: {error}", self.path.display()))?;
         let shape: Vec<i64> = array.shape().iter().map(|size| *size as i64).collect();
         let double = array.dtype().num_bytes() == Some(8);
         let values: Vec<f64> = if double {

@@ -1,5 +1,7 @@
 //! Laws of a whole V-MPO step.
 
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
 mod vmpo_support;
 
 use comic_experiment::Prior;

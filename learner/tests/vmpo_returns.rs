@@ -1,5 +1,7 @@
 //! Targets of the value function: the recursion, and what an episode's end stops.
 
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
 use comic_learner::vmpo::returns;
 use proptest::prelude::*;
 use tch::Tensor;
@@ -62,7 +64,8 @@ fn unroll() -> impl Strategy<Value = Unroll> {
 
 #[test]
 fn the_return_runs_to_the_unrolls_end_and_bootstraps_there() {
-    let unroll = Unroll { reward: vec![1.0, 2.0], discount: vec![1.0; 2], valid: vec![1.0; 2], values: vec![7.0, 8.0, 10.0] };
+    let unroll =
+        Unroll { reward: vec![1.0, 2.0], discount: vec![1.0; 2], valid: vec![1.0; 2], values: vec![7.0, 8.0, 10.0] };
     assert!(close(&unroll.targets(1.0), &[1.0 + 0.9 * (2.0 + 0.9 * 10.0), 2.0 + 0.9 * 10.0]));
 }
 

@@ -1,5 +1,7 @@
 //! The learner over several steps: its state, the warm start, and that it learns.
 
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
 mod vmpo_support;
 
 use comic_experiment::{Experiment, Prior};

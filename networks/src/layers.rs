@@ -8,7 +8,12 @@ use crate::DiagonalGaussian;
 pub(crate) fn linear(path: &nn::Path, input: i64, output: i64, scale: f64) -> nn::Linear {
     let bound = scale / (input as f64).sqrt();
     let weights = if bound > 0.0 { nn::Init::Uniform { lo: -bound, up: bound } } else { nn::Init::Const(0.0) };
-    nn::linear(path, input, output, nn::LinearConfig { ws_init: weights, bs_init: Some(nn::Init::Const(0.0)), bias: true })
+    nn::linear(
+        path,
+        input,
+        output,
+        nn::LinearConfig { ws_init: weights, bs_init: Some(nn::Init::Const(0.0)), bias: true },
+    )
 }
 
 /// `[.., D]` as rows `[N, D]`.

@@ -61,7 +61,10 @@ impl Normaliser {
 
     pub(crate) fn forward(&self, proprioception: &Tensor, task: &Tensor) -> NormalisedObservation {
         if !self.active {
-            return NormalisedObservation { proprioception: proprioception.shallow_clone(), task: task.shallow_clone() };
+            return NormalisedObservation {
+                proprioception: proprioception.shallow_clone(),
+                task: task.shallow_clone(),
+            };
         }
         NormalisedObservation {
             proprioception: normalise(proprioception, &self.proprioception_mean, &self.proprioception_std),

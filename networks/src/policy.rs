@@ -79,7 +79,13 @@ impl Policy {
 
     /// Acts, or learns: proprioception `[N, P]`, task observation `[N, X]`, previous sampled latent `[N, Z]`
     /// (zeros at an episode's start) and standard-normal noise `[N, Z]`, all as they come from the environment.
-    pub fn act(&self, proprioception: &Tensor, task: &Tensor, previous_latent: &Tensor, latent_noise: &Tensor) -> Acting {
+    pub fn act(
+        &self,
+        proprioception: &Tensor,
+        task: &Tensor,
+        previous_latent: &Tensor,
+        latent_noise: &Tensor,
+    ) -> Acting {
         self.act_normalised(&self.normalise(proprioception, task), previous_latent, latent_noise)
     }
 

@@ -20,7 +20,8 @@ fn close(left: f64, right: f64) -> bool {
 
 #[test]
 fn log_prob_of_the_standard_normal_at_zero_is_minus_half_ln_tau_a_dimension() {
-    let log_prob = gaussian(&[0.0; 3], &[1.0; 3]).log_prob(&Tensor::zeros([1, 3], (tch::Kind::Float, tch::Device::Cpu)));
+    let log_prob =
+        gaussian(&[0.0; 3], &[1.0; 3]).log_prob(&Tensor::zeros([1, 3], (tch::Kind::Float, tch::Device::Cpu)));
     assert!(close(number(&log_prob), -1.5 * std::f64::consts::TAU.ln()));
 }
 

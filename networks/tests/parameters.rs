@@ -1,5 +1,7 @@
 //! Parameters over a wire: what goes in comes out, and nothing hostile gets in.
 
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
 use std::collections::HashMap;
 
 use comic_experiment::{Network, TaskSpec};
@@ -9,7 +11,8 @@ use safetensors::tensor::{Dtype, TensorView};
 use tch::{Device, nn};
 
 fn store() -> nn::VarStore {
-    let spec = TaskSpec { proprioception: 3, task: 4, action: 2, reward_terms: vec!["a".into()], clips: vec!["x".into()] };
+    let spec =
+        TaskSpec { proprioception: 3, task: 4, action: 2, reward_terms: vec!["a".into()], clips: vec!["x".into()] };
     let mut network = Network { encoder: vec![8], low_level: vec![8], normaliser_steps: 1, ..Network::default() };
     network.latent.size = 2;
     let store = nn::VarStore::new(Device::Cpu);

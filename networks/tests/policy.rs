@@ -1,5 +1,7 @@
 //! The policy and the value function: where they start, and that acting and learning are one function.
 
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
 use comic_experiment::{Network, TaskSpec};
 use comic_networks::{Error, NORMALISED_LIMIT, NormaliserStatistics, Policy, Value};
 use tch::{Device, Kind, Tensor, nn};

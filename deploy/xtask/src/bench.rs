@@ -43,15 +43,12 @@ const ROUNDS: usize = 3;
 /// Builds and measures.
 pub(crate) fn run(options: &Options) -> Result<()> {
     setup::run(&setup::Options::default())?;
+    workspace::build()?;
     match options.side {
         Side::Actor => {
-            workspace::build(&["comic-actor"])?;
             show(&figures(Command::new(workspace::program("comic-actor")?).arg("bench").args(&options.arguments))?)
         }
-        Side::Learner => {
-            workspace::build(&["comic-learner"])?;
-            learner(options.threads, &options.arguments)
-        }
+        Side::Learner => learner(options.threads, &options.arguments),
     }
 }
 

@@ -16,7 +16,7 @@ pub(crate) struct TestOptions {
 pub(crate) fn test(options: &TestOptions) -> Result<()> {
     setup::run(&setup::Options::default())?;
     // The whole-system tests start the programs, so these are built first.
-    workspace::build(&["comic-learner", "comic-actor"])?;
+    workspace::build()?;
     let mut command = cargo();
     if cargo_has("nextest") {
         command.args(["nextest", "run"]);

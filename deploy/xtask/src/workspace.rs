@@ -45,14 +45,10 @@ pub(crate) fn describe(command: &Command) -> String {
     std::iter::once(program).chain(command.get_args()).map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
 }
 
-/// Builds the programs of `packages` in the release profile.
-pub(crate) fn build(packages: &[&str]) -> Result<()> {
-    let mut command = cargo();
-    command.args(["build", "--release"]);
-    for package in packages {
-        command.args(["--package", package]);
-    }
-    run(&mut command)
+/// Builds every program in the release profile: always all of them, since cargo compiles a crate anew when it is
+/// built together with others that ask for more features of what they share.
+pub(crate) fn build() -> Result<()> {
+    run(cargo().args(["build", "--release", "--workspace", "--bins"]))
 }
 
 /// A program of this workspace; they all stand beside this one.

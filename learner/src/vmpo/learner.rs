@@ -181,7 +181,9 @@ impl VmpoLearner {
             + &pass.value_loss * self.vmpo.value_weight
             + &pass.latent_kl * self.network.latent.beta;
         if self.vmpo.entropy != 0.0 {
-            total = total - masked_mean(&pass.acting.action.entropy(), &pass.valid) * self.vmpo.entropy;
+            // A new tensor: an in-place sum would write over what the graph holds.
+            let bonus = masked_mean(&pass.acting.action.entropy(), &pass.valid) * self.vmpo.entropy;
+            total = &total - &bonus;
         }
         let networks = self.adam.parameters(self.networks_group);
         let inputs: Vec<&Tensor> = networks.iter().chain([self.multipliers.parameter()]).collect();
@@ -207,9 +209,8 @@ impl VmpoLearner {
         let deviation = (&pass.acting.action.mean - &pass.behaviour.mean) / self.network.initial_std;
         let squares = deviation.square().sum_dim_intlist(-1i64, false, Kind::Float) * 0.5;
         let regression = masked_mean(&squares, &pass.valid);
-        let total = &regression
-            + &pass.value_loss * self.vmpo.value_weight
-            + &pass.latent_kl * self.network.latent.beta;
+        let total =
+            &regression + &pass.value_loss * self.vmpo.value_weight + &pass.latent_kl * self.network.latent.beta;
         let gradients = Tensor::f_run_backward(&[&total], self.adam.parameters(self.networks_group), false, false)?;
         let norm = self.descend(gradients);
         let shape = minibatch.shape();

@@ -106,9 +106,7 @@ impl MinibatchTensors {
             reward: blanked("reward", source.reward, shape.reward_terms, 0.0)?,
             discount: flag("discount", source.discount, 0)? * &valid,
             first: flag("first", source.first, 1)?,
-            clip: Tensor::from_slice(&clip)
-                .f_reshape([shape.unrolls as i64, rows[1] as i64])?
-                .f_to_device(device)?,
+            clip: Tensor::from_slice(&clip).f_reshape([shape.unrolls as i64, rows[1] as i64])?.f_to_device(device)?,
             clips: source.clip.iter().max().map_or(0, |clip| *clip as usize + 1),
             valid,
         })

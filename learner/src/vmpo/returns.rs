@@ -13,14 +13,7 @@ use tch::Tensor;
 /// - `discount`: `[B, T]`, 0 where the episode terminated.
 /// - `valid`: `[B, T]`, 1 where the row is a transition.
 /// - `values`: V(s), `[B, T+1, R]`.
-pub fn returns(
-    reward: &Tensor,
-    discount: &Tensor,
-    valid: &Tensor,
-    values: &Tensor,
-    gamma: f64,
-    lambda: f64,
-) -> Tensor {
+pub fn returns(reward: &Tensor, discount: &Tensor, valid: &Tensor, values: &Tensor, gamma: f64, lambda: f64) -> Tensor {
     tch::no_grad(|| {
         let steps = reward.size()[1];
         let transition = valid.gt(0.5).unsqueeze(-1);

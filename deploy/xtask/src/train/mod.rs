@@ -65,7 +65,7 @@ struct Job {
 pub(crate) fn run(options: Options) -> Result<()> {
     let job = Job::new(options)?;
     setup::run(&setup::Options::default())?;
-    workspace::build(&["comic-learner", "comic-actor"])?;
+    workspace::build()?;
     let interrupt = Interrupt::install()?;
     job.directory.make()?;
     // Chosen only now: the build takes minutes, and a port that was free before it may be taken.

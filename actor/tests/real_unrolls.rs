@@ -1,0 +1,106 @@
+//! Unrolls of the real task under a real policy: what a learner will find in them.
+
+#![allow(clippy::unwrap_used, reason = "tests")]
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use comic_actor::acting::{ActingBatch, ForwardPass as _};
+use comic_actor::mailbox::{Conduct, Directive};
+use comic_actor::policy::{TorchPolicy, acting_sizes};
+use comic_actor::worker::{FinishedUnroll, Progress, Worker};
+use comic_clips::Catalogue;
+use comic_experiment::{Experiment, resolve};
+use comic_proto::v1::UnrollHeader;
+use comic_proto::{Expected, Field, UnrollBuffer, UnrollLayout, UnrollShape, validate};
+use comic_tasks::TrackingTask;
+
+const ENVIRONMENTS: usize = 3;
+
+struct Setup {
+    experiment: Experiment,
+    task: Arc<TrackingTask>,
+    layout: Arc<UnrollLayout>,
+    policy: TorchPolicy,
+}
+
+fn setup() -> Setup {
+    let experiment = resolve("quickstart", &[]).unwrap();
+    let catalogue = Catalogue::open(&experiment.clips).unwrap();
+    let task = Arc::new(TrackingTask::new(&experiment.task, &catalogue).unwrap());
+    let layout = Arc::new(UnrollLayout::new(UnrollShape::new(task.spec(), &experiment)));
+    let policy = TorchPolicy::untrained(task.spec(), &experiment, 5, || Ok(catalogue.mean_action()?)).unwrap();
+    Setup { experiment, task, layout, policy }
+}
+
+/// Two rounds of unrolls, `[round][environment]`.
+fn record(setup: &Setup, conduct: Conduct) -> Vec<Vec<FinishedUnroll>> {
+    let environments = (0..ENVIRONMENTS as u64).map(|seed| setup.task.environment(seed)).collect();
+    let policy = TorchPolicy::untrained(setup.task.spec(), &setup.experiment, 6, || Ok([0.0; 56])).unwrap();
+    let mut worker = Worker::new(environments, policy, Arc::clone(&setup.layout), 0.1, 9);
+    let parameters = Bytes::from(setup.policy.to_parameters().unwrap());
+    worker.adopt(&Arc::new(Directive { learner_epoch: 2, version: 4, conduct, parameters })).unwrap();
+    (0..2).map(|_| worker.unroll(&|| false, &Progress::default()).unwrap().unwrap()).collect()
+}
+
+#[test]
+fn unrolls_pass_the_learners_validation() {
+    let setup = setup();
+    for conduct in [Conduct::Policy, Conduct::Demonstrate] {
+        for unroll in record(&setup, conduct).into_iter().flatten() {
+            let header = UnrollHeader {
+                learner_epoch: unroll.learner_epoch,
+                version: unroll.version,
+                layout_hash: setup.layout.hash().to_vec(),
+                demonstration: unroll.demonstration,
+                episodes: unroll.episodes,
+                ..UnrollHeader::default()
+            };
+            let expected = Expected { clips: setup.task.spec().clips.len(), epoch: 2, newest_version: 4 };
+            validate(&setup.layout, &header, &unroll.payload, &expected).unwrap();
+            assert_eq!(unroll.demonstration, conduct == Conduct::Demonstrate);
+        }
+    }
+}
+
+#[test]
+fn the_behaviour_policy_follows_from_what_is_recorded() {
+    let mut setup = setup();
+    for round in record(&setup, Conduct::Policy) {
+        let mut unrolls: Vec<_> =
+            round.iter().map(|unroll| UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap()).collect();
+        let mut batch = ActingBatch::new(ENVIRONMENTS, acting_sizes(setup.task.spec(), &setup.experiment));
+        for t in 0..setup.layout.shape().length {
+            for (index, unroll) in unrolls.iter().enumerate() {
+                let row = batch.row(index);
+                row.proprioception.copy_from_slice(unroll.row(Field::Proprioception, t));
+                row.task.copy_from_slice(unroll.row(Field::Task, t));
+                row.previous_latent.copy_from_slice(unroll.row(Field::PreviousLatent, t));
+                row.latent_noise.copy_from_slice(unroll.row(Field::LatentNoise, t));
+            }
+            setup.policy.forward(&mut batch).unwrap();
+            for (index, unroll) in unrolls.iter_mut().enumerate() {
+                let row = batch.row(index);
+                // Equal batch shapes give equal numbers, bit for bit.
+                assert_eq!(row.mean, unroll.row(Field::Mean, t));
+                assert_eq!(row.std, unroll.row(Field::Std, t));
+            }
+        }
+    }
+}
+
+#[test]
+fn rewards_are_the_tracking_tasks() {
+    let setup = setup();
+    let mut best = 0.0_f32;
+    for unroll in record(&setup, Conduct::Demonstrate).into_iter().flatten() {
+        let buffer = UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap();
+        for t in 0..setup.layout.shape().length {
+            let reward: f32 = buffer.row(Field::Reward, t).iter().sum();
+            // Beyond the threshold, at a failure, the termination term turns negative.
+            assert!(reward <= 1.45 && (reward >= 0.0 || buffer.row(Field::Discount, t) == [0.0]), "{reward}");
+            best = best.max(reward);
+        }
+    }
+    assert!(best > 0.3, "the servo action tracks a little, at least at an episode's start: {best}");
+}

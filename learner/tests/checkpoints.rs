@@ -1,0 +1,82 @@
+//! Checkpoints are whole or not there, and a damaged one costs no more than itself.
+
+use comic_learner::checkpoint::{Name, Snapshot, Store, read};
+
+fn snapshot(content: &str) -> Snapshot {
+    let mut snapshot = Snapshot::default();
+    snapshot.parts.insert("part".into(), content.as_bytes().to_vec());
+    snapshot
+}
+
+#[test]
+fn the_newest_is_found_again() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 3).unwrap();
+    assert!(store.newest().unwrap().is_none());
+    store.write(Name::Updates(9), &snapshot("nine")).unwrap();
+    store.write(Name::Updates(10), &snapshot("ten")).unwrap();
+    assert_eq!(store.newest().unwrap().unwrap().1, snapshot("ten"));
+}
+
+#[test]
+fn a_damaged_one_is_skipped() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 3).unwrap();
+    store.write(Name::Updates(1), &snapshot("one")).unwrap();
+    let newest = store.write(Name::Updates(2), &snapshot("two")).unwrap();
+    std::fs::write(newest.join("part"), "twø").unwrap();
+    assert_eq!(store.newest().unwrap().unwrap().1, snapshot("one"));
+    let complaint = format!("{:#}", read(&newest).unwrap_err());
+    assert!(complaint.contains("part") && complaint.contains("SHA-256"), "{complaint}");
+}
+
+#[test]
+fn one_that_was_not_finished_is_not_there() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 3).unwrap();
+    store.write(Name::Updates(1), &snapshot("one")).unwrap();
+    // As a crash leaves it: the parts, and neither manifest nor final name.
+    let unfinished = run.path().join("checkpoints/.checkpoint-0000000002");
+    std::fs::create_dir(&unfinished).unwrap();
+    std::fs::write(unfinished.join("part"), "two").unwrap();
+    assert_eq!(store.newest().unwrap().unwrap().1, snapshot("one"));
+    store.write(Name::Updates(2), &snapshot("two")).unwrap();
+    assert_eq!(store.newest().unwrap().unwrap().1, snapshot("two"));
+}
+
+#[test]
+fn the_oldest_beyond_the_number_kept_are_forgotten_and_the_named_ones_stay() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 2).unwrap();
+    store.write(Name::Initial, &snapshot("initial")).unwrap();
+    for updates in 1..=4 {
+        store.write(Name::Updates(updates), &snapshot("later")).unwrap();
+    }
+    let kept = |updates| store.has(Name::Updates(updates));
+    assert_eq!([1, 2, 3, 4].map(kept), [false, false, true, true]);
+    assert!(store.has(Name::Initial));
+}
+
+#[test]
+fn a_manifest_that_points_elsewhere_is_refused() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 2).unwrap();
+    let path = store.write(Name::Updates(1), &snapshot("one")).unwrap();
+    std::fs::write(path.join("MANIFEST.json"), r#"{"../../secret": "00"}"#).unwrap();
+    assert!(read(&path).is_err());
+}
+
+#[test]
+fn every_life_has_a_larger_epoch_than_the_one_before() {
+    let run = tempfile::tempdir().unwrap();
+    let epochs: Vec<u64> = (0..3).map(|_| Store::open(run.path(), 1).unwrap().begin_life().unwrap()).collect();
+    assert_eq!(epochs, [1, 2, 3]);
+}
+
+#[test]
+fn a_damaged_epoch_is_an_error_that_names_the_file() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 1).unwrap();
+    std::fs::write(run.path().join("checkpoints/epoch"), "many").unwrap();
+    assert!(format!("{:#}", store.begin_life().unwrap_err()).contains("epoch"));
+}
