@@ -66,7 +66,8 @@ impl Bench {
         let catalogue = Catalogue::open(&experiment.clips)?;
         let task = Arc::new(TrackingTask::new(&experiment.task, &catalogue)?);
         let subject = Subject { experiment, task, budget };
-        for name in Name::value_variants().iter().filter(|name| self.figures.is_empty() || self.figures.contains(name)) {
+        for name in Name::value_variants().iter().filter(|name| self.figures.is_empty() || self.figures.contains(name))
+        {
             let figure = match name {
                 Name::Env => physics::environment(&subject),
                 Name::Policy => acting::policy(&subject)?,

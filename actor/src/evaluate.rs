@@ -61,8 +61,7 @@ pub fn evaluate<F: ForwardPass>(
     let environments = (0..options.environments.min(starts.len()).max(1) as u64)
         .map(|index| task.environment(derive(options.seed, index)))
         .collect::<Vec<TrackingEnvironment>>();
-    let sizes =
-        ActingSizes { proprioception: spec.proprioception, task: spec.task, latent, action: spec.action };
+    let sizes = ActingSizes { proprioception: spec.proprioception, task: spec.task, latent, action: spec.action };
     let finished = rollout::run(evaluated, environments, sizes, &starts, options, progress)?;
     Ok(Report::new(spec, &finished, options))
 }

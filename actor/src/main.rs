@@ -15,7 +15,6 @@ Exit codes: 0 when the run is over or the actor was told to stop, 2 when the con
 again cannot help, 1 otherwise (for instance when the learner now serves another experiment).
 Logs go to standard error; RUST_LOG chooses what (default: info).";
 
-
 /// Steps humanoids for a learner; it needs nothing but the learner's address.
 #[derive(Debug, Parser)]
 #[command(version, args_conflicts_with_subcommands = true, after_help = EXIT_CODES)]

@@ -87,8 +87,7 @@ impl ForwardPass for TorchPolicy {
     fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
         let environments = batch.environments() as i64;
         let sizes = batch.sizes();
-        let matrix =
-            |values: &[f32], width: usize| Tensor::f_from_slice(values)?.f_view([environments, width as i64]);
+        let matrix = |values: &[f32], width: usize| Tensor::f_from_slice(values)?.f_view([environments, width as i64]);
         tch::no_grad(|| {
             let acting = self.policy.act(
                 &matrix(&batch.proprioception, sizes.proprioception)?,

@@ -69,8 +69,7 @@ pub fn run(options: &Options) -> Result<(), Error> {
     let (workers, parameters) = build(&joined, threads, environments)?;
     tracing::info!(experiment = joined.experiment.name, threads, environments, "acting");
 
-    let unacknowledged =
-        (2 * threads).saturating_mul(environments).clamp(FEWEST_UNACKNOWLEDGED, MOST_UNACKNOWLEDGED);
+    let unacknowledged = (2 * threads).saturating_mul(environments).clamp(FEWEST_UNACKNOWLEDGED, MOST_UNACKNOWLEDGED);
     let limits = Limits { window: unacknowledged, parameters: parameters + PARAMETERS_SLACK, flush: FLUSH };
     // One round of unrolls fits: then a worker goes on stepping while the connection takes what it made.
     let (sender, unrolls) = mpsc::channel(unacknowledged / 2);

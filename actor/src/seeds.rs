@@ -17,7 +17,8 @@ mod tests {
 
     #[test]
     fn neighbouring_seeds_give_disjoint_families() {
-        let all: HashSet<u64> = (0..100).flat_map(|seed| (0..100).map(move |index| derive(derive(1, seed), index))).collect();
+        let all: HashSet<u64> =
+            (0..100).flat_map(|seed| (0..100).map(move |index| derive(derive(1, seed), index))).collect();
         assert_eq!(all.len(), 10_000);
     }
 }

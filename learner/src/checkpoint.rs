@@ -87,10 +87,9 @@ impl Store {
     pub fn begin_life(&self) -> Result<u64> {
         let path = self.directory.join(EPOCH);
         let last = match fs::read_to_string(&path) {
-            Ok(text) => text
-                .trim()
-                .parse::<u64>()
-                .with_context(|| format!("{} is damaged: write the number of earlier starts into it", path.display()))?,
+            Ok(text) => text.trim().parse::<u64>().with_context(|| {
+                format!("{} is damaged: write the number of earlier starts into it", path.display())
+            })?,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => 0,
             Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),
         };

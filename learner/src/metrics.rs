@@ -104,12 +104,8 @@ impl Metrics {
         let total: f64 = window.returns.iter().sum();
         // Shares of nothing are absent, not 0.
         let per = |value: f64, count: u64| if count == 0 { Value::Null } else { json!(value / count as f64) };
-        let terms: Map<String, Value> = self
-            .terms
-            .iter()
-            .zip(&window.returns)
-            .map(|(name, sum)| (name.clone(), per(*sum, window.steps)))
-            .collect();
+        let terms: Map<String, Value> =
+            self.terms.iter().zip(&window.returns).map(|(name, sum)| (name.clone(), per(*sum, window.steps))).collect();
         let line = json!({
             "seconds": position.seconds,
             "learner_epoch": position.epoch,

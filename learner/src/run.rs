@@ -129,7 +129,11 @@ fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shar
         None => Ledger::new(),
     };
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
-    let config = Config { unrolls: experiment.unroll.batch, max_staleness: experiment.unroll.max_staleness, ahead: experiment.unroll.ahead };
+    let config = Config {
+        unrolls: experiment.unroll.batch,
+        max_staleness: experiment.unroll.max_staleness,
+        ahead: experiment.unroll.ahead,
+    };
     let batcher = Batcher::new(layout, config, Phase { epoch, ..Phase::default() }, ledger);
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {
@@ -140,8 +144,7 @@ fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shar
         publisher: publisher.clone(),
     })?;
     let run = options.run.clone();
-    let setup =
-        Setup { experiment, spec, pose, run, epoch, resume, batcher, publisher, shared: shared.clone() };
+    let setup = Setup { experiment, spec, pose, run, epoch, resume, batcher, publisher, shared: shared.clone() };
     Ok((setup, shared))
 }
 

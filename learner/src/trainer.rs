@@ -248,10 +248,7 @@ impl Trainer {
     }
 
     /// The gradient steps' minibatches: every unroll once before any comes again.
-    fn minibatches<'a>(
-        &mut self,
-        tensors: &'a MinibatchTensors,
-    ) -> impl Iterator<Item = MinibatchTensors> + use<'a> {
+    fn minibatches<'a>(&mut self, tensors: &'a MinibatchTensors) -> impl Iterator<Item = MinibatchTensors> + use<'a> {
         let unrolls = self.experiment.unroll.batch;
         let size = self.experiment.vmpo.minibatch_unrolls;
         let steps = self.experiment.vmpo.gradient_steps;

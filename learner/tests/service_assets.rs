@@ -36,11 +36,10 @@ async fn a_fetched_asset_has_the_announced_hash_and_size() {
     let assets = assets.map(|(name, size)| asset(folder.path(), name, size)).to_vec();
     let world = World::start_with(8, assets).await;
     let announced = world.actor(70).await.reply.assets;
-    assert_eq!(announced.iter().map(|asset| asset.source.as_str()).collect::<Vec<_>>(), [
-        "clips/walk.h5",
-        "clips/run.h5",
-        "clips/empty.h5"
-    ]);
+    assert_eq!(
+        announced.iter().map(|asset| asset.source.as_str()).collect::<Vec<_>>(),
+        ["clips/walk.h5", "clips/run.h5", "clips/empty.h5"]
+    );
     for asset in announced {
         let contents = fetch(&world, asset.sha256.clone()).await.unwrap();
         assert_eq!(contents.len() as u64, asset.size);

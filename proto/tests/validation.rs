@@ -133,7 +133,8 @@ fn numbers_that_are_not_finite_are_refused_wherever_they_stand() {
 
 #[test]
 fn each_field_keeps_to_its_range() {
-    let cases = [(Field::Std, 0.0), (Field::Std, -1.0), (Field::Discount, 1.5), (Field::Valid, 0.5), (Field::First, 2.0)];
+    let cases =
+        [(Field::Std, 0.0), (Field::Std, -1.0), (Field::Discount, 1.5), (Field::Valid, 0.5), (Field::First, 2.0)];
     for (name, number) in cases {
         let refused = payload_refusal(|unroll| unroll.row_mut(name, 3)[0] = number);
         let expected = matches!(
@@ -146,14 +147,8 @@ fn each_field_keeps_to_its_range() {
 
 #[test]
 fn an_episode_begins_exactly_after_a_row_without_a_transition() {
-    assert_eq!(
-        payload_refusal(|unroll| unroll.row_mut(Field::First, 2)[0] = 0.0),
-        Some(Invalid::Boundary { row: 1 })
-    );
-    assert_eq!(
-        payload_refusal(|unroll| unroll.row_mut(Field::First, 4)[0] = 1.0),
-        Some(Invalid::Boundary { row: 3 })
-    );
+    assert_eq!(payload_refusal(|unroll| unroll.row_mut(Field::First, 2)[0] = 0.0), Some(Invalid::Boundary { row: 1 }));
+    assert_eq!(payload_refusal(|unroll| unroll.row_mut(Field::First, 4)[0] = 1.0), Some(Invalid::Boundary { row: 3 }));
 }
 
 #[test]

@@ -27,9 +27,15 @@ pub struct Books {
 impl Books {
     /// Whether `produced = trained + dropped + in flight`.
     pub fn balance(&self) -> bool {
-        [self.dropped.stale, self.dropped.invalid, self.dropped.superseded, self.dropped.lost_at_restart, self.in_flight]
-            .iter()
-            .try_fold(self.trained, |sum, part| sum.checked_add(*part))
+        [
+            self.dropped.stale,
+            self.dropped.invalid,
+            self.dropped.superseded,
+            self.dropped.lost_at_restart,
+            self.in_flight,
+        ]
+        .iter()
+        .try_fold(self.trained, |sum, part| sum.checked_add(*part))
             == Some(self.produced)
     }
 }
@@ -91,7 +97,9 @@ pub struct Joined {
 #[non_exhaustive]
 pub enum JoinError {
     /// Its account was closed to make room for others.
-    #[error("the account of actor {actor}, incarnation {incarnation:016x}, was closed after a long silence: start the actor again")]
+    #[error(
+        "the account of actor {actor}, incarnation {incarnation:016x}, was closed after a long silence: start the actor again"
+    )]
     Closed {
         /// The index it had.
         actor: u64,

@@ -6,8 +6,8 @@ mod common;
 
 use std::time::Duration;
 
-use common::{Actor, CONFIG, PHASE, SLOTS, batch_now, batcher, now, payload};
 use comic_replay::{Next, Outcome, Phase};
+use common::{Actor, CONFIG, PHASE, SLOTS, batch_now, batcher, now, payload};
 
 #[test]
 fn nothing_more_is_taken_than_an_open_and_a_full_batch() {

@@ -4,9 +4,9 @@
 
 mod common;
 
-use common::{Actor, CONFIG, SLOTS, batch_now, batcher, layout, mark, payload};
 use comic_proto::{Field, Invalid};
 use comic_replay::{Batch, Outcome};
+use common::{Actor, CONFIG, SLOTS, batch_now, batcher, layout, mark, payload};
 
 fn assert_holds(batch: &Batch, expected: &[comic_proto::v1::UnrollHeader]) {
     assert_eq!(batch.unrolls, expected.len());

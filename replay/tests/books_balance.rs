@@ -7,8 +7,8 @@ mod common;
 
 use std::collections::{HashMap, HashSet};
 
-use common::{Actor, CONFIG, PHASE, batch_now, insert_now, layout};
 use comic_replay::{Batch, Batcher, Ledger, Outcome, Phase, Reason, Snapshot};
+use common::{Actor, CONFIG, PHASE, batch_now, insert_now, layout};
 use proptest::prelude::*;
 
 const ACTORS: u64 = 3;

@@ -4,9 +4,9 @@
 
 mod common;
 
-use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, payload};
 use comic_proto::MAX_SEQUENCE;
 use comic_replay::{Dropped, Outcome, Phase, Reason};
+use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, payload};
 
 #[test]
 fn an_unroll_sent_twice_is_taken_once() {

@@ -4,8 +4,8 @@
 
 mod common;
 
-use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, layout};
 use comic_replay::{Batcher, Books, Dropped, Error, Ledger, Outcome, Phase, Snapshot};
+use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, layout};
 
 /// The next life of the learner, from what a checkpoint file would hold.
 fn restarted(snapshot: &Snapshot) -> Batcher {

@@ -48,7 +48,8 @@ pub(super) fn threads(subject: &Subject) -> Result<Figure, Error> {
         })?;
         Ok::<_, Error>((both, unroll_rate(&mut one)?))
     })?;
-    let note = "two threads of 16 environments with the paper's networks; floor: one such thread, so the aim is a ratio of 2";
+    let note =
+        "two threads of 16 environments with the paper's networks; floor: one such thread, so the aim is a ratio of 2";
     Ok(Figure::new("actor.threads", "steps/s", medians, note))
 }
 
@@ -56,11 +57,7 @@ fn environments(subject: &Subject, family: u64) -> Vec<TrackingEnvironment> {
     (0..ENVIRONMENTS as u64).map(|index| subject.task.environment(derive(family, index))).collect()
 }
 
-fn worker<E: Environment>(
-    subject: &Subject,
-    environments: Vec<E>,
-    seed: u64,
-) -> Result<Worker<E, TorchPolicy>, Error> {
+fn worker<E: Environment>(subject: &Subject, environments: Vec<E>, seed: u64) -> Result<Worker<E, TorchPolicy>, Error> {
     let (spec, experiment) = (subject.task.spec(), &subject.experiment);
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, experiment)));
     let policy = TorchPolicy::untrained(spec, experiment, seed, || Ok([0.0; 56]))?;

@@ -15,8 +15,8 @@ use tokio::sync::{mpsc, watch};
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::figure::{Figure, Medians, interleave};
 use super::Subject;
+use super::figure::{Figure, Medians, interleave};
 use crate::Error;
 use crate::mailbox::Mailbox;
 use crate::session::{self, Limits};
@@ -160,7 +160,13 @@ async fn take(batcher: &Batcher, message: UnrollMessage) -> Result<UnrollAck, St
         Outcome::Taken => Verdict::Taken,
         _ => Verdict::Invalid,
     };
-    Ok(UnrollAck { sequence: header.sequence, verdict: verdict.into(), learner_epoch: 1, version: 1, ..UnrollAck::default() })
+    Ok(UnrollAck {
+        sequence: header.sequence,
+        verdict: verdict.into(),
+        learner_epoch: 1,
+        version: 1,
+        ..UnrollAck::default()
+    })
 }
 
 #[tonic::async_trait]

@@ -112,8 +112,13 @@ impl<E: Startable> Lane<E> {
         self.environment.observe(row.proprioception, row.task);
         row.previous_latent.fill(0.0);
         let steps_left = self.environment.episode().steps_left;
-        self.episode =
-            Some(Finished { clip: start.clip, steps_left, steps: 0, returns: [0.0; MAX_REWARD_TERMS], diverged: false });
+        self.episode = Some(Finished {
+            clip: start.clip,
+            steps_left,
+            steps: 0,
+            returns: [0.0; MAX_REWARD_TERMS],
+            diverged: false,
+        });
         Ok(())
     }
 

@@ -70,7 +70,13 @@ impl Connector {
             .keep_alive_while_idle(true)
             .initial_stream_window_size(1 << 20)
             .initial_connection_window_size(4 << 20);
-        Ok(Self { address: address.to_string(), endpoint, incarnation: rand::random(), actor: None, learner_epoch: None })
+        Ok(Self {
+            address: address.to_string(),
+            endpoint,
+            incarnation: rand::random(),
+            actor: None,
+            learner_epoch: None,
+        })
     }
 
     pub(super) fn address(&self) -> &str {
@@ -82,8 +88,7 @@ impl Connector {
     }
 
     pub(super) async fn connect(&mut self) -> Result<Link, Failure> {
-        let channel =
-            self.endpoint.connect().await.map_err(|error| Failure::Lost(with_sources(&error)))?;
+        let channel = self.endpoint.connect().await.map_err(|error| Failure::Lost(with_sources(&error)))?;
         let mut client = LearnerClient::new(channel).max_decoding_message_size(MESSAGE_LIMIT);
         let mut request =
             Request::new(JoinRequest { incarnation: self.incarnation, actor: self.actor, protocol: PROTOCOL_VERSION });

@@ -62,7 +62,10 @@ async fn connections_dropped_in_mid_stream_lose_nothing_repeat_nothing_and_keep_
     // 2 + 0 + 0 + 0 + 2 were taken without an acknowledgement, and came again.
     assert_eq!((settled.taken, settled.duplicate), (36, 4));
     assert_eq!(seen.joins.len(), 6);
-    assert!(seen.joins.iter().all(|join| join.incarnation == seen.joins[0].incarnation), "one process, one incarnation");
+    assert!(
+        seen.joins.iter().all(|join| join.incarnation == seen.joins[0].incarnation),
+        "one process, one incarnation"
+    );
     assert_eq!(seen.joins[0].actor, None);
     assert!(seen.joins[1..].iter().all(|join| join.actor == Some(learner::ACTOR)));
 }
@@ -218,7 +221,8 @@ mod assets {
     async fn that_are_not_what_was_announced_are_refused() {
         for sent in [b"clipz".as_slice(), b"longer than announced"] {
             let asset = Some(b"clips".to_vec());
-            let learner = FakeLearner::start(Script { asset, asset_sent: Some(sent.to_vec()), ..Script::default() }).await;
+            let learner =
+                FakeLearner::start(Script { asset, asset_sent: Some(sent.to_vec()), ..Script::default() }).await;
             let cache = tempfile::tempdir().unwrap();
             let error = fetch(&learner, cache.path()).await.unwrap_err();
             assert!(matches!(error, Error::Asset { .. }), "{error}");

@@ -311,7 +311,12 @@ fn a_closed_mailbox_ends_the_worker_and_a_full_channel_holds_it() {
     let layout = layout(4);
     let worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), layout, 0.1, 3);
     let mailbox = Mailbox::default();
-    mailbox.publish(Directive { learner_epoch: 1, version: 1, conduct: Conduct::Policy, parameters: Bytes::from_static(b"1") });
+    mailbox.publish(Directive {
+        learner_epoch: 1,
+        version: 1,
+        conduct: Conduct::Policy,
+        parameters: Bytes::from_static(b"1"),
+    });
     let progress = Progress::default();
     let (sender, mut receiver) = mpsc::channel(1);
     std::thread::scope(|scope| {

@@ -82,7 +82,12 @@ async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAc
         Outcome::Superseded => ack(shared, sequence, Verdict::Superseded, superseded(&header, shared)),
         Outcome::Stale => {
             let newest = shared.batcher.phase().version;
-            ack(shared, sequence, Verdict::Stale, format!("version {} is too old, the newest is {newest}", header.version))
+            ack(
+                shared,
+                sequence,
+                Verdict::Stale,
+                format!("version {} is too old, the newest is {newest}", header.version),
+            )
         }
         Outcome::Invalid => {
             let reason = invalid.map_or_else(|| "its numbers fit no account".into(), |invalid| invalid.to_string());
