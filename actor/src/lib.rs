@@ -8,7 +8,7 @@
 //!   each is acknowledged, and comes back by itself after every loss.
 //! - [`run`] puts these together into an actor process.
 //! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads what the learner wrote.
-//! - [`bench`] holds the figures of `comic-actor bench`.
+//! - [`mod@bench`] holds the figures of `comic-actor bench`.
 //!
 //! Nothing here knows a loss, and nothing here is unbounded: finished unrolls wait in a bounded channel, unrolls that
 //! are not acknowledged in a bounded window, and behind a full window the environments stand still.

@@ -15,7 +15,10 @@ use serde_json::{Map, Value, json};
 struct Window {
     episodes: u64,
     steps: u64,
-    possible_steps: u64,
+    /// Sum over episodes of return / (the most it could have paid).
+    normalised: f64,
+    /// Sum over episodes of the share of the clip that was survived.
+    survived: f64,
     diverged: u64,
     returns: Vec<f64>,
     environment_steps: u64,
@@ -82,9 +85,12 @@ impl Metrics {
             window.unrolls += 1;
             window.age += version.saturating_sub(header.version);
             for episode in &header.episodes {
+                let possible = f64::from(episode.steps_left_at_start.max(1));
+                let total: f64 = episode.returns.iter().map(|term| f64::from(*term)).sum();
+                window.normalised += total / (TRACKING_MAX_REWARD * possible);
+                window.survived += f64::from(episode.steps) / possible;
                 window.episodes += 1;
                 window.steps += u64::from(episode.steps);
-                window.possible_steps += u64::from(episode.steps_left_at_start);
                 window.diverged += u64::from(episode.end == EpisodeEnd::Diverged as i32);
                 for (sum, value) in window.returns.iter_mut().zip(&episode.returns) {
                     *sum += f64::from(*value);
@@ -120,8 +126,8 @@ impl Metrics {
             "episode_length": per(window.steps as f64, window.episodes),
             "episode_return": per(total, window.episodes),
             "reward_per_step": per(total, window.steps),
-            "normalised_reward": per(total / TRACKING_MAX_REWARD, window.possible_steps),
-            "fraction_survived": per(window.steps as f64, window.possible_steps),
+            "normalised_reward": per(window.normalised, window.episodes),
+            "fraction_survived": per(window.survived, window.episodes),
             "reward_terms": terms,
             "losses": losses,
             "books": books,

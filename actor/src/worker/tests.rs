@@ -330,7 +330,8 @@ fn a_closed_mailbox_ends_the_worker_and_a_full_channel_holds_it() {
         // At most one unroll waits in the channel and one in the worker's hand: it cannot have run ahead further.
         assert!(progress.steps.load(Ordering::Relaxed) <= 4 * 5);
         mailbox.close();
-        receiver.close();
+        // What waits in the channel is given up, and its tickets with it.
+        drop(receiver);
         running.join().unwrap().unwrap();
     });
 }
