@@ -6,7 +6,7 @@
 //! - [`trainer`] is the OS thread that owns the device: batches in, gradient steps, parameters out. [`warm_start`] is what
 //!   it does before.
 //! - [`vmpo`] is the algorithm: losses, and the gradient step. [`adam`] is its optimiser.
-//! - [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
+//! - `state` turns the trainer into a snapshot and back. [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
 //! - [`metrics`] is what a person sees.
 //!
 //! There is no MuJoCo here: whatever needs a simulator is done by actors.
@@ -19,6 +19,7 @@ pub mod options;
 pub mod publish;
 pub mod run;
 pub mod service;
+mod state;
 pub mod statistics;
 pub mod tensors;
 pub mod trainer;

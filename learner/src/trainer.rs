@@ -65,10 +65,10 @@ pub enum Ending {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Progress {
-    updates: u64,
-    environment_steps: u64,
-    seconds: f64,
-    version: u64,
+    pub(crate) updates: u64,
+    pub(crate) environment_steps: u64,
+    pub(crate) seconds: f64,
+    pub(crate) version: u64,
     pub(crate) warm_started: bool,
     /// Decides the minibatches.
     pub(crate) random: Pcg64,
@@ -78,13 +78,13 @@ pub(crate) struct Progress {
 #[derive(Debug)]
 pub struct Trainer {
     pub(crate) experiment: Experiment,
-    spec: TaskSpec,
+    pub(crate) spec: TaskSpec,
     epoch: u64,
     pub(crate) learner: VmpoLearner,
     /// Of the observations, for the normaliser: proprioception and task.
-    statistics: [Statistics; 2],
+    pub(crate) statistics: [Statistics; 2],
     /// The parameters actors act with, as published.
-    target: Bytes,
+    pub(crate) target: Bytes,
     pub(crate) progress: Progress,
     /// Since when this life counts time, and what had been counted then.
     clock: Option<(Instant, f64)>,
@@ -94,7 +94,7 @@ pub struct Trainer {
     shared: Arc<Shared>,
     pub(crate) metrics: Metrics,
     pub(crate) writer: Writer,
-    checkpointed: Instant,
+    pub(crate) checkpointed: Instant,
 }
 
 impl Trainer {
@@ -211,9 +211,7 @@ pub(crate) enum Wait {
 impl Trainer {
     pub(crate) fn next_batch(&mut self) -> Result<Wait> {
         let next = self.batcher.next_batch_within(PATIENCE);
-        if self.metrics.elapsed() >= self.experiment.learner.metrics_seconds {
-            self.write_metrics()?;
-        }
+        self.write_metrics_when_due()?;
         Ok(match next {
             Next::Batch(batch) => {
                 let seconds = self.progress.seconds;
@@ -325,7 +323,7 @@ impl Trainer {
         Ok(())
     }
 
-    fn seconds(&self) -> f64 {
+    pub(crate) fn seconds(&self) -> f64 {
         self.clock.map_or(self.progress.seconds, |(start, before)| before + start.elapsed().as_secs_f64())
     }
 
@@ -354,13 +352,15 @@ impl Trainer {
     }
 
     pub(crate) fn after_update(&mut self) -> Result<()> {
-        if self.metrics.elapsed() >= self.experiment.learner.metrics_seconds {
-            self.write_metrics()?;
-        }
+        self.write_metrics_when_due()?;
         if self.checkpointed.elapsed().as_secs_f64() >= self.experiment.learner.checkpoint_seconds {
             self.checkpoint(false)?;
         }
         Ok(())
+    }
+
+    pub(crate) fn write_metrics_when_due(&mut self) -> Result<()> {
+        if self.metrics.elapsed() >= self.experiment.learner.metrics_seconds { self.write_metrics() } else { Ok(()) }
     }
 
     fn write_metrics(&mut self) -> Result<()> {
@@ -377,52 +377,4 @@ impl Trainer {
         self.shared.set_metrics(line);
         Ok(())
     }
-
-    /// Hands a snapshot to the writer; while it is still busy with the last one, only a `final_one` waits.
-    fn checkpoint(&mut self, final_one: bool) -> Result<()> {
-        if !final_one && self.writer.is_busy() {
-            return Ok(());
-        }
-        self.writer.write(Name::Updates(self.progress.updates), self.snapshot()?)?;
-        self.checkpointed = Instant::now();
-        Ok(())
-    }
-
-    pub(crate) fn snapshot(&self) -> Result<Snapshot> {
-        let mut tensors = self.learner.state();
-        for (statistics, name) in self.statistics.iter().zip(STATISTICS) {
-            tensors.extend(statistics.state(name));
-        }
-        let progress = Progress { seconds: self.seconds(), ..self.progress.clone() };
-        let mut snapshot = Snapshot::default();
-        for (name, bytes) in [
-            ("experiment.toml", self.experiment.to_toml()?.into_bytes()),
-            ("task.json", serde_json::to_vec_pretty(&self.spec)?),
-            ("policy.safetensors", to_safetensors(self.learner.policy_store())?),
-            ("target.safetensors", self.target.to_vec()),
-            ("learner.safetensors", crate::tensors::to_bytes(&tensors)?),
-            ("progress.json", serde_json::to_vec_pretty(&progress)?),
-            ("books.json", serde_json::to_vec_pretty(&self.batcher.snapshot())?),
-        ] {
-            snapshot.parts.insert(name.to_string(), bytes);
-        }
-        Ok(snapshot)
-    }
-
-    fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let mut tensors = crate::tensors::from_bytes(snapshot.part("learner.safetensors")?)?;
-        for (statistics, name) in self.statistics.iter_mut().zip(STATISTICS) {
-            let find = |wanted: &str| tensors.iter().find(|(name, _)| name == wanted).map(|(_, tensor)| tensor.copy());
-            statistics.restore(name, find).with_context(|| format!("the checkpoint's {name} do not fit the task"))?;
-        }
-        tensors.retain(|(name, _)| !STATISTICS.iter().any(|prefix| name.starts_with(prefix)));
-        self.learner.load_state(&tensors).context("the checkpoint does not fit the experiment's networks")?;
-        self.target = Bytes::copy_from_slice(snapshot.part("target.safetensors")?);
-        self.progress =
-            serde_json::from_slice(snapshot.part("progress.json")?).context("the checkpoint's progress is damaged")?;
-        Ok(())
-    }
 }
-
-/// The statistics' names in a checkpoint.
-const STATISTICS: [&str; 2] = ["statistics.proprioception", "statistics.task"];

@@ -30,6 +30,10 @@ impl Trainer {
                 self.report(&losses)?;
                 tracing::info!(step, regression = losses.regression_loss, latent_kl = losses.latent_kl, "regressing");
             }
+            self.write_metrics_when_due()?;
+            if self.batcher.is_closed() {
+                return Ok(None);
+            }
         }
         self.learner.reset_optimiser();
         self.progress.warm_started = true;

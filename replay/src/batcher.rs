@@ -252,6 +252,11 @@ impl Batcher {
         self.inner.filled.notify_all();
     }
 
+    /// Whether all waiting has ended.
+    pub fn is_closed(&self) -> bool {
+        self.lock().closed
+    }
+
     /// Takes a buffer back from a [`Batch`] whose unrolls were trained on, or dropped for a reason.
     pub(crate) fn take_back(&self, mut buffer: Buffer, end: Option<Reason>) {
         let mut state = self.lock();

@@ -1,0 +1,60 @@
+//! The trainer's whole state as a snapshot, and back: everything that changes the future.
+
+use std::time::Instant;
+
+use anyhow::{Context as _, Result};
+use bytes::Bytes;
+use comic_networks::to_safetensors;
+
+use crate::checkpoint::{Name, Snapshot};
+use crate::trainer::{Progress, Trainer};
+
+/// The statistics' names in a checkpoint.
+const STATISTICS: [&str; 2] = ["statistics.proprioception", "statistics.task"];
+
+impl Trainer {
+    /// Hands a snapshot to the writer; while it is still busy with the last one, only a `final_one` waits.
+    pub(crate) fn checkpoint(&mut self, final_one: bool) -> Result<()> {
+        if !final_one && self.writer.is_busy() {
+            return Ok(());
+        }
+        self.writer.write(Name::Updates(self.progress.updates), self.snapshot()?)?;
+        self.checkpointed = Instant::now();
+        Ok(())
+    }
+
+    pub(crate) fn snapshot(&self) -> Result<Snapshot> {
+        let mut tensors = self.learner.state();
+        for (statistics, name) in self.statistics.iter().zip(STATISTICS) {
+            tensors.extend(statistics.state(name));
+        }
+        let progress = Progress { seconds: self.seconds(), ..self.progress.clone() };
+        let mut snapshot = Snapshot::default();
+        for (name, bytes) in [
+            ("experiment.toml", self.experiment.to_toml()?.into_bytes()),
+            ("task.json", serde_json::to_vec_pretty(&self.spec)?),
+            ("policy.safetensors", to_safetensors(self.learner.policy_store())?),
+            ("target.safetensors", self.target.to_vec()),
+            ("learner.safetensors", crate::tensors::to_bytes(&tensors)?),
+            ("progress.json", serde_json::to_vec_pretty(&progress)?),
+            ("books.json", serde_json::to_vec_pretty(&self.batcher.snapshot())?),
+        ] {
+            snapshot.parts.insert(name.to_string(), bytes);
+        }
+        Ok(snapshot)
+    }
+
+    pub(crate) fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let mut tensors = crate::tensors::from_bytes(snapshot.part("learner.safetensors")?)?;
+        for (statistics, name) in self.statistics.iter_mut().zip(STATISTICS) {
+            let find = |wanted: &str| tensors.iter().find(|(name, _)| name == wanted).map(|(_, tensor)| tensor.copy());
+            statistics.restore(name, find).with_context(|| format!("the checkpoint's {name} do not fit the task"))?;
+        }
+        tensors.retain(|(name, _)| !STATISTICS.iter().any(|prefix| name.starts_with(prefix)));
+        self.learner.load_state(&tensors).context("the checkpoint does not fit the experiment's networks")?;
+        self.target = Bytes::copy_from_slice(snapshot.part("target.safetensors")?);
+        self.progress =
+            serde_json::from_slice(snapshot.part("progress.json")?).context("the checkpoint's progress is damaged")?;
+        Ok(())
+    }
+}
