@@ -50,7 +50,10 @@ pub fn run(threads: usize, repeats: usize) -> Result<()> {
     let (mut updates, mut floors) = (Vec::new(), Vec::new());
     for repeat in 0..repeats + 2 {
         let update = milliseconds(|| learner.step(&minibatch).map(|losses| losses.to_metrics()))?;
-        let floor = milliseconds(|| Ok::<(), crate::vmpo::Error>(products.iter().for_each(Product::run)))?;
+        let floor = milliseconds(|| -> Result<(), crate::vmpo::Error> {
+            products.iter().for_each(Product::run);
+            Ok(())
+        })?;
         // The first two warm up.
         if repeat >= 2 {
             updates.push(update);
