@@ -14,6 +14,7 @@ use crate::Error;
 
 const MANIFEST: &str = "MANIFEST.json";
 const EXPERIMENT: &str = "experiment.toml";
+const PROGRESS: &str = "progress.json";
 const POLICY: &str = "policy.safetensors";
 
 /// What acting needs of a checkpoint.
@@ -25,6 +26,17 @@ pub struct Checkpoint {
     pub experiment: Experiment,
     /// Parameters of the online policy (safetensors).
     pub policy: Vec<u8>,
+    /// Where the run stood.
+    pub position: Position,
+}
+
+/// The life of the learner that wrote a checkpoint, and the newest version it had published.
+#[derive(Clone, Copy, Debug, Default, serde::Deserialize)]
+pub struct Position {
+    /// Which life.
+    pub epoch: u64,
+    /// Which version.
+    pub version: u64,
 }
 
 /// Reads the newest complete checkpoint that `path` names: a run directory (which holds `checkpoints/`), a directory of
@@ -52,7 +64,9 @@ fn numbered(directory: &Path) -> Result<Vec<PathBuf>, Error> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(directory).map_err(|error| refuse(directory, error))? {
         let entry = entry.map_err(|error| refuse(directory, error))?;
-        if entry.file_name().to_string_lossy().starts_with("checkpoint-") && entry.path().is_dir() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let digits = name.strip_prefix("checkpoint-").unwrap_or_default();
+        if digits.len() == 10 && digits.bytes().all(|byte| byte.is_ascii_digit()) && entry.path().is_dir() {
             found.push(entry.path());
         }
     }
@@ -67,7 +81,9 @@ fn read_one(path: &Path) -> Result<Checkpoint, Error> {
     let experiment = String::from_utf8(part(path, &manifest, EXPERIMENT)?)
         .map_err(|error| refuse(path, format!("{EXPERIMENT}: {error}")))?;
     let experiment = Experiment::from_toml(&path.join(EXPERIMENT).display().to_string(), &experiment)?;
-    Ok(Checkpoint { path: path.to_path_buf(), experiment, policy: part(path, &manifest, POLICY)? })
+    let position = serde_json::from_slice(&part(path, &manifest, PROGRESS)?)
+        .map_err(|error| refuse(path, format!("{PROGRESS}: {error}")))?;
+    Ok(Checkpoint { path: path.to_path_buf(), experiment, policy: part(path, &manifest, POLICY)?, position })
 }
 
 fn part(path: &Path, manifest: &BTreeMap<String, String>, name: &str) -> Result<Vec<u8>, Error> {
@@ -92,7 +108,9 @@ mod tests {
     fn write(path: &Path, policy: &[u8]) {
         std::fs::create_dir_all(path).unwrap();
         let mut manifest = BTreeMap::new();
-        for (name, bytes) in [(EXPERIMENT, Experiment::default().to_toml().unwrap().as_bytes()), (POLICY, policy)] {
+        let experiment = Experiment::default().to_toml().unwrap();
+        let progress = br#"{"epoch": 2, "version": 30, "updates": 29}"#;
+        for (name, bytes) in [(EXPERIMENT, experiment.as_bytes()), (PROGRESS, progress), (POLICY, policy)] {
             std::fs::write(path.join(name), bytes).unwrap();
             let hash: String = Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect();
             manifest.insert(name, hash);

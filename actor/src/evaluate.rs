@@ -7,6 +7,7 @@
 //! [`TRACKING_MAX_REWARD`]: comic_experiment::TRACKING_MAX_REWARD
 
 pub mod command;
+mod delivery;
 mod report;
 mod rollout;
 mod table;

@@ -94,10 +94,12 @@ fn stop_on_signal(runtime: &Runtime, closing: Closing) -> Result<(), Error> {
     let _context = runtime.enter();
     let mut terminate = signal(SignalKind::terminate()).map_err(Error::Thread)?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Error::Thread)?;
+    let mut hangup = signal(SignalKind::hangup()).map_err(Error::Thread)?;
     runtime.spawn(async move {
         tokio::select! {
             _ = terminate.recv() => {}
             _ = interrupt.recv() => {}
+            _ = hangup.recv() => {}
         }
         tracing::info!("told to stop: delivering what is finished");
         drop(closing);

@@ -88,11 +88,23 @@ struct Terms {
 impl Terms {
     fn of(reply: &JoinReply) -> Self {
         Self {
-            experiment: reply.experiment.clone(),
+            experiment: lasting(&reply.experiment),
             task_spec: reply.task_spec.clone(),
             layout_hash: reply.layout_hash.clone(),
         }
     }
+}
+
+/// What of an experiment may not change under a running actor: how long, how often and with how many threads may.
+fn lasting(document: &str) -> String {
+    let Ok(mut experiment) = Experiment::from_toml("the learner's experiment", document) else {
+        return document.to_string();
+    };
+    let default = Experiment::default();
+    experiment.budget = default.budget;
+    experiment.learner = default.learner;
+    experiment.actor = default.actor;
+    experiment.to_toml().unwrap_or_else(|_| document.to_string())
 }
 
 /// Joins the learner, waiting for it as long as it takes, and fetches the assets this machine lacks.

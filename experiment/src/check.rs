@@ -15,6 +15,9 @@ pub(crate) struct Fault {
 }
 
 const AT_LEAST_ONE: &str = "must be at least 1";
+/// Below it a squared ratio of float32 numbers overflows; the wire refuses it too.
+const SMALLEST_STD: f64 = 1e-6;
+const AT_LEAST_STD: &str = "must be at least 1e-6";
 const POSITIVE: &str = "must be positive";
 const NOT_NEGATIVE: &str = "must be 0 or more";
 
@@ -92,7 +95,7 @@ fn network(network: &Network) -> Result<(), Fault> {
     }
     let Network { clip_embedding, initial_std, min_std, policy_head_scale, latent, .. } = network;
     ensure("network.clip_embedding", clip_embedding, (1..=4096).contains(clip_embedding), "must be 1 to 4096")?;
-    ensure("network.min_std", min_std, positive(*min_std), POSITIVE)?;
+    ensure("network.min_std", min_std, positive(*min_std) && *min_std >= SMALLEST_STD, AT_LEAST_STD)?;
     let holds = positive(*initial_std) && initial_std > min_std;
     ensure("network.initial_std", initial_std, holds, "must exceed network.min_std")?;
     ensure("network.policy_head_scale", policy_head_scale, not_negative(*policy_head_scale), NOT_NEGATIVE)?;
@@ -151,7 +154,10 @@ fn optimiser(optimiser: &Optimiser) -> Result<(), Fault> {
 
 fn unroll(unroll: &Unroll) -> Result<(), Fault> {
     ensure("unroll.length", unroll.length, (1..=4096).contains(&unroll.length), "must be 1 to 4096")?;
-    ensure("unroll.batch", unroll.batch, (1..=65536).contains(&unroll.batch), "must be 1 to 65536")
+    ensure("unroll.batch", unroll.batch, (1..=65536).contains(&unroll.batch), "must be 1 to 65536")?;
+    let rows = unroll.batch * unroll.length;
+    ensure("unroll.batch", unroll.batch, rows <= 1 << 20, "times unroll.length must be at most 1048576 rows")?;
+    ensure("unroll.ahead", unroll.ahead, unroll.ahead <= 1, "must be 0 or 1")
 }
 
 fn actor(actor: &Actor) -> Result<(), Fault> {
@@ -163,7 +169,7 @@ fn warm_start(warm_start: &WarmStart) -> Result<(), Fault> {
     let WarmStart { steps, demonstration_steps, noise, minibatch_unrolls, learning_rate, .. } = warm_start;
     let holds = *steps == 0 || *demonstration_steps > 0;
     ensure("warm_start.demonstration_steps", demonstration_steps, holds, AT_LEAST_ONE)?;
-    ensure("warm_start.noise", noise, positive(*noise), POSITIVE)?;
+    ensure("warm_start.noise", noise, positive(*noise) && *noise >= SMALLEST_STD, AT_LEAST_STD)?;
     ensure("warm_start.minibatch_unrolls", minibatch_unrolls, *minibatch_unrolls > 0, AT_LEAST_ONE)?;
     ensure("warm_start.learning_rate", learning_rate, positive(*learning_rate), POSITIVE)
 }

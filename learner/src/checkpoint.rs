@@ -80,6 +80,19 @@ impl Store {
         Ok(Self { directory, kept: kept.max(1) })
     }
 
+    /// Keeps every other learner off this run for as long as the guard lives.
+    ///
+    /// # Errors
+    /// When another learner has it.
+    pub fn lock(&self) -> Result<File> {
+        let path = self.directory.join("lock");
+        let file = File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
+        file.try_lock().with_context(|| {
+            format!("another learner uses {}: stop it, or give another --run", self.directory.display())
+        })?;
+        Ok(file)
+    }
+
     /// Begins a new life of the learner: an epoch larger than every earlier one, on disk before it is returned.
     ///
     /// # Errors
@@ -116,24 +129,43 @@ impl Store {
         }
         write_synced(&temporary.join(MANIFEST), &serde_json::to_vec_pretty(&manifest)?)?;
         sync_directory(&temporary)?;
-        remove_if_there(&path)?;
+        // One of the same name steps aside first: at no moment is neither of them there.
+        let former = self.directory.join(format!(".former-{name}"));
+        remove_if_there(&former)?;
+        if path.exists() {
+            self.put(&path, &former)?;
+        }
         self.put(&temporary, &path)?;
-        self.forget_oldest()?;
+        remove_if_there(&former)?;
+        self.forget_oldest(&path)?;
         Ok(path)
     }
 
-    /// The newest checkpoint whose every part verifies; damaged ones are skipped with a warning.
+    /// The newest checkpoint whose every part verifies. Damaged ones are put aside as `damaged-…`, with a warning.
     ///
     /// # Errors
-    /// When the directory cannot be listed.
+    /// When the directory cannot be listed, or when there are checkpoints and none of them verifies: beginning anew
+    /// beside them would be a loss nobody asked for.
     pub fn newest(&self) -> Result<Option<(PathBuf, Snapshot)>> {
-        for path in self.numbered()?.into_iter().rev() {
-            match read(&path) {
-                Ok(snapshot) => return Ok(Some((path, snapshot))),
-                Err(error) => tracing::warn!(checkpoint = %path.display(), "skipped a damaged checkpoint: {error:#}"),
+        let numbered = self.numbered()?;
+        for path in numbered.iter().rev() {
+            match read(path) {
+                Ok(snapshot) => return Ok(Some((path.clone(), snapshot))),
+                Err(error) => self.put_aside(path, &error)?,
             }
         }
+        if !numbered.is_empty() {
+            bail!("every checkpoint in {} is damaged: mend one, or give another --run", self.directory.display());
+        }
         Ok(None)
+    }
+
+    fn put_aside(&self, path: &Path, error: &anyhow::Error) -> Result<()> {
+        tracing::warn!(checkpoint = %path.display(), "a damaged checkpoint is put aside: {error:#}");
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let aside = self.directory.join(format!("damaged-{name}"));
+        remove_if_there(&aside)?;
+        self.put(path, &aside)
     }
 
     /// Whether a checkpoint of this name is there.
@@ -148,7 +180,9 @@ impl Store {
             fs::read_dir(&self.directory).with_context(|| format!("cannot list {}", self.directory.display()))?
         {
             let path = entry?.path();
-            if path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("checkpoint-")) {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            let digits = name.strip_prefix("checkpoint-").unwrap_or_default();
+            if digits.len() == 10 && digits.bytes().all(|byte| byte.is_ascii_digit()) && path.is_dir() {
                 found.push(path);
             }
         }
@@ -156,12 +190,11 @@ impl Store {
         Ok(found)
     }
 
-    fn forget_oldest(&self) -> Result<()> {
+    /// Keeps the newest few, and in any case the one just written.
+    fn forget_oldest(&self, written: &Path) -> Result<()> {
         let numbered = self.numbered()?;
-        for path in &numbered[..numbered.len().saturating_sub(self.kept)] {
-            remove_if_there(path)?;
-        }
-        Ok(())
+        let oldest = &numbered[..numbered.len().saturating_sub(self.kept)];
+        oldest.iter().filter(|path| *path != written).try_for_each(|path| remove_if_there(path))
     }
 
     #[allow(clippy::disallowed_methods, reason = "the one durable rename: contents synced before, directory after")]

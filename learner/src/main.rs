@@ -27,8 +27,11 @@ fn main() -> ExitCode {
         Err(error) => {
             eprintln!("comic-learner: {error:#}");
             // A configuration that is wrong stays wrong: 2 tells whoever restarts processes not to try again.
-            let configuration =
-                error.chain().any(|cause| cause.is::<comic_experiment::Error>() || cause.is::<comic_clips::Error>());
+            let configuration = error.chain().any(|cause| {
+                cause.is::<comic_experiment::Error>()
+                    || cause.is::<comic_clips::Error>()
+                    || cause.is::<comic_learner::run::Misuse>()
+            });
             ExitCode::from(if configuration { 2 } else { 1 })
         }
     }

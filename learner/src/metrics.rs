@@ -2,13 +2,15 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 use comic_experiment::{TRACKING_MAX_REWARD, TaskSpec};
 use comic_proto::v1::{EpisodeEnd, UnrollHeader};
 use serde_json::{Map, Value, json};
+
+use crate::service::Evaluation;
 
 /// Sums since the last line.
 #[derive(Debug, Default)]
@@ -31,6 +33,7 @@ struct Window {
 #[derive(Debug)]
 pub struct Metrics {
     terms: Vec<String>,
+    run: PathBuf,
     file: File,
     window: Window,
     since: Instant,
@@ -58,17 +61,31 @@ impl Metrics {
     /// When the file cannot be opened.
     pub fn open(run: &Path, spec: &TaskSpec) -> Result<Self> {
         let path = run.join("metrics.jsonl");
-        let file = OpenOptions::new()
-            .create(true)
-            .append(true)
-            .open(&path)
-            .with_context(|| format!("cannot write {}", path.display()))?;
-        Ok(Self { terms: spec.reward_terms.clone(), file, window: Window::default(), since: Instant::now() })
+        let file = append(&path)?;
+        Ok(Self {
+            terms: spec.reward_terms.clone(),
+            run: run.to_path_buf(),
+            file,
+            window: Window::default(),
+            since: Instant::now(),
+        })
     }
 
     /// Seconds since the last line.
     pub fn elapsed(&self) -> f64 {
         self.since.elapsed().as_secs_f64()
+    }
+
+    /// Appends an actor's evaluation to `RUN/evaluations.jsonl`.
+    ///
+    /// # Errors
+    /// When the file refuses.
+    pub fn keep_evaluation(&self, evaluation: &Evaluation) -> Result<()> {
+        let path = self.run.join("evaluations.jsonl");
+        let report: Value = serde_json::from_str(&evaluation.json).unwrap_or(Value::Null);
+        let line = json!({ "learner_epoch": evaluation.epoch, "version": evaluation.version, "evaluation": report });
+        let mut file = append(&path)?;
+        writeln!(file, "{line}").with_context(|| format!("cannot write {}", path.display()))
     }
 
     /// Counts environment steps that a batch held.
@@ -125,7 +142,7 @@ impl Metrics {
             "diverged": window.diverged,
             "episode_length": per(window.steps as f64, window.episodes),
             "episode_return": per(total, window.episodes),
-            "reward_per_step": per(total, window.steps),
+            "reward_per_step": per(total / TRACKING_MAX_REWARD, window.steps),
             "normalised_reward": per(window.normalised, window.episodes),
             "fraction_survived": per(window.survived, window.episodes),
             "reward_terms": terms,
@@ -136,4 +153,9 @@ impl Metrics {
         writeln!(self.file, "{line}").context("cannot write metrics.jsonl")?;
         Ok(line)
     }
+}
+
+fn append(path: &Path) -> Result<File> {
+    let file = OpenOptions::new().create(true).append(true).open(path);
+    file.with_context(|| format!("cannot write {}", path.display()))
 }

@@ -1,11 +1,13 @@
 //! A learner's life: resume or begin, serve and train, end.
 
+use std::io::Write as _;
 use std::net::SocketAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, anyhow, bail};
+use bytes::Bytes;
 use comic_clips::Catalogue;
 use comic_experiment::{Experiment, InitialPose, TaskSpec};
 use comic_proto::v1::Behaviour;
@@ -31,8 +33,7 @@ const FAREWELL: Duration = Duration::from_millis(1500);
 pub fn run(options: &Options) -> Result<()> {
     let experiment = options.document.resolve()?;
     if options.print {
-        print!("{}", experiment.to_toml()?);
-        return Ok(());
+        return std::io::stdout().write_all(experiment.to_toml()?.as_bytes()).context("cannot write to stdout");
     }
     tch::set_num_threads(experiment.learner.threads as i32);
     let workers = std::thread::available_parallelism().map_or(2, usize::from).clamp(1, 4);
@@ -48,10 +49,12 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     // Both signals count from the first moment on.
     let mut interrupt = signal(SignalKind::interrupt())?;
     let mut terminate = signal(SignalKind::terminate())?;
+    let mut hangup = signal(SignalKind::hangup())?;
     let address = SocketAddr::new(options.address, options.port);
     let listener = TcpListener::bind(address)
         .await
         .with_context(|| format!("cannot listen on {address}: choose another --port, or 0 for any free one"))?;
+    let _lock = Store::open(&options.run, experiment.learner.checkpoints_kept)?.lock()?;
     let (setup, shared) = prepare(options, experiment)?;
     let (batcher, publisher, epoch) = (setup.batcher.clone(), setup.publisher.clone(), setup.epoch);
     let mut training = start_trainer(setup)?;
@@ -60,23 +63,39 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     let serving = tokio::spawn(service::serve(listener, shared, async {
         let _ = stopped.await;
     }));
-    println!("{}", serde_json::json!({ "listening": address.to_string(), "learner_epoch": epoch, "run": options.run }));
+    let listening = serde_json::json!({ "listening": address.to_string(), "learner_epoch": epoch, "run": options.run });
+    // Nobody has to read it.
+    let _ = writeln!(std::io::stdout(), "{listening}");
     tracing::info!(%address, epoch, run = %options.run.display(), "serving");
     let ending = tokio::select! {
-        ending = &mut training => ending,
-        _ = interrupt.recv() => stop(&batcher, training).await,
-        _ = terminate.recv() => stop(&batcher, training).await,
+        ending = &mut training => Some(ending),
+        _ = interrupt.recv() => None,
+        _ = terminate.recv() => None,
+        _ = hangup.recv() => None,
+    };
+    let ending = match ending {
+        Some(ending) => ending,
+        None => {
+            tracing::info!("stopping after this update; a checkpoint follows. A second signal does not wait for it");
+            batcher.close();
+            tokio::select! {
+                ending = &mut training => ending,
+                _ = interrupt.recv() => bail!("stopped by a second signal, without a last checkpoint"),
+                _ = terminate.recv() => bail!("stopped by a second signal, without a last checkpoint"),
+            }
+        }
     };
     if let Ok(Ok(Ending::Budget)) = &ending
         && let Some(newest) = publisher.newest()
     {
-        publisher.publish(newest.version, Behaviour::Leave, newest.payload.clone());
+        publisher.publish(newest.version, Behaviour::Leave, Bytes::new());
         tokio::time::sleep(FAREWELL).await;
     }
     batcher.close();
     let _ = stop_serving.send(());
-    serving.await.context("the server failed")??;
+    let served = serving.await;
     let ending = ending.context("the trainer's thread is gone")??;
+    served.context("the server failed")??;
     tracing::info!(books = ?batcher.books(), "{}", match ending {
         Ending::Budget => "the budget is used up",
         Ending::Stopped => "stopped; start again with the same --run to go on",
@@ -85,12 +104,6 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
 }
 
 type Training = oneshot::Receiver<Result<Ending>>;
-
-async fn stop(batcher: &Batcher, training: Training) -> Result<Result<Ending>, oneshot::error::RecvError> {
-    tracing::info!("stopping after this update; a checkpoint follows");
-    batcher.close();
-    training.await
-}
 
 fn start_trainer(setup: Setup) -> Result<Training> {
     let (ended, training) = oneshot::channel();
@@ -108,7 +121,7 @@ fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shar
     let catalogue = Catalogue::open(&experiment.clips)?;
     let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
     let spec = TaskSpec::tracking(&experiment.task, names)
-        .map_err(|name| anyhow!("task.observations: the tracking task has no observation `{name}`"))?;
+        .map_err(|name| Misuse(format!("task.observations: the tracking task has no observation `{name}`")))?;
     let pose = match experiment.network.initial_pose {
         InitialPose::MidRange => vec![0.0; spec.action],
         InitialPose::ReferenceMean => catalogue.mean_action()?.iter().map(|action| *action as f32).collect(),
@@ -116,7 +129,7 @@ fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shar
     let store = Store::open(&options.run, experiment.learner.checkpoints_kept)?;
     let resume = store.newest()?;
     if let Some((path, snapshot)) = &resume {
-        check_same_experiment(&experiment, snapshot)
+        check_same_experiment(&experiment, &spec, snapshot)
             .with_context(|| format!("{} cannot be resumed", options.run.display()))?;
         tracing::info!(checkpoint = %path.display(), "resuming");
     }
@@ -149,7 +162,7 @@ fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shar
 }
 
 /// A run goes on only as the experiment it was; how long, how often and with how many threads may change.
-fn check_same_experiment(now: &Experiment, snapshot: &Snapshot) -> Result<()> {
+fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot) -> Result<()> {
     let then = Experiment::from_toml("experiment.toml of the checkpoint", snapshot.text("experiment.toml")?)?;
     let comparable = |experiment: &Experiment| {
         let mut experiment = experiment.clone();
@@ -160,10 +173,19 @@ fn check_same_experiment(now: &Experiment, snapshot: &Snapshot) -> Result<()> {
     };
     let (now, then) = (comparable(now)?, then.to_toml()?);
     if let Some((new, old)) = now.lines().zip(then.lines()).find(|(new, old)| new != old) {
-        bail!("it was made with `{old}` where the experiment now says `{new}`: give another --run, or the old value");
+        return Err(Misuse(format!(
+            "it was made with `{old}` where the experiment now says `{new}`: give another --run, or the old value"
+        ))
+        .into());
     }
-    if now != then {
-        bail!("it was made by an experiment with other clips or fields: give another --run");
+    let clips: TaskSpec = serde_json::from_slice(snapshot.part("task.json")?)?;
+    if now != then || clips != *spec {
+        return Err(Misuse("it was made by an experiment with other clips or fields: give another --run".into()).into());
     }
     Ok(())
 }
+
+/// A configuration that is wrong and stays wrong, however often it is tried.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct Misuse(String);

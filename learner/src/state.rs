@@ -28,7 +28,7 @@ impl Trainer {
         for (statistics, name) in self.statistics.iter().zip(STATISTICS) {
             tensors.extend(statistics.state(name));
         }
-        let progress = Progress { seconds: self.seconds(), ..self.progress.clone() };
+        let progress = Progress { epoch: self.epoch, seconds: self.seconds(), ..self.progress.clone() };
         let mut snapshot = Snapshot::default();
         for (name, bytes) in [
             ("experiment.toml", self.experiment.to_toml()?.into_bytes()),

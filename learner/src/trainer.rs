@@ -10,7 +10,7 @@ use comic_experiment::{Experiment, TaskSpec};
 use comic_networks::{NormaliserStatistics, to_safetensors};
 use comic_proto::v1::Behaviour;
 use comic_proto::{Field, UnrollShape};
-use comic_replay::{Batch, Batcher, Next, Phase};
+use comic_replay::{Batch, Batcher, Next, Phase, Reason};
 use rand::SeedableRng as _;
 use rand::seq::SliceRandom as _;
 use rand_pcg::Pcg64;
@@ -65,6 +65,8 @@ pub enum Ending {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Progress {
+    /// The life of the learner that made it, without which the version means nothing.
+    pub(crate) epoch: u64,
     pub(crate) updates: u64,
     pub(crate) environment_steps: u64,
     pub(crate) seconds: f64,
@@ -79,7 +81,7 @@ pub(crate) struct Progress {
 pub struct Trainer {
     pub(crate) experiment: Experiment,
     pub(crate) spec: TaskSpec,
-    epoch: u64,
+    pub(crate) epoch: u64,
     pub(crate) learner: VmpoLearner,
     /// Of the observations, for the normaliser: proprioception and task.
     pub(crate) statistics: [Statistics; 2],
@@ -92,6 +94,8 @@ pub struct Trainer {
     pub(crate) batcher: Batcher,
     publisher: Publisher,
     shared: Arc<Shared>,
+    /// Unrolls of versions before this one are superseded.
+    oldest: u64,
     pub(crate) metrics: Metrics,
     pub(crate) writer: Writer,
     pub(crate) checkpointed: Instant,
@@ -111,6 +115,7 @@ impl Trainer {
             statistics: [spec.proprioception, spec.task].map(|width| Statistics::new(width as i64)),
             target: Bytes::from(to_safetensors(learner.policy_store())?),
             progress: Progress {
+                epoch,
                 updates: 0,
                 environment_steps: 0,
                 seconds: 0.0,
@@ -120,6 +125,7 @@ impl Trainer {
             },
             clock: None,
             losses: Map::new(),
+            oldest: 0,
             metrics: Metrics::open(&run, &spec)?,
             writer: Writer::start(store)?,
             checkpointed: Instant::now(),
@@ -143,7 +149,14 @@ impl Trainer {
     /// # Errors
     /// When a number is no longer finite, or the disk refuses.
     pub fn run(mut self) -> Result<Ending> {
-        let ending = self.train()?;
+        let ending = match self.train() {
+            Ok(ending) => ending,
+            Err(error) => {
+                // What was handed to the writer is still good.
+                let _ = self.writer.finish();
+                return Err(error);
+            }
+        };
         self.write_metrics()?;
         self.checkpoint(true)?;
         self.writer.finish()?;
@@ -177,9 +190,11 @@ impl Trainer {
             self.set_normaliser()?;
             if unseen {
                 // Numbers of any size would teach the networks nothing: the first batch only sets the scale.
+                // What was made before acts on another scale.
+                self.oldest = self.progress.version + 1;
                 self.publish(Behaviour::Policy)?;
-                self.book(batch);
-                return Ok(());
+                self.batcher.discard(batch, Reason::Superseded);
+                return self.after_update();
             }
         }
         self.schedule_learning_rate();
@@ -282,7 +297,7 @@ impl Trainer {
     fn announce(&self, behaviour: Behaviour) {
         let version = self.progress.version;
         let demonstration = behaviour == Behaviour::Demonstrate;
-        self.batcher.set_phase(Phase { epoch: self.epoch, version, demonstration });
+        self.batcher.set_phase(Phase { epoch: self.epoch, version, oldest: self.oldest, demonstration });
         self.publisher.publish(version, behaviour, self.target.clone());
     }
 
@@ -372,6 +387,9 @@ impl Trainer {
             epoch: self.epoch,
         };
         let books = serde_json::to_value(self.batcher.books())?;
+        for evaluation in self.shared.take_evaluations() {
+            self.metrics.keep_evaluation(&evaluation)?;
+        }
         let line = self.metrics.write(position, books, self.losses.clone())?;
         tracing::info!(target: "metrics", "{line}");
         self.shared.set_metrics(line);

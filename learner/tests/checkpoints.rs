@@ -25,9 +25,49 @@ fn a_damaged_one_is_skipped() {
     store.write(Name::Updates(1), &snapshot("one")).unwrap();
     let newest = store.write(Name::Updates(2), &snapshot("two")).unwrap();
     std::fs::write(newest.join("part"), "twø").unwrap();
-    assert_eq!(store.newest().unwrap().unwrap().1, snapshot("one"));
     let complaint = format!("{:#}", read(&newest).unwrap_err());
     assert!(complaint.contains("part") && complaint.contains("SHA-256"), "{complaint}");
+    assert_eq!(store.newest().unwrap().unwrap().1, snapshot("one"));
+}
+
+#[test]
+fn a_run_with_nothing_but_damaged_ones_does_not_begin_anew() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 3).unwrap();
+    let only = store.write(Name::Updates(1), &snapshot("one")).unwrap();
+    std::fs::write(only.join("part"), "øne").unwrap();
+    assert!(format!("{:#}", store.newest().unwrap_err()).contains("--run"));
+    assert!(run.path().join("checkpoints/damaged-checkpoint-0000000001").is_dir());
+}
+
+#[test]
+fn other_peoples_files_beside_them_do_no_harm() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 1).unwrap();
+    std::fs::write(run.path().join("checkpoints/checkpoint-best.tar"), "mine").unwrap();
+    std::fs::create_dir(run.path().join("checkpoints/checkpoint-best")).unwrap();
+    store.write(Name::Updates(1), &snapshot("one")).unwrap();
+    store.write(Name::Updates(2), &snapshot("two")).unwrap();
+    assert_eq!(store.newest().unwrap().unwrap().1, snapshot("two"));
+    assert!(run.path().join("checkpoints/checkpoint-best").is_dir());
+}
+
+#[test]
+fn one_of_the_same_number_is_replaced() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 1).unwrap();
+    store.write(Name::Updates(1), &snapshot("one")).unwrap();
+    store.write(Name::Updates(1), &snapshot("another")).unwrap();
+    assert_eq!(store.newest().unwrap().unwrap().1, snapshot("another"));
+}
+
+#[test]
+fn two_learners_cannot_share_a_run() {
+    let run = tempfile::tempdir().unwrap();
+    let held = Store::open(run.path(), 1).unwrap().lock().unwrap();
+    assert!(format!("{:#}", Store::open(run.path(), 1).unwrap().lock().unwrap_err()).contains("another learner"));
+    drop(held);
+    Store::open(run.path(), 1).unwrap().lock().unwrap();
 }
 
 #[test]

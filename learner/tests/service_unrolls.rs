@@ -82,7 +82,7 @@ async fn old_unrolls_are_refused_as_stale_and_those_of_another_life_or_phase_as_
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;
-    world.batcher.set_phase(Phase { epoch: EPOCH, version: 6, demonstration: false });
+    world.batcher.set_phase(Phase { epoch: EPOCH, version: 6, oldest: 0, demonstration: false });
     let ack = unrolls.send(actor.unroll(0)).await.unwrap();
     assert_eq!((ack.verdict(), ack.detail.as_str()), (Verdict::Stale, "version 0 is too old, the newest is 6"));
 

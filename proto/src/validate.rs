@@ -115,6 +115,13 @@ pub enum Invalid {
     },
 }
 
+/// MuJoCo's own limit (`mjMAXVAL`): a simulation beyond it has diverged.
+const LARGEST_OBSERVATION: f32 = 1e10;
+/// No squared ratio of two of these overflows a float32 where the deviation is at least [`SMALLEST_STD`].
+const LARGEST_NUMBER: f32 = 1e6;
+/// The least standard deviation an experiment may ask for.
+const SMALLEST_STD: f32 = 1e-6;
+
 /// Checks header and payload of an unroll against everything both sides agreed on.
 ///
 /// One pass over the payload finds whether all is finite; only when it is not does a second one look for the place.
@@ -132,7 +139,18 @@ pub fn validate(
         return Err(Invalid::Length { found: payload.len(), expected: layout.size() });
     }
     check_finite(layout, payload)?;
-    check_range(layout, payload, Field::Std, "above 0", |value| value > 0.0)?;
+    for (field, limit, expected) in [
+        (Field::Proprioception, LARGEST_OBSERVATION, "within ±1e10"),
+        (Field::Task, LARGEST_OBSERVATION, "within ±1e10"),
+        (Field::PreviousLatent, LARGEST_NUMBER, "within ±1e6"),
+        (Field::LatentNoise, LARGEST_NUMBER, "within ±1e6"),
+        (Field::Action, LARGEST_NUMBER, "within ±1e6"),
+        (Field::Mean, LARGEST_NUMBER, "within ±1e6"),
+        (Field::Reward, LARGEST_NUMBER, "within ±1e6"),
+    ] {
+        check_range(layout, payload, field, expected, |value| value.abs() <= limit)?;
+    }
+    check_range(layout, payload, Field::Std, "1e-6 to 1e6", |value| (SMALLEST_STD..=LARGEST_NUMBER).contains(&value))?;
     check_range(layout, payload, Field::Discount, "0 to 1", |value| (0.0..=1.0).contains(&value))?;
     check_range(layout, payload, Field::Valid, "0 or 1", |value| value == 0.0 || value == 1.0)?;
     check_range(layout, payload, Field::First, "0 or 1", |value| value == 0.0 || value == 1.0)?;

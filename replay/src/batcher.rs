@@ -32,6 +32,8 @@ pub struct Phase {
     pub epoch: u64,
     /// The newest published version; versions count publications.
     pub version: u64,
+    /// Versions before this one acted on other terms and are superseded.
+    pub oldest: u64,
     /// Demonstrations instead of the policy's own unrolls.
     pub demonstration: bool,
 }
@@ -158,7 +160,8 @@ impl Batcher {
     /// Says what is wanted from now on. What waits in the batcher for another epoch or phase is superseded.
     pub fn set_phase(&self, phase: Phase) {
         let mut state = self.lock();
-        let over = state.phase.epoch != phase.epoch || state.phase.demonstration != phase.demonstration;
+        let terms = |phase: Phase| (phase.epoch, phase.oldest, phase.demonstration);
+        let over = terms(state.phase) != terms(phase);
         state.phase = phase;
         if !over {
             return;
@@ -284,8 +287,9 @@ impl Batcher {
         if let Some(outcome) = refuse_unaccountable(&mut state.ledger, header) {
             return Some(outcome);
         }
-        let Phase { epoch, version, demonstration } = state.phase;
-        let reason = if header.learner_epoch != epoch || header.demonstration != demonstration {
+        let Phase { epoch, version, oldest, demonstration } = state.phase;
+        let other = header.learner_epoch != epoch || header.demonstration != demonstration || header.version < oldest;
+        let reason = if other {
             Reason::Superseded
         } else if payload.len() != self.inner.layout.size() {
             Reason::Invalid

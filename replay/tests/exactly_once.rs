@@ -99,6 +99,16 @@ fn unrolls_of_another_epoch_or_phase_are_superseded() {
 }
 
 #[test]
+fn an_unroll_made_before_the_terms_changed_is_superseded() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    assert_eq!(actor.send(&batcher, 0), Some(Outcome::Taken));
+    batcher.set_phase(Phase { version: PHASE.version + 1, oldest: PHASE.version + 1, ..PHASE });
+    assert_eq!(actor.send(&batcher, 1), Some(Outcome::Superseded));
+    assert_eq!(batcher.books().dropped.superseded, 2);
+}
+
+#[test]
 fn a_change_of_phase_drops_what_waits_for_the_old_one() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);

@@ -7,11 +7,13 @@ use std::sync::Arc;
 use clap::Args;
 use comic_clips::Catalogue;
 use comic_experiment::{ClipSource, Experiment};
+use comic_proto::v1::EvaluationReport;
 use comic_tasks::TrackingTask;
 
+use super::delivery::deliver;
 use super::{Evaluated, Options, Report, evaluate};
 use crate::Error;
-use crate::checkpoint;
+use crate::checkpoint::{self, Checkpoint, Position};
 use crate::policy::TorchPolicy;
 
 const JSON_HELP: &str = "\
@@ -49,8 +51,8 @@ pub struct Evaluate {
     /// The servo action itself, the pose of the next reference frame, instead of a policy.
     #[arg(long, conflicts_with = "untrained")]
     servo: bool,
-    /// Clips in place of the experiment's own.
-    #[arg(long, value_name = "FILE|builtin:NAME", value_delimiter = ',')]
+    /// Clips in place of the experiment's own: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP.
+    #[arg(long, value_name = "SOURCE", num_args = 1..)]
     clips: Vec<String>,
     /// The mean action and the latent's mean instead of samples.
     #[arg(long)]
@@ -64,6 +66,16 @@ pub struct Evaluate {
     /// JSON instead of a table; see below.
     #[arg(long)]
     json: bool,
+    /// Report the evaluation of a checkpoint to this learner too, which keeps it in `evaluations.jsonl`.
+    #[arg(long, value_name = "URL", requires = "checkpoint")]
+    learner: Option<String>,
+}
+
+/// What is evaluated.
+struct Subject {
+    experiment: Experiment,
+    parameters: Option<Vec<u8>>,
+    position: Position,
 }
 
 impl Evaluate {
@@ -72,21 +84,25 @@ impl Evaluate {
     /// # Errors
     /// Whatever keeps it from that.
     pub fn run(&self) -> Result<(), Error> {
-        let report = self.evaluate()?;
-        let text = if self.json {
-            let json = serde_json::to_string_pretty(&report)
-                .map_err(|error| Error::Usage(format!("cannot write the report as JSON: {error}")))?;
-            json + "\n"
-        } else {
-            report.to_string()
-        };
+        let subject = self.subject()?;
+        let position = subject.position;
+        let report = self.evaluate(subject)?;
+        let json = serde_json::to_string_pretty(&report)
+            .map_err(|error| Error::Usage(format!("cannot write the report as JSON: {error}")))?;
+        if let Some(learner) = &self.learner {
+            let Position { epoch: learner_epoch, version } = position;
+            deliver(learner, EvaluationReport { learner_epoch, version, json: json.clone() })?;
+        }
+        let text = if self.json { json + "\n" } else { report.to_string() };
         std::io::stdout().write_all(text.as_bytes()).map_err(Error::file("standard output"))
     }
 
-    fn evaluate(&self) -> Result<Report, Error> {
-        let (mut experiment, parameters) = self.subject()?;
+    fn evaluate(&self, subject: Subject) -> Result<Report, Error> {
+        let Subject { mut experiment, parameters, .. } = subject;
+        // A policy that was never trained starts from the pose of its own clips, whatever it is evaluated on.
+        let own = if self.untrained { Some(Catalogue::open(&experiment.clips)?) } else { None };
         if !self.clips.is_empty() {
-            experiment.clips = self.clips.iter().map(ClipSource::whole).collect();
+            experiment.clips = self.clips.iter().map(|source| ClipSource::parse(source)).collect();
         }
         let catalogue = Catalogue::open(&experiment.clips)?;
         let task = Arc::new(TrackingTask::new(&experiment.task, &catalogue)?);
@@ -97,17 +113,18 @@ impl Evaluate {
             ..Options::default()
         };
         let latent = experiment.network.latent.size;
-        let mut policy = self.policy(&experiment, &task, &catalogue, parameters.as_deref())?;
+        let mut policy = self.policy(&experiment, &task, own.as_ref(), parameters.as_deref())?;
         let mut evaluated = policy.as_mut().map_or(Evaluated::Servo, Evaluated::Policy);
         evaluate(&mut evaluated, &task, latent, &options, &mut show_progress)
     }
 
     /// The experiment, and the parameters when there is a checkpoint.
-    fn subject(&self) -> Result<(Experiment, Option<Vec<u8>>), Error> {
+    fn subject(&self) -> Result<Subject, Error> {
         if let Some(path) = &self.checkpoint {
             let found = checkpoint::read(path)?;
             tracing::info!(checkpoint = %found.path.display(), "evaluating");
-            return Ok((found.experiment, Some(found.policy)));
+            let Checkpoint { experiment, policy, position, .. } = found;
+            return Ok(Subject { experiment, parameters: Some(policy), position });
         }
         let preset = self.preset.as_deref().unwrap_or_default();
         if !self.untrained && !self.servo {
@@ -115,14 +132,15 @@ impl Evaluate {
                 "a preset has no trained policy: add --untrained or --servo, or name a --checkpoint".into(),
             ));
         }
-        Ok((comic_experiment::resolve(preset, &self.set)?, None))
+        let experiment = comic_experiment::resolve(preset, &self.set)?;
+        Ok(Subject { experiment, parameters: None, position: Position::default() })
     }
 
     fn policy(
         &self,
         experiment: &Experiment,
         task: &TrackingTask,
-        catalogue: &Catalogue,
+        own: Option<&Catalogue>,
         parameters: Option<&[u8]>,
     ) -> Result<Option<TorchPolicy>, Error> {
         if self.servo {
@@ -130,7 +148,9 @@ impl Evaluate {
         }
         let policy = match parameters {
             Some(parameters) if !self.untrained => TorchPolicy::from_parameters(task.spec(), experiment, parameters)?,
-            _ => TorchPolicy::untrained(task.spec(), experiment, experiment.seed, || Ok(catalogue.mean_action()?))?,
+            _ => TorchPolicy::untrained(task.spec(), experiment, experiment.seed, || {
+                own.map_or(Ok([0.0; 56]), |own| Ok(own.mean_action()?))
+            })?,
         };
         Ok(Some(policy))
     }

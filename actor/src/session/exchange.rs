@@ -76,6 +76,7 @@ impl Exchange<'_> {
         };
         // What was acknowledged before the end needs no sending again.
         while let Ok(ack) = acks.try_recv() {
+            self.mailbox.announce(ack.learner_epoch, ack.version);
             self.outbox.settle(&ack);
         }
         ended

@@ -57,7 +57,7 @@ impl World {
         };
         let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
         let config = Config { unrolls: BATCH, max_staleness: 5, ahead: 2 };
-        let phase = Phase { epoch: EPOCH, version: 0, demonstration: false };
+        let phase = Phase { epoch: EPOCH, version: 0, oldest: 0, demonstration: false };
         let batcher = Batcher::new(layout, config, phase, Ledger::new());
         let publisher = Publisher::new(EPOCH);
         let setup = Setup {

@@ -10,7 +10,7 @@ use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{Batch, Batcher, Config, Ledger, Next, Outcome, Phase};
 
-pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, demonstration: false };
+pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, oldest: 0, demonstration: false };
 pub(crate) const CONFIG: Config = Config { unrolls: 3, max_staleness: 4, ahead: 2 };
 /// Slots that fill up while nobody trains: the open batch and the full one.
 pub(crate) const SLOTS: usize = 2 * CONFIG.unrolls;
