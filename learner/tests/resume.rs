@@ -1,6 +1,8 @@
 //! A checkpoint holds everything that changes the future: a run that was stopped and resumed ends, bit for bit, where
 //! one that was not stopped ends. Actors are replaced by a recorded stream of unrolls.
 
+#![allow(clippy::unwrap_used, reason = "a test stops at the first surprise")]
+
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
@@ -11,7 +13,7 @@ use comic_learner::service::{self, Shared};
 use comic_learner::trainer::{Ending, Setup, Trainer};
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
-use comic_replay::{Batcher, Config, Ledger, Phase};
+use comic_replay::{Batcher, Config, Ledger, Outcome, Phase};
 use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 
@@ -91,14 +93,19 @@ fn live(run: &Path, updates: u64) -> Snapshot {
     let feeder = std::thread::spawn({
         let (batcher, layout) = (batcher.clone(), layout.clone());
         // Exactly what the rest of the run needs, so that the books are the same whoever feeds.
-        let unrolls = (updates + 1) * experiment.unroll.batch as u64;
+        let batch = experiment.unroll.batch as u64;
+        let unrolls = (updates + 1) * batch;
         move || {
             for sequence in joined.next_sequence..unrolls {
                 let (actor, incarnation) = (joined.actor, INCARNATION);
                 let header = UnrollHeader { actor, incarnation, sequence, learner_epoch: epoch, ..Default::default() };
                 let header = UnrollHeader { version: batcher.phase().version, ..header };
                 let inserted = batcher.insert(&header, recorded(&layout, sequence).into_bytes());
-                futures::executor::block_on(inserted);
+                assert_eq!(futures::executor::block_on(inserted), Outcome::Taken);
+                // Batch by batch, so that none waits while the trainer changes the terms.
+                while (sequence + 1) % batch == 0 && batcher.books().in_flight > 0 {
+                    std::thread::yield_now();
+                }
             }
         }
     });

@@ -19,7 +19,7 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
     workspace::build()?;
     let mut command = cargo();
     if cargo_has("nextest") {
-        command.args(["nextest", "run"]);
+        command.args(["nextest", "run", "--no-fail-fast"]);
     } else {
         eprintln!("cargo-nextest is not installed: running the tests with `cargo test`");
         command.arg("test");
