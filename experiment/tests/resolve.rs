@@ -82,7 +82,7 @@ fn a_file_resolves_like_a_preset() {
 fn neither_preset_nor_file_lists_the_presets() {
     let message = resolve("trackin-mlp", &[]).unwrap_err().to_string();
     assert!(message.starts_with("no preset or file `trackin-mlp` ("), "{message}");
-    assert!(message.ends_with("presets are quickstart, tracking-mlp"), "{message}");
+    assert!(message.ends_with("presets are quickstart, quickstart-from-zero, tracking-mlp"), "{message}");
 }
 
 #[test]

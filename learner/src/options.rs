@@ -37,7 +37,7 @@ pub struct Options {
 /// The experiment and what changes it.
 #[derive(Clone, Debug, Args)]
 pub struct Document {
-    /// A preset's name (quickstart, tracking-mlp) or the path of an experiment file.
+    /// A preset's name (quickstart, quickstart-from-zero, tracking-mlp) or the path of an experiment file.
     #[arg(long, value_name = "NAME|FILE", default_value = "tracking-mlp", global = true)]
     pub preset: String,
     /// Clips to track instead of the experiment's: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP.
