@@ -97,9 +97,10 @@ fn smooth(points: &[(f64, f64, f64)]) -> Vec<(f64, f64, f64)> {
 
 fn draw<B: DrawingBackend>(area: &DrawingArea<B, Shift>, curves: &[Curve], quantity: Quantity) -> Result<()> {
     area.fill(&WHITE).map_err(|error| anyhow!("{error}"))?;
-    let (left, right) = area.split_horizontally((50).percent());
-    panel(&left, curves, "minutes of wall clock", quantity.label(), |point| point.0)?;
-    panel(&right, curves, "million environment steps", quantity.label(), |point| point.1)
+    let halves = area.split_evenly((1, 2));
+    let [left, right] = halves.as_slice() else { return Err(anyhow!("the picture cannot be halved")) };
+    panel(left, curves, "minutes of wall clock", quantity.label(), |point| point.0)?;
+    panel(right, curves, "million environment steps", quantity.label(), |point| point.1)
 }
 
 fn panel<B: DrawingBackend>(
@@ -137,7 +138,7 @@ fn panel<B: DrawingBackend>(
     }
     chart
         .configure_series_labels()
-        .position(SeriesLabelPosition::UpperLeft)
+        .position(SeriesLabelPosition::LowerRight)
         .background_style(WHITE.mix(0.8))
         .draw()
         .map_err(|error| failed(error.to_string()))
