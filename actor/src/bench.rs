@@ -14,8 +14,8 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use comic_clips::Catalogue;
-use comic_experiment::Experiment;
-use comic_tasks::TrackingTask;
+use comic_experiment::{Experiment, TaskName};
+use comic_tasks::{Simulated, Task};
 
 use crate::Error;
 
@@ -32,6 +32,9 @@ pub struct Bench {
     /// Seconds for each figure.
     #[arg(long, default_value_t = 15.0)]
     seconds: f64,
+    /// The task: tracking, go-to-target, gaps, walls, get-up or ball-catch.
+    #[arg(long, default_value_t = TaskName::Tracking)]
+    task: TaskName,
     /// Only these figures.
     #[arg(value_enum)]
     figures: Vec<Name>,
@@ -47,11 +50,17 @@ enum Name {
     Wire,
 }
 
-/// What all figures are measured on: the paper's networks, one built-in walk.
+/// What all figures are measured on: the paper's networks, one built-in walk or another task.
 struct Subject {
     experiment: Experiment,
-    task: Arc<TrackingTask>,
+    task: Arc<dyn Task>,
     budget: Duration,
+}
+
+impl Subject {
+    fn environment(&self, seed: u64) -> Result<Box<dyn Simulated>, comic_tasks::Error> {
+        Arc::clone(&self.task).environment(seed)
+    }
 }
 
 impl Bench {
@@ -62,17 +71,17 @@ impl Bench {
     pub fn run(&self) -> Result<(), Error> {
         let budget = Duration::try_from_secs_f64(self.seconds)
             .map_err(|error| Error::Usage(format!("--seconds {}: {error}", self.seconds)))?;
-        let experiment = Experiment::default();
+        let experiment = Experiment { task: self.task, ..Experiment::default() };
         let catalogue = Catalogue::open(&experiment.clips)?;
-        let task = Arc::new(TrackingTask::new(&experiment.task, &catalogue)?);
+        let task = comic_tasks::build(&experiment, &catalogue)?;
         let subject = Subject { experiment, task, budget };
         for name in Name::value_variants().iter().filter(|name| self.figures.is_empty() || self.figures.contains(name))
         {
             let figure = match name {
-                Name::Env => physics::environment(&subject),
+                Name::Env => physics::environment(&subject)?,
                 Name::Policy => acting::policy(&subject)?,
                 Name::Threads => acting::threads(&subject)?,
-                Name::Reset => physics::reset(&subject),
+                Name::Reset => physics::reset(&subject)?,
                 Name::Wire => wire::wire(&subject)?,
             };
             figure.print()?;

@@ -1,10 +1,8 @@
 //! How well a policy tracks, per clip and reward term.
 //!
-//! An episode's normalised reward is its return / ([`TRACKING_MAX_REWARD`] × the steps that were left in the clip at
-//! its start), so that falling early counts. Beside it stand the reward per survived step / [`TRACKING_MAX_REWARD`],
-//! which forgives a fall, and the fraction survived, which sees nothing else.
-//!
-//! [`TRACKING_MAX_REWARD`]: comic_experiment::TRACKING_MAX_REWARD
+//! An episode's normalised reward is its return / (the most a step can pay × the steps that were left at its start), so
+//! that falling early counts; for tracking that is 1.45 × the steps left in the clip. Beside it stand the reward per
+//! survived step / the most, which forgives a fall, and the fraction survived, which sees nothing else.
 
 pub mod command;
 mod delivery;
@@ -14,7 +12,7 @@ mod table;
 
 use std::sync::Arc;
 
-use comic_tasks::{ClipStarts, TrackingEnvironment, TrackingTask};
+use comic_tasks::{ClipStarts, Simulated, Task};
 use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 
@@ -23,7 +21,7 @@ use crate::acting::{ActingSizes, ForwardPass};
 use crate::seeds::derive;
 
 pub use report::{ClipReport, Finished, Report};
-pub use rollout::{Evaluated, Start, Startable};
+pub use rollout::{Evaluated, Start};
 
 /// How to evaluate.
 #[derive(Clone, Copy, Debug)]
@@ -52,7 +50,7 @@ impl Default for Options {
 /// A failing forward pass, a start that the task does not have.
 pub fn evaluate<F: ForwardPass>(
     evaluated: &mut Evaluated<'_, F>,
-    task: &Arc<TrackingTask>,
+    task: &Arc<dyn Task>,
     latent: usize,
     options: &Options,
     progress: &mut dyn FnMut(usize, usize),
@@ -60,8 +58,8 @@ pub fn evaluate<F: ForwardPass>(
     let spec = task.spec();
     let starts = chosen(task.starts(), options);
     let environments = (0..options.environments.min(starts.len()).max(1) as u64)
-        .map(|index| task.environment(derive(options.seed, index)))
-        .collect::<Vec<TrackingEnvironment>>();
+        .map(|index| Arc::clone(task).environment(derive(options.seed, index)))
+        .collect::<Result<Vec<Box<dyn Simulated>>, _>>()?;
     let sizes = ActingSizes { proprioception: spec.proprioception, task: spec.task, latent, action: spec.action };
     let finished = rollout::run(evaluated, environments, sizes, &starts, options, progress)?;
     Ok(Report::new(spec, &finished, options))

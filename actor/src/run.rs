@@ -7,7 +7,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use comic_clips::Catalogue;
-use comic_tasks::{TrackingEnvironment, TrackingTask};
+use comic_tasks::Simulated;
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{mpsc, watch};
@@ -42,7 +42,7 @@ pub struct Options {
     pub cache: Option<PathBuf>,
 }
 
-type TrackingWorker = Worker<TrackingEnvironment, TorchPolicy>;
+type TaskWorker = Worker<Box<dyn Simulated>, TorchPolicy>;
 
 /// Acts for a learner until the run is over or the process is told to stop (SIGTERM, SIGINT).
 ///
@@ -108,10 +108,10 @@ fn stop_on_signal(runtime: &Runtime, closing: Closing) -> Result<(), Error> {
 }
 
 /// The workers, and the bytes that the acting parameters take.
-fn build(joined: &Joined, threads: usize, environments: usize) -> Result<(Vec<TrackingWorker>, u64), Error> {
+fn build(joined: &Joined, threads: usize, environments: usize) -> Result<(Vec<TaskWorker>, u64), Error> {
     let (experiment, spec) = (&joined.experiment, &joined.spec);
     let catalogue = Catalogue::open_with(&experiment.clips, |source| joined.assets.get(source).cloned())?;
-    let task = Arc::new(TrackingTask::new(&experiment.task, &catalogue)?);
+    let task = comic_tasks::build(experiment, &catalogue)?;
     if task.spec() != spec {
         return Err(Error::Disagreement { what: "the task's observations, rewards or clips" });
     }
@@ -119,8 +119,9 @@ fn build(joined: &Joined, threads: usize, environments: usize) -> Result<(Vec<Tr
     let mut workers = Vec::with_capacity(threads);
     for thread in 0..threads as u64 {
         let seed = derive(joined.seed, thread);
-        let environments =
-            (1..=environments as u64).map(|environment| task.environment(derive(seed, environment))).collect();
+        let environments = (1..=environments as u64)
+            .map(|environment| Arc::clone(&task).environment(derive(seed, environment)))
+            .collect::<Result<_, _>>()?;
         // The first parameters off the wire replace what it starts with.
         let policy = TorchPolicy::untrained(spec, experiment, seed, || Ok([0.0; 56]))?;
         parameters = policy.to_parameters()?.len() as u64;
@@ -133,7 +134,7 @@ fn build(joined: &Joined, threads: usize, environments: usize) -> Result<(Vec<Tr
 type WorkerThread = thread::JoinHandle<Result<(), Error>>;
 
 fn start(
-    workers: Vec<TrackingWorker>,
+    workers: Vec<TaskWorker>,
     closing: &Closing,
     unrolls: mpsc::Sender<FinishedUnroll>,
     progress: &Arc<Progress>,

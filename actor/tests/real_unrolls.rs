@@ -13,13 +13,13 @@ use comic_clips::Catalogue;
 use comic_experiment::{Experiment, resolve};
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Expected, Field, UnrollBuffer, UnrollLayout, UnrollShape, validate};
-use comic_tasks::TrackingTask;
+use comic_tasks::Task;
 
 const ENVIRONMENTS: usize = 3;
 
 struct Setup {
     experiment: Experiment,
-    task: Arc<TrackingTask>,
+    task: Arc<dyn Task>,
     layout: Arc<UnrollLayout>,
     policy: TorchPolicy,
 }
@@ -27,7 +27,7 @@ struct Setup {
 fn setup() -> Setup {
     let experiment = resolve("quickstart", &[]).unwrap();
     let catalogue = Catalogue::open(&experiment.clips).unwrap();
-    let task = Arc::new(TrackingTask::new(&experiment.task, &catalogue).unwrap());
+    let task = comic_tasks::build(&experiment, &catalogue).unwrap();
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(task.spec(), &experiment)));
     let policy = TorchPolicy::untrained(task.spec(), &experiment, 5, || Ok(catalogue.mean_action()?)).unwrap();
     Setup { experiment, task, layout, policy }
@@ -35,7 +35,8 @@ fn setup() -> Setup {
 
 /// Two rounds of unrolls, `[round][environment]`.
 fn record(setup: &Setup, conduct: Conduct) -> Vec<Vec<FinishedUnroll>> {
-    let environments = (0..ENVIRONMENTS as u64).map(|seed| setup.task.environment(seed)).collect();
+    let environments =
+        (0..ENVIRONMENTS as u64).map(|seed| Arc::clone(&setup.task).environment(seed).unwrap()).collect();
     let policy = TorchPolicy::untrained(setup.task.spec(), &setup.experiment, 6, || Ok([0.0; 56])).unwrap();
     let mut worker = Worker::new(environments, policy, Arc::clone(&setup.layout), 0.1, 9);
     let parameters = Bytes::from(setup.policy.to_parameters().unwrap());

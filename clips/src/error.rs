@@ -156,7 +156,7 @@ pub enum Error {
     },
     /// No frame of the clip can be a start.
     #[error(
-        "clip `{name}` is too short: its frames {first} to {last} are {frames}, but looking {look_ahead} frames ahead for at least {min_steps} steps needs {needed}; lower task.reference_steps or task.min_steps, or leave it out"
+        "clip `{name}` is too short: its frames {first} to {last} are {frames}, but looking {look_ahead} frames ahead for at least {min_steps} steps needs {needed}; lower tracking.reference_steps or tracking.min_steps, or leave it out"
     )]
     TooShort {
         /// The clip.

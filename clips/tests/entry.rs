@@ -57,7 +57,7 @@ fn a_clip_too_short_for_its_look_ahead_is_refused() {
     assert_eq!(
         entry(15, 0, None).check(Cmu2020, 0.03, 5, 10).unwrap_err().to_string(),
         "clip `walk` is too short: its frames 0 to 14 are 15, but looking 5 frames ahead for at least 10 steps needs \
-         16; lower task.reference_steps or task.min_steps, or leave it out"
+         16; lower tracking.reference_steps or tracking.min_steps, or leave it out"
     );
     entry(87, 10, Some(26)).check(Cmu2020, 0.03, 5, 10).unwrap();
     assert!(entry(87, 10, Some(25)).check(Cmu2020, 0.03, 5, 10).is_err());

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::{BallCatch, Gaps, GetUp, GoToTarget, TaskName, Tracking, Walls};
+
 /// A whole experiment, resolved: what is learnt, from which motion, how, and for how long.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -10,10 +12,22 @@ pub struct Experiment {
     pub name: String,
     /// Seed of everything random: networks, actors, minibatches.
     pub seed: u64,
-    /// The reference motion, one entry per source.
+    /// What is learnt; the section of the same name holds its numbers.
+    pub task: TaskName,
+    /// Motion capture, one entry per source: what is tracked, and the poses other tasks may start in.
     pub clips: Vec<ClipSource>,
-    /// The tracking task.
-    pub task: Tracking,
+    /// Motion-capture tracking.
+    pub tracking: Tracking,
+    /// Go-to-target.
+    pub go_to_target: GoToTarget,
+    /// The corridor with gaps.
+    pub gaps: Gaps,
+    /// The corridor with walls.
+    pub walls: Walls,
+    /// Get up and stand.
+    pub get_up: GetUp,
+    /// Ball catching.
+    pub ball_catch: BallCatch,
     /// Sizes and initial values of the networks.
     pub network: Network,
     /// V-MPO's own numbers.
@@ -82,57 +96,6 @@ impl ClipSource {
 
 /// dm_control's named subsets of the CMU clips (`cmu_subsets.py`).
 pub const SUBSETS: [&str; 5] = ["walk_tiny", "run_jump_tiny", "get_up", "locomotion_small", "all"];
-
-/// Multi-clip motion-capture tracking (`dm_control/locomotion/tasks/reference_pose/tracking.py`).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Tracking {
-    /// Which frames ahead of the current one the policy sees (S: the next five).
-    pub reference_steps: Vec<usize>,
-    /// Frames a started episode must at least be able to last (dm_control: 10). The last
-    /// `max(reference_steps) + min_steps` frames are no starts; 5 gives the supplement's "last 10 frames".
-    pub min_steps: usize,
-    /// τ: the episode ends with discount 0 when the termination error exceeds it (S).
-    pub termination_threshold: f64,
-    /// How the termination error adds up.
-    pub termination_error: TerminationError,
-    /// Seconds after which an episode is truncated (dm_control's example: 30).
-    pub time_limit: f64,
-    /// Start every episode at its clip's first frame instead of a random one.
-    pub always_start_at_clip_start: bool,
-    /// Preset the actuators' filter state to the reference pose at reset. dm_control leaves it at 0, mid-range.
-    pub preset_actuators: bool,
-    /// Task observations, by dm_control's names without `walker/`, in this order
-    /// (MoCapAct's choice: the supplement's "relative target positions and orientations in the local frame").
-    pub observations: Vec<String>,
-}
-
-impl Default for Tracking {
-    fn default() -> Self {
-        Self {
-            reference_steps: vec![1, 2, 3, 4, 5],
-            min_steps: 10,
-            termination_threshold: 0.3,
-            termination_error: TerminationError::DmControl,
-            time_limit: 30.0,
-            always_start_at_clip_start: false,
-            preset_actuators: false,
-            observations: ["body_height", "reference_rel_bodies_pos_local", "reference_rel_bodies_quats"]
-                .map(String::from)
-                .to_vec(),
-        }
-    }
-}
-
-/// ε, the termination error.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum TerminationError {
-    /// ½·mean|Δ body positions| + ½·mean|Δ joints|: what the published code computes.
-    DmControl,
-    /// ‖Δ body positions‖₁ + ‖Δ joints‖₁, summed: the supplement's text, taken literally.
-    Supplement,
-}
 
 /// Sizes and initial values of every network.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -409,8 +372,14 @@ impl Default for Experiment {
         Self {
             name: "tracking-mlp".into(),
             seed: 1,
+            task: TaskName::Tracking,
             clips: vec![ClipSource::whole("builtin:CMU_007_01")],
-            task: Tracking::default(),
+            tracking: Tracking::default(),
+            go_to_target: GoToTarget::default(),
+            gaps: Gaps::default(),
+            walls: Walls::default(),
+            get_up: GetUp::default(),
+            ball_catch: BallCatch::default(),
             network: Network::default(),
             vmpo: Vmpo::default(),
             optimiser: Optimiser::default(),

@@ -18,7 +18,9 @@ mod lines;
 pub mod presets;
 mod resolve;
 mod spec;
+mod tasks;
 
 pub use document::*;
 pub use resolve::{Error, resolve};
 pub use spec::*;
+pub use tasks::*;

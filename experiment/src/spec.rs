@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::Tracking;
+use crate::{Experiment, TaskName, Tracking};
 
 /// Tracking bodies of the V2020 humanoid, `face` among them.
 const BODIES: usize = 31;
@@ -18,7 +18,7 @@ pub const TRACKING_REWARD_TERMS: [&str; 5] =
 pub const TRACKING_MAX_REWARD: f64 = 1.45;
 
 /// Sizes and names of a task: all that networks, wire and learner know of it.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskSpec {
     /// Length of the proprioception vector.
@@ -29,11 +29,63 @@ pub struct TaskSpec {
     pub action: usize,
     /// Names of the reward terms; their sum is the reward.
     pub reward_terms: Vec<String>,
+    /// The most a step can pay: what normalised rewards are relative to.
+    pub max_reward: f64,
     /// Names of the clips; a clip's index is its place here.
     pub clips: Vec<String>,
 }
 
+/// Reward terms of go-to-target.
+pub const GO_TO_TARGET_REWARD_TERMS: [&str; 1] = ["target"];
+/// Reward terms of the corridors.
+pub const CORRIDOR_REWARD_TERMS: [&str; 1] = ["velocity"];
+/// Reward terms of get-up-and-stand.
+pub const GET_UP_REWARD_TERMS: [&str; 1] = ["height"];
+/// Reward terms of ball catching.
+pub const BALL_CATCH_REWARD_TERMS: [&str; 4] = ["failure", "touch", "standing", "walking"];
+/// Height and width of the egocentric camera's image, in pixels of three bytes (C).
+pub const IMAGE_SIZE: usize = 64;
+
+impl Experiment {
+    /// The most a step of the task can pay.
+    fn max_reward(&self) -> f64 {
+        match self.task {
+            TaskName::Tracking => TRACKING_MAX_REWARD,
+            TaskName::GoToTarget | TaskName::Gaps | TaskName::Walls | TaskName::GetUp => 1.0,
+            TaskName::BallCatch => {
+                let ball = &self.ball_catch;
+                2.0 * ball.touch_reward + ball.standing_reward + ball.walking_reward
+            }
+        }
+    }
+}
+
 impl TaskSpec {
+    /// The experiment's task over these clips, whose names only tracking keeps: any other task is a clip of its own.
+    ///
+    /// # Errors
+    /// The name of an observation that the tracking task does not have.
+    pub fn new(experiment: &Experiment, clips: Vec<String>) -> Result<Self, String> {
+        let plain = |task, terms: &[&str]| Self {
+            proprioception: PROPRIOCEPTION_SIZE,
+            task,
+            action: ACTION_SIZE,
+            reward_terms: terms.iter().map(|term| (*term).to_string()).collect(),
+            max_reward: experiment.max_reward(),
+            clips: vec![experiment.task.name().to_string()],
+        };
+        Ok(match experiment.task {
+            TaskName::Tracking => return Self::tracking(&experiment.tracking, clips),
+            // The target in the root's frame.
+            TaskName::GoToTarget => plain(3, &GO_TO_TARGET_REWARD_TERMS),
+            // The root's height.
+            TaskName::Gaps | TaskName::Walls => plain(1, &CORRIDOR_REWARD_TERMS),
+            TaskName::GetUp => plain(1, &GET_UP_REWARD_TERMS),
+            // The ball's position, velocity and angular velocity in the root's frame, its radius; the target.
+            TaskName::BallCatch => plain(13, &BALL_CATCH_REWARD_TERMS),
+        })
+    }
+
     /// The tracking task over these clips.
     ///
     /// # Errors
@@ -49,6 +101,7 @@ impl TaskSpec {
             task,
             action: ACTION_SIZE,
             reward_terms: TRACKING_REWARD_TERMS.map(String::from).to_vec(),
+            max_reward: TRACKING_MAX_REWARD,
             clips,
         })
     }

@@ -34,7 +34,7 @@ fn every_preset_resolves_under_its_own_name_and_survives_writing_and_reading() {
 
 #[test]
 fn defaults_are_the_papers() {
-    let Experiment { vmpo, optimiser, unroll, network, task, .. } = resolve("tracking-mlp", &[]).unwrap();
+    let Experiment { vmpo, optimiser, unroll, network, tracking, .. } = resolve("tracking-mlp", &[]).unwrap();
     // CoMic supplement, table 1 and section 1.
     assert_eq!((unroll.batch, unroll.length), (128, 32));
     assert_eq!(vmpo.discount, 0.95);
@@ -45,15 +45,15 @@ fn defaults_are_the_papers() {
     assert_eq!((network.encoder, network.encoder_linear_path), (vec![1024, 1024], true));
     assert_eq!((network.low_level, network.value), (vec![1024, 1024], vec![1024, 1024, 1024]));
     assert_eq!((network.clip_embedding, network.latent.size, network.latent.beta), (30, 60, 5e-4));
-    assert_eq!((task.reference_steps, task.termination_threshold), (vec![1, 2, 3, 4, 5], 0.3));
+    assert_eq!((tracking.reference_steps, tracking.termination_threshold), (vec![1, 2, 3, 4, 5], 0.3));
     // V-MPO: one gradient step on the whole batch, no entropy bonus, no clipping; a target network.
     assert_eq!((vmpo.gradient_steps, vmpo.minibatch_unrolls, vmpo.target_period), (1, 128, 100));
     assert_eq!((vmpo.entropy, optimiser.max_gradient_norm, vmpo.lambda), (0.0, 0.0, 1.0));
     // What the paper does not have is off.
-    let Experiment { warm_start, network, task, optimiser, .. } = Experiment::default();
-    assert_eq!((warm_start.steps, network.normaliser_steps, task.preset_actuators), (0, 0, false));
+    let Experiment { warm_start, network, tracking, optimiser, .. } = Experiment::default();
+    assert_eq!((warm_start.steps, network.normaliser_steps, tracking.preset_actuators), (0, 0, false));
     assert_eq!((network.initial_pose, network.latent.prior), (InitialPose::MidRange, Prior::Standard));
-    assert_eq!((task.termination_error, optimiser.final_learning_rate_share), (TerminationError::DmControl, 1.0));
+    assert_eq!((tracking.termination_error, optimiser.final_learning_rate_share), (TerminationError::DmControl, 1.0));
 }
 
 #[test]
@@ -82,7 +82,12 @@ fn a_file_resolves_like_a_preset() {
 fn neither_preset_nor_file_lists_the_presets() {
     let message = resolve("trackin-mlp", &[]).unwrap_err().to_string();
     assert!(message.starts_with("no preset or file `trackin-mlp` ("), "{message}");
-    assert!(message.ends_with("presets are quickstart, quickstart-from-zero, tracking-mlp"), "{message}");
+    assert!(
+        message.ends_with(
+            "presets are quickstart, quickstart-from-zero, tracking-mlp, go-to-target, gaps, walls, get-up, ball-catch"
+        ),
+        "{message}"
+    );
 }
 
 #[test]
@@ -99,7 +104,7 @@ fn a_wrong_type_names_file_line_and_field() {
     assert!(message.ends_with("invalid type: string \"much\", expected f64"), "{message}");
     let message = refused_text("[unroll]\nlength = -1\n");
     assert!(message.contains("line 2") && message.contains("length = -1"), "{message}");
-    let message = refused_text("[task]\ntermination_error = \"dmcontrol\"\n");
+    let message = refused_text("[tracking]\ntermination_error = \"dmcontrol\"\n");
     assert!(message.contains("line 2") && message.contains("`dm-control`"), "{message}");
     let message = refused_text("[[clips]]\nids = [\"CMU_007_01\"]\n");
     assert!(message.contains("missing field `source`"), "{message}");
@@ -176,7 +181,7 @@ fn overrides_reach_every_depth_and_are_applied_in_order() {
         "vmpo.epsilon_eta=0.3",
         "network.initial_pose=reference-mean",
         "network.latent.prior.ar1.alpha=0.95",
-        "task.termination_error=\"supplement\"",
+        "tracking.termination_error=\"supplement\"",
     ])
     .unwrap();
     assert_eq!((experiment.name.as_str(), experiment.seed), ("mine", 7));
@@ -186,7 +191,7 @@ fn overrides_reach_every_depth_and_are_applied_in_order() {
         (vec![64, 64], InitialPose::ReferenceMean)
     );
     assert_eq!(experiment.network.latent.prior, Prior::Ar1 { alpha: 0.95 });
-    assert_eq!(experiment.task.termination_error, TerminationError::Supplement);
+    assert_eq!(experiment.tracking.termination_error, TerminationError::Supplement);
 }
 
 #[test]
@@ -261,11 +266,11 @@ fn values_outside_their_meaning_are_refused_by_name() {
         ("clips.0.weight=-1.0", "must be 0 or more"),
         ("clips.0.subset=\"walk\"", "must be one of walk_tiny, run_jump_tiny, get_up, locomotion_small, all"),
         ("clips.0.end_step=0", "must exceed start_step"),
-        ("task.reference_steps=[]", "must be 1 to 64 numbers of frames ahead, each 1 to 1000"),
-        ("task.reference_steps=[0]", "must be 1 to 64 numbers of frames ahead, each 1 to 1000"),
-        ("task.min_steps=0", "must be 1 to 100000"),
-        ("task.termination_threshold=0.0", "must be positive"),
-        ("task.time_limit=-30.0", "must be positive seconds"),
+        ("tracking.reference_steps=[]", "must be 1 to 64 numbers of frames ahead, each 1 to 1000"),
+        ("tracking.reference_steps=[0]", "must be 1 to 64 numbers of frames ahead, each 1 to 1000"),
+        ("tracking.min_steps=0", "must be 1 to 100000"),
+        ("tracking.termination_threshold=0.0", "must be positive"),
+        ("tracking.time_limit=-30.0", "must be positive seconds"),
         ("network.encoder=[]", "must be one or more layers of 1 to 16384 units"),
         ("network.value=[64, 0]", "must be one or more layers of 1 to 16384 units"),
         ("network.clip_embedding=0", "must be 1 to 4096"),
@@ -310,10 +315,10 @@ fn values_outside_their_meaning_are_refused_by_name() {
 
 #[test]
 fn an_observation_that_the_task_does_not_have_is_refused() {
-    let message = refused("task.observations=[\"body_height\", \"head_height\"]");
-    assert!(message.contains("task.observations.1 = \"head_height\": must be one of body_height, "), "{message}");
+    let message = refused("tracking.observations=[\"body_height\", \"head_height\"]");
+    assert!(message.contains("tracking.observations.1 = \"head_height\": must be one of body_height, "), "{message}");
     for name in TRACKING_OBSERVATIONS {
-        set(&[&format!("task.observations=[\"{name}\"]")]).unwrap();
+        set(&[&format!("tracking.observations=[\"{name}\"]")]).unwrap();
     }
 }
 

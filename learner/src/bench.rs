@@ -42,8 +42,8 @@ pub fn run(threads: usize, repeats: usize) -> Result<()> {
     tch::set_num_threads(threads as i32);
     tch::manual_seed(1);
     let experiment = Experiment::default();
-    let spec = TaskSpec::tracking(&experiment.task, vec!["clip".into()])
-        .map_err(|name| anyhow::anyhow!("no observation `{name}`"))?;
+    let spec =
+        TaskSpec::new(&experiment, vec!["clip".into()]).map_err(|name| anyhow::anyhow!("no observation `{name}`"))?;
     let mut learner = VmpoLearner::new(&spec, &experiment, &vec![0.0; spec.action], Device::Cpu)?;
     let minibatch = random_minibatch(&spec, &experiment)?;
     let products = products(&spec, &experiment);

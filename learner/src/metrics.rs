@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
-use comic_experiment::{TRACKING_MAX_REWARD, TaskSpec};
+use comic_experiment::TaskSpec;
 use comic_proto::v1::{EpisodeEnd, UnrollHeader};
 use serde_json::{Map, Value, json};
 
@@ -33,6 +33,7 @@ struct Window {
 #[derive(Debug)]
 pub struct Metrics {
     terms: Vec<String>,
+    max_reward: f64,
     run: PathBuf,
     file: File,
     window: Window,
@@ -64,6 +65,7 @@ impl Metrics {
         let file = append(&path)?;
         Ok(Self {
             terms: spec.reward_terms.clone(),
+            max_reward: spec.max_reward,
             run: run.to_path_buf(),
             file,
             window: Window::default(),
@@ -104,7 +106,7 @@ impl Metrics {
             for episode in &header.episodes {
                 let possible = f64::from(episode.steps_left_at_start.max(1));
                 let total: f64 = episode.returns.iter().map(|term| f64::from(*term)).sum();
-                window.normalised += total / (TRACKING_MAX_REWARD * possible);
+                window.normalised += total / (self.max_reward * possible);
                 window.survived += f64::from(episode.steps) / possible;
                 window.episodes += 1;
                 window.steps += u64::from(episode.steps);
@@ -142,7 +144,7 @@ impl Metrics {
             "diverged": window.diverged,
             "episode_length": per(window.steps as f64, window.episodes),
             "episode_return": per(total, window.episodes),
-            "reward_per_step": per(total / TRACKING_MAX_REWARD, window.steps),
+            "reward_per_step": per(total / self.max_reward, window.steps),
             "normalised_reward": per(window.normalised, window.episodes),
             "fraction_survived": per(window.survived, window.episodes),
             "reward_terms": terms,

@@ -120,8 +120,8 @@ fn start_trainer(setup: Setup) -> Result<Training> {
 fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shared>)> {
     let catalogue = Catalogue::open(&experiment.clips)?;
     let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
-    let spec = TaskSpec::tracking(&experiment.task, names)
-        .map_err(|name| Misuse(format!("task.observations: the tracking task has no observation `{name}`")))?;
+    let spec = TaskSpec::new(&experiment, names)
+        .map_err(|name| Misuse(format!("tracking.observations: the tracking task has no observation `{name}`")))?;
     let pose = match experiment.network.initial_pose {
         InitialPose::MidRange => vec![0.0; spec.action],
         InitialPose::ReferenceMean => catalogue.mean_action()?.iter().map(|action| *action as f32).collect(),

@@ -41,7 +41,7 @@ fn experiment(updates: u64) -> Experiment {
 }
 
 fn spec(experiment: &Experiment) -> TaskSpec {
-    TaskSpec::tracking(&experiment.task, vec!["a".into(), "b".into()]).unwrap()
+    TaskSpec::new(experiment, vec!["a".into(), "b".into()]).unwrap()
 }
 
 /// The `sequence`-th unroll of the recording: the same numbers whenever it is asked for.

@@ -11,8 +11,14 @@ use safetensors::tensor::{Dtype, TensorView};
 use tch::{Device, nn};
 
 fn store() -> nn::VarStore {
-    let spec =
-        TaskSpec { proprioception: 3, task: 4, action: 2, reward_terms: vec!["a".into()], clips: vec!["x".into()] };
+    let spec = TaskSpec {
+        proprioception: 3,
+        task: 4,
+        action: 2,
+        reward_terms: vec!["a".into()],
+        max_reward: 1.0,
+        clips: vec!["x".into()],
+    };
     let mut network = Network { encoder: vec![8], low_level: vec![8], normaliser_steps: 1, ..Network::default() };
     network.latent.size = 2;
     let store = nn::VarStore::new(Device::Cpu);

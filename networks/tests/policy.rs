@@ -14,6 +14,7 @@ fn spec() -> TaskSpec {
         task: 11,
         action: 3,
         reward_terms: vec!["a".into(), "b".into()],
+        max_reward: 1.0,
         clips: vec!["x".into(), "y".into(), "z".into()],
     }
 }

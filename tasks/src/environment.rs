@@ -3,16 +3,16 @@
 use std::sync::Arc;
 
 use comic_clips::pose_to_action;
-use mujoco_rs::prelude::*;
+use mujoco_rs::prelude::MjModel;
 use rand::SeedableRng;
 use rand_pcg::Pcg64;
 
 use crate::error::Error;
-use crate::observation::{ALL, Observation, PROPRIOCEPTION, View};
-use crate::physics::{Data, is_healthy};
+use crate::observation::{ALL, Body, Observation, View};
+use crate::physics::{Data, Simulation, is_healthy};
 use crate::reference::Reference;
 use crate::tracking::TrackingTask;
-use crate::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Step, reward};
+use crate::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Simulated, Step, control, reward};
 
 /// An environment of a [`TrackingTask`]. Owns its simulation state and its random numbers, shares all else.
 #[derive(Debug)]
@@ -40,54 +40,6 @@ impl TrackingEnvironment {
         environment
     }
 
-    /// Begins an episode at frame `start` of clip `clip`, the frame counted from the clip's own first.
-    ///
-    /// # Errors
-    /// [`Error::Start`] when that is no frame of the clip's range from which a step can be made.
-    pub fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error> {
-        let (first, frames) = self
-            .task
-            .references
-            .get(clip)
-            .map_or((0, 0), |reference| (reference.first, reference.last_step(self.task.look_ahead)));
-        match start.checked_sub(first) {
-            Some(frame) if frame < frames => {
-                self.place(clip, frame);
-                Ok(())
-            }
-            _ => Err(Error::Start { clip, start, first, frames }),
-        }
-    }
-
-    /// One control step with the control in full precision; see [`Environment::step`].
-    ///
-    /// Nothing keeps a caller from stepping on after the episode's end: the physics goes on, references stay at the
-    /// clip's last frame. After a divergence every step reports it again until the next reset.
-    pub fn step_control(&mut self, control: &[f64; 56]) -> Step {
-        if self.diverged || !control.iter().all(|value| value.is_finite()) {
-            return self.diverge();
-        }
-        self.previous.copy_from_slice(self.data.qpos());
-        self.task.models.step(&mut self.data, control);
-        self.frame += 1;
-        if !is_healthy(&self.data) {
-            return self.diverge();
-        }
-        let Self { task, data, frame, .. } = self;
-        let (reference, config) = (&task.references[self.clip], &task.config);
-        self.error = reward::termination_error(config.termination_error, &task.walker, data, reference, *frame);
-        let reward_terms =
-            reward::terms(&task.walker, data, reference, *frame, self.error, config.termination_threshold);
-        let outcome = if self.error > config.termination_threshold {
-            Outcome::Terminated
-        } else if *frame >= reference.last_step(task.look_ahead) || data.time() >= config.time_limit {
-            Outcome::Truncated
-        } else {
-            Outcome::Running
-        };
-        Step { reward_terms, discount: if outcome == Outcome::Terminated { 0.0 } else { 1.0 }, outcome }
-    }
-
     /// dm_control's whole observation dictionary, in its order, in full precision; for comparisons.
     pub fn dictionary(&self) -> Vec<(&'static str, Vec<f64>)> {
         let (view, steps) = (self.view(), self.task.config.reference_steps.len());
@@ -97,11 +49,6 @@ impl TrackingEnvironment {
             (one.name(), value)
         };
         ALL.iter().map(|one| value(*one)).collect()
-    }
-
-    /// The simulation itself, to look at.
-    pub fn simulation(&self) -> &MjData<Arc<MjModel>> {
-        &self.data
     }
 
     /// The current frame of the reference, counted from the first of the clip's range.
@@ -136,28 +83,13 @@ impl TrackingEnvironment {
 
     fn view(&self) -> View<'_> {
         View {
-            walker: &self.task.walker,
-            data: &self.data,
+            body: Body { walker: &self.task.walker, data: &self.data },
             reference: self.reference(),
             steps: &self.task.config.reference_steps,
             previous: &self.previous,
             clip: self.clip,
             start: self.start,
             frame: self.frame,
-        }
-    }
-
-    fn write(&self, observations: &[Observation], out: &mut [f32]) {
-        if self.diverged {
-            out.fill(0.0);
-            return;
-        }
-        let (view, steps) = (self.view(), self.task.config.reference_steps.len());
-        let mut rest = out;
-        for one in observations {
-            let (place, after) = rest.split_at_mut(one.size(&self.task.walker, steps));
-            one.write(&view, place);
-            rest = after;
         }
     }
 }
@@ -169,14 +101,39 @@ impl Environment for TrackingEnvironment {
         self.place(clip, start.saturating_sub(first));
     }
 
+    fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error> {
+        let (first, frames) = self
+            .task
+            .references
+            .get(clip)
+            .map_or((0, 0), |reference| (reference.first, reference.last_step(self.task.look_ahead)));
+        match start.checked_sub(first) {
+            Some(frame) if frame < frames => {
+                self.place(clip, frame);
+                Ok(())
+            }
+            _ => Err(Error::Start { clip, start, first, frames }),
+        }
+    }
+
     fn step(&mut self, action: &[f32]) -> Step {
-        let Ok(action) = <&[f32; 56]>::try_from(action) else { return self.diverge() };
-        self.step_control(&action.map(f64::from))
+        self.step_control(&control(action))
     }
 
     fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
-        self.write(&PROPRIOCEPTION, proprioception);
-        self.write(&self.task.observations, task);
+        if self.diverged {
+            proprioception.fill(0.0);
+            task.fill(0.0);
+            return;
+        }
+        let view = self.view();
+        view.body.write_proprioception(proprioception);
+        let (mut rest, steps) = (task, self.task.config.reference_steps.len());
+        for one in &self.task.observations {
+            let (place, after) = rest.split_at_mut(one.size(&self.task.walker, steps));
+            one.write(&view, place);
+            rest = after;
+        }
     }
 
     fn episode(&self) -> Episode {
@@ -190,5 +147,45 @@ impl Environment for TrackingEnvironment {
         for (place, value) in action.iter_mut().zip(target) {
             *place = value as f32;
         }
+    }
+}
+
+impl Simulated for TrackingEnvironment {
+    /// References stay at the clip's last frame when somebody steps on after its end.
+    fn step_control(&mut self, control: &[f64; 56]) -> Step {
+        if self.diverged || !control.iter().all(|value| value.is_finite()) {
+            return self.diverge();
+        }
+        self.previous.copy_from_slice(self.data.qpos());
+        self.task.models.step(&mut self.data, control);
+        self.frame += 1;
+        if !is_healthy(&self.data) {
+            return self.diverge();
+        }
+        let Self { task, data, frame, .. } = self;
+        let (reference, config) = (&task.references[self.clip], &task.config);
+        self.error = reward::termination_error(config.termination_error, &task.walker, data, reference, *frame);
+        let reward_terms =
+            reward::terms(&task.walker, data, reference, *frame, self.error, config.termination_threshold);
+        let outcome = if self.error > config.termination_threshold {
+            Outcome::Terminated
+        } else if *frame >= reference.last_step(task.look_ahead) || data.time() >= config.time_limit {
+            Outcome::Truncated
+        } else {
+            Outcome::Running
+        };
+        Step { reward_terms, discount: if outcome == Outcome::Terminated { 0.0 } else { 1.0 }, outcome }
+    }
+
+    fn model(&self) -> Arc<MjModel> {
+        self.task.models.shared()
+    }
+
+    fn simulation(&self) -> &Simulation {
+        &self.data
+    }
+
+    fn simulation_mut(&mut self) -> &mut Simulation {
+        &mut self.data
     }
 }

@@ -36,7 +36,7 @@ pub enum Error {
         reason: String,
     },
     /// An observation that the tracking task does not have.
-    #[error("task.observations: no observation `{name}`; did you mean `{nearest}`?")]
+    #[error("tracking.observations: no observation `{name}`; did you mean `{nearest}`?")]
     Observation {
         /// The name given.
         name: String,
@@ -45,10 +45,10 @@ pub enum Error {
     },
     /// No clip has a frame at which an episode may start.
     #[error(
-        "task: no clip has a start with weight above 0; lower task.min_steps ({min_steps}) or widen the clips' ranges"
+        "task: no clip has a start with weight above 0; lower tracking.min_steps ({min_steps}) or widen the clips' ranges"
     )]
     NoStarts {
-        /// `task.min_steps`.
+        /// `tracking.min_steps`.
         min_steps: usize,
     },
     /// A start that is not in the clip.

@@ -85,7 +85,7 @@ mod tests {
 
     #[test]
     fn kinematics_give_the_features_of_the_synthetic_clips() {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fixtures/tracking/synthetic_v2020.h5");
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fixtures/golden/synthetic_v2020.h5");
         assert_kinematics_give_the_files_features(&path);
     }
 

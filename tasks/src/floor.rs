@@ -2,46 +2,61 @@
 
 use std::sync::Arc;
 
-use crate::physics::Data;
-use crate::tracking::TrackingTask;
+use mujoco_rs::prelude::*;
 
-/// `6 × mj_step` + `mj_forward` per control step (10 × for clips of 0.05 s) on a task's own model, and nothing else.
-#[derive(Debug)]
+use crate::{Simulated, Simulation};
+
+/// `6 × mj_step` + `mj_forward` per control step on an environment's own model, and nothing else.
+#[derive(Debug, Default)]
 pub struct RawFloor {
-    task: Arc<TrackingTask>,
-    data: Data,
-    control: [f64; 56],
+    data: Option<Simulation>,
+}
+
+/// A state from which the physics alone goes on.
+#[derive(Clone, Debug)]
+pub struct FloorState {
+    model: Arc<MjModel>,
+    qpos: Vec<f64>,
+    qvel: Vec<f64>,
+}
+
+impl FloorState {
+    /// The state of an environment.
+    pub fn of(environment: &dyn Simulated) -> Self {
+        let simulation = environment.simulation();
+        Self { model: environment.model(), qpos: simulation.qpos().to_vec(), qvel: simulation.qvel().to_vec() }
+    }
 }
 
 impl RawFloor {
-    /// A simulation on the task's model, at the first start of its first clip.
-    pub fn new(task: &Arc<TrackingTask>) -> Self {
-        let mut floor = Self { task: Arc::clone(task), data: task.models.data(), control: [0.0; 56] };
-        let first = task.references.first().map_or(0, |reference| reference.first);
-        floor.reset_to(0, first);
-        floor
+    /// `mj_resetData` and the state.
+    pub fn reset_to(&mut self, state: &FloorState) {
+        let entered = self.data.as_mut().is_some_and(|data| data.try_swap_model(Arc::clone(&state.model)).is_ok());
+        if !entered {
+            self.data = None;
+        }
+        let data = self.data.get_or_insert_with(|| Simulation::new(Arc::clone(&state.model)));
+        data.reset();
+        data.qpos_mut().copy_from_slice(&state.qpos);
+        data.qvel_mut().copy_from_slice(&state.qvel);
     }
 
-    /// `mj_resetData` and the state at frame `start` of clip `clip`, both as in [`Episode`](crate::Episode). Frames
-    /// and clips out of range are the last ones.
-    pub fn reset_to(&mut self, clip: usize, start: usize) {
-        let Some(reference) = self.task.references.get(clip).or(self.task.references.last()) else { return };
-        let frame = start.saturating_sub(reference.first);
-        self.data.reset();
-        self.data.qpos_mut().copy_from_slice(&reference.qpos(frame));
-        self.data.qvel_mut().copy_from_slice(&reference.qvel(frame));
-    }
-
-    /// One control step; `action` as in [`Environment::step`](crate::Environment::step).
-    pub fn step(&mut self, action: &[f32]) {
-        for (place, value) in self.control.iter_mut().zip(action) {
+    /// One control step of `substeps` physics steps; `action` as in [`Environment::step`](crate::Environment::step).
+    pub fn step(&mut self, action: &[f32], substeps: usize) {
+        let Some(data) = &mut self.data else { return };
+        for (place, value) in data.ctrl_mut().iter_mut().zip(action) {
             *place = f64::from(*value);
         }
-        self.task.models.step_plainly(&mut self.data, &self.control);
+        for _ in 0..substeps {
+            data.step();
+        }
+        data.forward();
     }
 
     /// `mj_forward`: after [`RawFloor::reset_to`], the least that a reset costs.
     pub fn forward(&mut self) {
-        self.data.forward();
+        if let Some(data) = &mut self.data {
+            data.forward();
+        }
     }
 }

@@ -1,41 +1,128 @@
 //! The humanoid and the tasks it is trained on: observation, reward, termination. Knows neither libtorch nor the wire.
 //!
 //! # Layout
-//! - [`Environment`] is what an actor steps; [`TrackingTask`] is what all environments of a process share (compiled
-//!   models, reference clips), [`TrackingEnvironment`] one simulation of it.
+//! - [`Task`] is what all environments of a process share, [`Environment`] one simulation of it, and [`build`] makes the
+//!   one that an experiment names. An actor's hot path knows no more.
+//! - [`TrackingTask`] follows clips. Every other task is one file of rules (how an episode begins, what a step pays, when
+//!   it fails) that one environment plays: go-to-target, gaps, walls, get-up, ball catching.
 //! - [`humanoid`] builds the compiled model from dm_control's XML; [`floor`] is the same physics without a task, the
-//!   yardstick of the benchmarks.
+//!   yardstick of the benchmarks; [`comparison`] replays recorded episodes of dm_control's tasks.
 //!
-//! The task is dm_control's `MultiClipMocapTracking`: the state of the simulation is equal bit for bit, observations
-//! and rewards to 1e-12 (`tests/parity_tracking.rs`).
+//! Tracking, go-to-target and the corridors are dm_control's: the state of the simulation is equal bit for bit,
+//! observations and rewards to 1e-12 (`tests/parity`).
 
+mod arenas;
+mod assets;
+mod ball_catch;
+pub mod comparison;
+mod corridor;
 mod environment;
 mod error;
 mod features;
 pub mod floor;
+mod gaps;
+mod get_up;
+mod go_to_target;
 pub mod humanoid;
 mod observation;
 mod physics;
 mod quaternion;
 mod reference;
 mod reward;
+mod rules;
 mod silence;
+mod stage;
+mod start;
 mod starts;
 mod tracking;
 mod walker;
+mod walls;
+
+use std::fmt::Debug;
+use std::sync::Arc;
+
+use comic_clips::Catalogue;
+use comic_experiment::{Experiment, TaskName, TaskSpec};
+use mujoco_rs::prelude::MjModel;
+use rand::SeedableRng as _;
+use rand_pcg::Pcg64;
+
+use ball_catch::BallCatchRules;
+use corridor::CorridorRules;
+use get_up::GetUpRules;
+use go_to_target::GoToTargetRules;
+use rules::RuledTask;
+use start::Poses;
 
 pub use environment::TrackingEnvironment;
 pub use error::Error;
+pub use physics::Simulation;
 pub use starts::ClipStarts;
 pub use tracking::TrackingTask;
 
 /// The most reward terms a task has.
 pub const MAX_REWARD_TERMS: usize = 5;
 
-/// One environment of any task.
-pub trait Environment: Send {
+/// What all environments of a task share. Immutable.
+pub trait Task: Debug + Send + Sync {
+    /// Sizes and names, as networks, wire and learner know the task.
+    fn spec(&self) -> &TaskSpec;
+
+    /// Where episodes can start: frames of clips, or, for a task without clips, numbered draws.
+    fn starts(&self) -> &[ClipStarts];
+
+    /// An environment, already reset; `seed` decides all its draws.
+    ///
+    /// # Errors
+    /// When its arena cannot be built.
+    fn environment(self: Arc<Self>, seed: u64) -> Result<Box<dyn Simulated>, Error>;
+}
+
+/// The task of an experiment. Tracking follows the catalogue's clips, the others may start in their poses.
+///
+/// # Errors
+/// [`Error`]: clips that are missing or unusable, dm_control's XML missing.
+pub fn build(experiment: &Experiment, catalogue: &Catalogue) -> Result<Arc<dyn Task>, Error> {
+    let spec = || {
+        let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
+        TaskSpec::new(experiment, names).map_err(tracking::unknown)
+    };
+    let poses = |kind| Poses::new(kind, catalogue);
+    Ok(match experiment.task {
+        TaskName::Tracking => Arc::new(TrackingTask::new(&experiment.tracking, catalogue)?),
+        TaskName::GoToTarget => {
+            let config = &experiment.go_to_target;
+            Arc::new(RuledTask::new(GoToTargetRules::new(config, poses(config.start_pose)?)?, spec()?))
+        }
+        TaskName::Gaps => {
+            let (config, obstacles) = (&experiment.gaps.corridor, experiment.gaps.clone());
+            Arc::new(RuledTask::new(CorridorRules::new(config, poses(config.start_pose)?, obstacles), spec()?))
+        }
+        TaskName::Walls => {
+            let (config, obstacles) = (&experiment.walls.corridor, experiment.walls.clone());
+            Arc::new(RuledTask::new(CorridorRules::new(config, poses(config.start_pose)?, obstacles), spec()?))
+        }
+        TaskName::GetUp => Arc::new(RuledTask::new(GetUpRules::new(&experiment.get_up, catalogue)?, spec()?)),
+        TaskName::BallCatch => {
+            let config = &experiment.ball_catch;
+            let mut random = Pcg64::seed_from_u64(experiment.seed);
+            let rules = BallCatchRules::new(config, poses(config.start_pose)?, &mut random)?;
+            Arc::new(RuledTask::new(rules, spec()?))
+        }
+    })
+}
+
+/// One environment of any task, as a policy meets it.
+pub trait Environment: Debug + Send {
     /// Draws a start and begins an episode there; its first observation is ready.
     fn reset(&mut self);
+
+    /// Begins an episode at one of the task's [starts](Task::starts): for tracking at that frame of the clip, counted
+    /// from the clip's own first; for other tasks at the episode that is drawn from that number.
+    ///
+    /// # Errors
+    /// [`Error::Start`] when there is no such start.
+    fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error>;
 
     /// One control step. `action` is in control order, −1 … 1 per joint's range; values beyond are clipped by MuJoCo.
     /// A value that is not finite, or an action of another length, diverges.
@@ -44,14 +131,64 @@ pub trait Environment: Send {
     /// Writes the observation after the last reset or step; zeros when that step diverged.
     ///
     /// # Panics
-    /// When the slices are shorter than [`TaskSpec`](comic_experiment::TaskSpec) says.
+    /// When the slices are shorter than [`TaskSpec`] says.
     fn observe(&self, proprioception: &mut [f32], task: &mut [f32]);
 
     /// Where the current episode began.
     fn episode(&self) -> Episode;
 
-    /// The action whose servos aim at the pose of the next reference frame: a demonstration, and a baseline.
+    /// The action whose servos aim at the pose of the next reference frame: a demonstration, and a baseline. In a task
+    /// without reference it aims at the pose that is.
     fn servo_action(&self, action: &mut [f32]);
+}
+
+impl<E: Environment + ?Sized> Environment for Box<E> {
+    fn reset(&mut self) {
+        (**self).reset();
+    }
+
+    fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error> {
+        (**self).reset_to(clip, start)
+    }
+
+    fn step(&mut self, action: &[f32]) -> Step {
+        (**self).step(action)
+    }
+
+    fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
+        (**self).observe(proprioception, task);
+    }
+
+    fn episode(&self) -> Episode {
+        (**self).episode()
+    }
+
+    fn servo_action(&self, action: &mut [f32]) {
+        (**self).servo_action(action);
+    }
+}
+
+/// An environment that is a MuJoCo simulation: what is needed beside acting, to compare, to measure and to look.
+pub trait Simulated: Environment {
+    /// One control step with the control in full precision; see [`Environment::step`].
+    ///
+    /// Nothing keeps a caller from stepping on after the episode's end: the physics goes on. After a divergence every
+    /// step reports it again until the next reset.
+    fn step_control(&mut self, control: &[f64; 56]) -> Step;
+
+    /// The compiled model, which other simulations may share.
+    fn model(&self) -> Arc<MjModel>;
+
+    /// The simulation itself, to look at.
+    fn simulation(&self) -> &Simulation;
+
+    /// The simulation, to be drawn: MuJoCo fills in what its pictures need as it goes.
+    fn simulation_mut(&mut self) -> &mut Simulation;
+}
+
+/// An action in full precision; of another length it is no action, and not finite.
+pub(crate) fn control(action: &[f32]) -> [f64; 56] {
+    <&[f32; 56]>::try_from(action).map_or([f64::NAN; 56], |action| action.map(f64::from))
 }
 
 /// What one control step gave.

@@ -12,10 +12,38 @@ const TORQUE_THRESHOLD: f64 = 60.0;
 /// Force beyond which a touch sensor reports a touch (N, `_TOUCH_THRESHOLD`).
 const TOUCH_THRESHOLD: f64 = 1e-3;
 
-/// What the observations are computed from, after a reset or a step.
-pub(crate) struct View<'a> {
+/// The humanoid after a reset or a step.
+#[derive(Clone, Copy)]
+pub(crate) struct Body<'a> {
     pub(crate) walker: &'a Walker,
     pub(crate) data: &'a Data,
+}
+
+impl Body<'_> {
+    /// Writes [`PROPRIOCEPTION`] into `out`, which has its size.
+    pub(crate) fn write_proprioception<T: Number>(&self, out: &mut [T]) {
+        let mut rest = out;
+        for one in PROPRIOCEPTION {
+            let (place, after) = rest.split_at_mut(one.size(self.walker, 0));
+            one.write_body(self, place);
+            rest = after;
+        }
+    }
+
+    /// The part of dm_control's dictionary that all its tasks have, in its order, in full precision.
+    pub(crate) fn dictionary(&self) -> Vec<(&'static str, Vec<f64>)> {
+        let value = |one: Observation| {
+            let mut value = vec![0.0; one.size(self.walker, 0)];
+            one.write_body(self, &mut value);
+            (one.name(), value)
+        };
+        BODY.iter().map(|one| value(*one)).collect()
+    }
+}
+
+/// What the tracking task's observations are computed from, after a reset or a step.
+pub(crate) struct View<'a> {
+    pub(crate) body: Body<'a>,
     pub(crate) reference: &'a Reference,
     /// Which frames ahead are references.
     pub(crate) steps: &'a [usize],
@@ -107,6 +135,23 @@ pub(crate) const PROPRIOCEPTION: [Observation; 9] = [
     Observation::Torque,
 ];
 
+/// What the body feels, in the order of dm_control's dictionary.
+const BODY: [Observation; 13] = [
+    Observation::ActuatorActivation,
+    Observation::Appendages,
+    Observation::BodyHeight,
+    Observation::EndEffectors,
+    Observation::Joints,
+    Observation::JointsVelocity,
+    Observation::Accelerometer,
+    Observation::Force,
+    Observation::Gyro,
+    Observation::Torque,
+    Observation::Touch,
+    Observation::Velocimeter,
+    Observation::WorldZ,
+];
+
 impl Observation {
     /// The observation of that name, with or without `walker/`.
     pub(crate) fn named(name: &str) -> Option<Self> {
@@ -143,7 +188,7 @@ impl Observation {
     pub(crate) fn write<T: Number>(self, view: &View<'_>, out: &mut [T]) {
         use Observation as O;
         match self {
-            O::ReferencePropsPosition | O::ReferencePropsQuaternion | O::Force => {}
+            O::ReferencePropsPosition | O::ReferencePropsQuaternion => {}
             O::ReferenceJoints
             | O::ReferenceBodiesGlobal
             | O::ReferenceBodiesQuaternions
@@ -156,18 +201,20 @@ impl Observation {
             O::VelocimeterControl | O::GyroControl | O::JointsVelocityControl | O::TimeInClip => {
                 self.write_control(view, out);
             }
-            _ => self.write_body(view, out),
+            _ => self.write_body(&view.body, out),
         }
     }
 
     /// What the body feels now.
-    fn write_body<T: Number>(self, view: &View<'_>, out: &mut [T]) {
+    fn write_body<T: Number>(self, body: &Body<'_>, out: &mut [T]) {
         use Observation as O;
-        let View { walker, data, .. } = view;
+        let Body { walker, data } = body;
         let sensors = data.sensordata();
         let (joints, velocities) = (&data.qpos()[ROOT_COORDINATES..], &data.qvel()[ROOT_VELOCITIES..]);
         let servos = Walker::servo_joints();
         match self {
+            // The humanoid has no force sensors.
+            O::Force => {}
             // Filter states of the servos, as actions.
             O::ActuatorActivation => fill(out, data.act().iter().copied()),
             // rradius, lradius, rfoot, lfoot, head relative to the root, m, root frame.
@@ -212,7 +259,7 @@ impl Observation {
 
     fn write_frame<T: Number>(self, view: &View<'_>, frame: usize, out: &mut [T]) {
         use Observation as O;
-        let View { walker, data, reference, .. } = view;
+        let View { body: Body { walker, data }, reference, .. } = view;
         let (positions, quaternions) = (&data.xpos()[walker.tracked.clone()], &data.xquat()[walker.tracked.clone()]);
         let rotation = &data.xmat()[walker.root];
         let root_position = || std::array::from_fn(|i| data.qpos()[i]);
@@ -250,7 +297,7 @@ impl Observation {
     /// Differences to the last control step, and the time.
     fn write_control<T: Number>(self, view: &View<'_>, out: &mut [T]) {
         use Observation as O;
-        let View { data, reference, previous, .. } = view;
+        let View { body: Body { data, .. }, reference, previous, .. } = view;
         let (now, dt) = (data.qpos(), reference.dt);
         let quaternion = |qpos: &[f64]| [qpos[3], qpos[4], qpos[5], qpos[6]];
         match self {
@@ -275,7 +322,8 @@ impl Observation {
     }
 }
 
-fn fill<T: Number>(out: &mut [T], values: impl IntoIterator<Item = f64>) {
+/// Writes `values`, one after the other.
+pub(crate) fn fill<T: Number>(out: &mut [T], values: impl IntoIterator<Item = f64>) {
     for (place, value) in out.iter_mut().zip(values) {
         *place = T::of(value);
     }

@@ -7,8 +7,9 @@ use mujoco_rs::prelude::*;
 
 use crate::error::Error;
 
-/// A simulation state on a shared model.
-pub(crate) type Data = MjData<Arc<MjModel>>;
+/// A simulation on a shared model.
+pub type Simulation = MjData<Arc<MjModel>>;
+pub(crate) type Data = Simulation;
 
 /// Beyond this MuJoCo calls a number bad (`mjMAXVAL`).
 const MAX_VALUE: f64 = 1e10;
@@ -35,7 +36,17 @@ impl Models {
         Data::new(Arc::clone(&self.active))
     }
 
-    /// Puts the humanoid into a state and computes everything that follows from it without servo forces.
+    /// The model of the simulations.
+    pub(crate) fn shared(&self) -> Arc<MjModel> {
+        Arc::clone(&self.active)
+    }
+
+    /// Lets a simulation go on in this model; `false`, and it stays where it is, when the two are laid out differently.
+    pub(crate) fn take_over(&self, data: &mut Data) -> bool {
+        data.try_swap_model(Arc::clone(&self.active)).is_ok()
+    }
+
+    /// Puts everything into a state and computes everything that follows from it without servo forces.
     /// Filter states are 0 unless given.
     pub(crate) fn place(&self, data: &mut Data, qpos: &[f64], qvel: &[f64], activation: Option<&[f64]>) {
         data.reset();
@@ -58,15 +69,6 @@ impl Models {
         data.ctrl_mut().copy_from_slice(control);
         data.step2();
         for _ in 1..self.substeps {
-            data.step();
-        }
-        data.forward();
-    }
-
-    /// The plain sequence, the yardstick of the benchmarks.
-    pub(crate) fn step_plainly(&self, data: &mut Data, control: &[f64; 56]) {
-        data.ctrl_mut().copy_from_slice(control);
-        for _ in 0..self.substeps {
             data.step();
         }
         data.forward();
@@ -134,7 +136,11 @@ mod tests {
         for step in 0..50 {
             let control = std::array::from_fn(|servo| ((step * 56 + servo) as f64).sin());
             models.step(&mut cheap, &control);
-            models.step_plainly(&mut plain, &control);
+            plain.ctrl_mut().copy_from_slice(&control);
+            for _ in 0..6 {
+                plain.step();
+            }
+            plain.forward();
             assert_eq!(cheap.qpos(), plain.qpos());
             assert_eq!(cheap.qvel(), plain.qvel());
             assert_eq!(cheap.act(), plain.act());

@@ -12,6 +12,23 @@ pub(crate) fn relative(a: &[f64; 4], b: &[f64; 4]) -> [f64; 4] {
     ]
 }
 
+/// a ⊗ b: b turned by a.
+pub(crate) fn product(a: &[f64; 4], b: &[f64; 4]) -> [f64; 4] {
+    relative(&[a[0], -a[1], -a[2], -a[3]], b)
+}
+
+/// The turn by `angle` (rad) about the unit vector `axis`.
+pub(crate) fn turn(axis: [f64; 3], angle: f64) -> [f64; 4] {
+    let (sine, cosine) = (angle / 2.0).sin_cos();
+    [cosine, axis[0] * sine, axis[1] * sine, axis[2] * sine]
+}
+
+/// v turned by a unit quaternion.
+pub(crate) fn rotated(q: &[f64; 4], v: [f64; 3]) -> [f64; 3] {
+    let rotation = matrix(q);
+    std::array::from_fn(|row| (0..3).map(|column| rotation[3 * row + column] * v[column]).sum())
+}
+
 /// The quaternion divided by its length.
 pub(crate) fn normalised(q: &[f64; 4]) -> [f64; 4] {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();

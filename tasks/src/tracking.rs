@@ -13,6 +13,7 @@ use crate::physics::{Models, substeps};
 use crate::reference::Reference;
 use crate::starts::{ClipStarts, Starts};
 use crate::walker::Walker;
+use crate::{Simulated, Task};
 
 /// dm_control's `MultiClipMocapTracking` over a catalogue of clips: compiled models, reference clips, starts.
 /// Immutable; every environment of a process shares one through an `Arc`.
@@ -77,19 +78,24 @@ impl TrackingTask {
         Ok(Self { config: config.clone(), walker, models, references, starts, observations, look_ahead, spec })
     }
 
-    /// Sizes and names, as networks, wire and learner know the task.
-    pub fn spec(&self) -> &TaskSpec {
+    /// An environment of its own, already reset; `seed` decides all its draws.
+    pub fn tracking_environment(self: &Arc<Self>, seed: u64) -> TrackingEnvironment {
+        TrackingEnvironment::new(Arc::clone(self), seed)
+    }
+}
+
+impl Task for TrackingTask {
+    fn spec(&self) -> &TaskSpec {
         &self.spec
     }
 
     /// Where episodes start, clip by clip.
-    pub fn starts(&self) -> &[ClipStarts] {
+    fn starts(&self) -> &[ClipStarts] {
         self.starts.clips()
     }
 
-    /// An environment of its own, already reset; `seed` decides all its draws.
-    pub fn environment(self: &Arc<Self>, seed: u64) -> TrackingEnvironment {
-        TrackingEnvironment::new(Arc::clone(self), seed)
+    fn environment(self: Arc<Self>, seed: u64) -> Result<Box<dyn Simulated>, Error> {
+        Ok(Box::new(TrackingEnvironment::new(self, seed)))
     }
 }
 
@@ -109,7 +115,7 @@ fn task_observation(name: &str) -> Result<Observation, Error> {
         .ok_or_else(|| unknown(name.to_string()))
 }
 
-fn unknown(name: String) -> Error {
+pub(crate) fn unknown(name: String) -> Error {
     let likeness = |known: &str| strsim::jaro_winkler(known, &name);
     let nearest = TRACKING_OBSERVATIONS.into_iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)));
     Error::Observation { nearest: nearest.unwrap_or_default().to_string(), name }

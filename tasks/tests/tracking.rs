@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use comic_clips::{Catalogue, pose_to_action};
 use comic_experiment::{ClipSource, TRACKING_MAX_REWARD, TRACKING_OBSERVATIONS, TaskSpec, TerminationError, Tracking};
-use comic_tasks::{Environment, Error, Outcome, TrackingEnvironment, TrackingTask};
+use comic_tasks::{Environment, Error, Outcome, Simulated, Task, TrackingEnvironment, TrackingTask};
 
 fn catalogue(names: &[&str]) -> Catalogue {
     let sources: Vec<ClipSource> = names.iter().map(|name| ClipSource::whole(format!("builtin:{name}"))).collect();
@@ -46,7 +46,7 @@ fn the_policy_sees_dm_controls_numbers_in_the_configured_order() {
     let mut names: Vec<String> = TRACKING_OBSERVATIONS.map(String::from).to_vec();
     names.reverse();
     let task = task_of(&Tracking { observations: names.clone(), ..lenient() }, &["walk"]);
-    let mut environment = task.environment(3);
+    let mut environment = task.tracking_environment(3);
     for step in 0..5 {
         environment.step(&wild(step));
     }
@@ -77,7 +77,7 @@ fn the_policy_sees_dm_controls_numbers_in_the_configured_order() {
 #[test]
 fn an_episode_begins_in_the_clips_pose_with_filters_at_zero() {
     let task = task_of(&Tracking::default(), &["walk"]);
-    let mut environment = task.environment(0);
+    let mut environment = task.tracking_environment(0);
     environment.reset_to(0, 17).unwrap();
     let clip = catalogue(&["walk"]).load(0).unwrap();
     let data = environment.simulation();
@@ -93,7 +93,7 @@ fn an_episode_begins_in_the_clips_pose_with_filters_at_zero() {
 fn presetting_the_actuators_keeps_the_first_step_close() {
     let config = Tracking { preset_actuators: true, ..Tracking::default() };
     let after_one_servo_step = |config: &Tracking| {
-        let mut environment = task_of(config, &["walk"]).environment(0);
+        let mut environment = task_of(config, &["walk"]).tracking_environment(0);
         environment.reset_to(0, 20).unwrap();
         let mut action = [0.0f32; 56];
         environment.servo_action(&mut action);
@@ -102,7 +102,7 @@ fn presetting_the_actuators_keeps_the_first_step_close() {
     };
     assert!(2.0 * after_one_servo_step(&config) < after_one_servo_step(&Tracking::default()));
 
-    let mut environment = task_of(&config, &["walk"]).environment(0);
+    let mut environment = task_of(&config, &["walk"]).tracking_environment(0);
     environment.reset_to(0, 20).unwrap();
     let clip = catalogue(&["walk"]).load(0).unwrap();
     assert_eq!(environment.simulation().act(), pose_to_action(&clip.motion.joints[20]));
@@ -110,7 +110,7 @@ fn presetting_the_actuators_keeps_the_first_step_close() {
 
 #[test]
 fn the_servo_action_aims_at_the_next_frame() {
-    let mut environment = task_of(&Tracking::default(), &["run"]).environment(0);
+    let mut environment = task_of(&Tracking::default(), &["run"]).tracking_environment(0);
     environment.reset_to(0, 5).unwrap();
     let clip = catalogue(&["run"]).load(0).unwrap();
     for frame in 6..9 {
@@ -124,7 +124,7 @@ fn the_servo_action_aims_at_the_next_frame() {
 #[test]
 fn an_episode_is_truncated_at_the_clips_end_with_discount_one() {
     let task = task_of(&lenient(), &["walk"]);
-    let mut environment = task.environment(0);
+    let mut environment = task.tracking_environment(0);
     let last_start = task.starts()[0].frames.end - 1;
     environment.reset_to(0, last_start).unwrap();
     assert_eq!(environment.episode().steps_left, 10);
@@ -137,7 +137,7 @@ fn an_episode_is_truncated_at_the_clips_end_with_discount_one() {
 
 #[test]
 fn an_episode_is_truncated_at_the_time_limit_with_discount_one() {
-    let mut environment = task_of(&Tracking { time_limit: 0.1, ..lenient() }, &["walk"]).environment(0);
+    let mut environment = task_of(&Tracking { time_limit: 0.1, ..lenient() }, &["walk"]).tracking_environment(0);
     let outcomes: Vec<_> = (0..4).map(|_| environment.step(&[0.0; 56])).collect();
     assert!(outcomes[..3].iter().all(|step| step.outcome == Outcome::Running));
     assert_eq!((outcomes[3].outcome, outcomes[3].discount), (Outcome::Truncated, 1.0));
@@ -146,7 +146,7 @@ fn an_episode_is_truncated_at_the_time_limit_with_discount_one() {
 #[test]
 fn an_episode_is_terminated_beyond_the_threshold_with_discount_zero_and_its_reward() {
     let task = task_of(&Tracking::default(), &["walk"]);
-    let mut environment = task.environment(0);
+    let mut environment = task.tracking_environment(0);
     environment.reset_to(0, 0).unwrap();
     for step in 0..60 {
         let result = environment.step(&wild(step));
@@ -166,7 +166,7 @@ fn an_episode_is_terminated_beyond_the_threshold_with_discount_zero_and_its_rewa
 #[test]
 fn no_step_pays_more_than_the_maximum() {
     let mut environment =
-        task_of(&Tracking { preset_actuators: true, ..Tracking::default() }, &["stand"]).environment(0);
+        task_of(&Tracking { preset_actuators: true, ..Tracking::default() }, &["stand"]).tracking_environment(0);
     let mut action = [0.0f32; 56];
     environment.servo_action(&mut action);
     let reward = environment.step(&action).reward();
@@ -177,7 +177,7 @@ fn no_step_pays_more_than_the_maximum() {
 fn an_action_that_is_no_number_diverges_and_a_reset_recovers() {
     let task = task_of(&Tracking::default(), &["walk"]);
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-        let mut environment = task.environment(0);
+        let mut environment = task.tracking_environment(0);
         let mut action = [0.0f32; 56];
         action[13] = bad;
         for attempt in [&action[..], &[0.0; 56]] {
@@ -193,13 +193,13 @@ fn an_action_that_is_no_number_diverges_and_a_reset_recovers() {
 
 #[test]
 fn an_action_of_another_length_diverges() {
-    let mut environment = task_of(&Tracking::default(), &["walk"]).environment(0);
+    let mut environment = task_of(&Tracking::default(), &["walk"]).tracking_environment(0);
     assert_eq!(environment.step(&[0.0; 55]).outcome, Outcome::Diverged);
 }
 
 #[test]
 fn stepping_on_after_the_end_never_panics() {
-    let mut environment = task_of(&Tracking::default(), &["walk"]).environment(0);
+    let mut environment = task_of(&Tracking::default(), &["walk"]).tracking_environment(0);
     for step in 0..400 {
         environment.step(&wild(step));
         assert_eq!(environment.dictionary().len(), 28);
@@ -210,7 +210,7 @@ fn stepping_on_after_the_end_never_panics() {
 fn a_seed_decides_an_environments_whole_life() {
     let task = task_of(&Tracking::default(), &["walk", "run", "jump"]);
     let life = |seed: u64| {
-        let mut environment = task.environment(seed);
+        let mut environment = task.tracking_environment(seed);
         let mut seen = Vec::new();
         for step in 0..40 {
             let result = environment.step(&wild(step));
@@ -234,7 +234,7 @@ fn a_seed_decides_an_environments_whole_life() {
 #[test]
 fn episodes_start_where_the_law_says() {
     let task = task_of(&Tracking::default(), &["walk", "run"]);
-    let mut environment = task.environment(5);
+    let mut environment = task.tracking_environment(5);
     for _ in 0..200 {
         environment.reset();
         let episode = environment.episode();
@@ -249,7 +249,7 @@ fn a_sub_range_is_a_clip_of_its_own() {
     let catalogue = Catalogue::open(&[source]).unwrap();
     let task = Arc::new(TrackingTask::new(&lenient(), &catalogue).unwrap());
     assert_eq!(task.starts()[0].frames, 20..45);
-    let mut environment = task.environment(0);
+    let mut environment = task.tracking_environment(0);
     environment.reset_to(0, 20).unwrap();
     // 41 frames, as dm_control slices them: the end is inclusive. The last five are references only.
     assert_eq!(environment.episode().steps_left, 35);
@@ -265,7 +265,7 @@ fn a_sub_range_is_a_clip_of_its_own() {
 #[test]
 fn starting_always_at_the_clips_start_is_an_option() {
     let config = Tracking { always_start_at_clip_start: true, ..Tracking::default() };
-    let mut environment = task_of(&config, &["walk", "run"]).environment(9);
+    let mut environment = task_of(&config, &["walk", "run"]).tracking_environment(9);
     for _ in 0..50 {
         environment.reset();
         assert_eq!(environment.episode().start, 0);
@@ -276,7 +276,7 @@ fn starting_always_at_the_clips_start_is_an_option() {
 fn the_supplements_termination_error_adds_what_the_codes_averages() {
     let run = |kind: TerminationError| {
         let config = Tracking { termination_error: kind, ..lenient() };
-        let mut environment = task_of(&config, &["walk"]).environment(0);
+        let mut environment = task_of(&config, &["walk"]).tracking_environment(0);
         environment.reset_to(0, 3).unwrap();
         (0..20).map(|step| (environment.step(&wild(step)), environment.termination_error()).1).collect::<Vec<_>>()
     };
@@ -292,7 +292,7 @@ fn an_unknown_observation_is_refused_with_the_nearest_known_one() {
     let error = TrackingTask::new(&config, &catalogue(&["walk"])).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "task.observations: no observation `reference_rel_joint`; did you mean `reference_rel_joints`?"
+        "tracking.observations: no observation `reference_rel_joint`; did you mean `reference_rel_joints`?"
     );
 }
 
@@ -313,7 +313,7 @@ fn clips_of_the_2019_body_are_compared_but_not_trained_on() {
     assert!(error.to_string().contains("cmuv2019_001"), "{error}");
     let task = Arc::new(TrackingTask::comparison(&config, &catalogue).unwrap());
     assert_eq!(task.spec().proprioception, 149);
-    let mut environment = task.environment(0);
+    let mut environment = task.tracking_environment(0);
     environment.step(&[0.0; 56]);
     let (proprioception, rest) = observation(&task, &environment);
     assert!(proprioception.iter().chain(&rest).all(|value| value.is_finite()));

@@ -1,6 +1,6 @@
 """Rollouts of dm_control's own tracking task, to compare another implementation with.
 
-    python tests/python/make_tracking_fixtures.py --seed 1 --out tests/fixtures/tracking
+    python tests/python/make_tracking_fixtures.py --seed 1 --out tests/fixtures/golden
 
 Needs requirements-tracking.txt and nothing from this repository. Everything drawn comes from the seed, so one seed
 gives the same bytes again on the same machine; another machine's libm may move the last digits. Written are

@@ -8,7 +8,7 @@ use std::time::Instant;
 use bytes::Bytes;
 use comic_proto::{UnrollLayout, UnrollShape};
 use comic_tasks::floor::RawFloor;
-use comic_tasks::{Environment, TrackingEnvironment};
+use comic_tasks::{Environment, Simulated};
 
 use super::figure::{Figure, interleave};
 use super::tape::Recorded;
@@ -22,9 +22,9 @@ use crate::worker::{Progress, Worker};
 
 /// One thread against the physics alone.
 pub(super) fn policy(subject: &Subject) -> Result<Figure, Error> {
-    let (environments, tapes): (Vec<_>, Vec<_>) = environments(subject, 1).into_iter().map(Recorded::new).unzip();
+    let (environments, tapes): (Vec<_>, Vec<_>) = environments(subject, 1)?.into_iter().map(Recorded::new).unzip();
     let mut worker = worker(subject, environments, 1)?;
-    let mut floors: Vec<_> = tapes.iter().map(|_| RawFloor::new(&subject.task)).collect();
+    let mut floors: Vec<_> = tapes.iter().map(|_| RawFloor::default()).collect();
     let medians = interleave(subject.budget, || {
         let value = unroll_rate(&mut worker)?;
         let begin = Instant::now();
@@ -38,8 +38,8 @@ pub(super) fn policy(subject: &Subject) -> Result<Figure, Error> {
 
 /// Two threads against one.
 pub(super) fn threads(subject: &Subject) -> Result<Figure, Error> {
-    let mut one = worker(subject, environments(subject, 1), 1)?;
-    let mut other = worker(subject, environments(subject, 2), 2)?;
+    let mut one = worker(subject, environments(subject, 1)?, 1)?;
+    let mut other = worker(subject, environments(subject, 2)?, 2)?;
     let medians = interleave(subject.budget, || {
         let both = thread::scope(|scope| {
             let second = scope.spawn(|| unroll_rate(&mut other));
@@ -53,8 +53,8 @@ pub(super) fn threads(subject: &Subject) -> Result<Figure, Error> {
     Ok(Figure::new("actor.threads", "steps/s", medians, note))
 }
 
-fn environments(subject: &Subject, family: u64) -> Vec<TrackingEnvironment> {
-    (0..ENVIRONMENTS as u64).map(|index| subject.task.environment(derive(family, index))).collect()
+fn environments(subject: &Subject, family: u64) -> Result<Vec<Box<dyn Simulated>>, Error> {
+    (0..ENVIRONMENTS as u64).map(|index| Ok(subject.environment(derive(family, index))?)).collect()
 }
 
 fn worker<E: Environment>(subject: &Subject, environments: Vec<E>, seed: u64) -> Result<Worker<E, TorchPolicy>, Error> {

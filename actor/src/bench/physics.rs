@@ -3,7 +3,7 @@
 use std::convert::Infallible;
 use std::time::Instant;
 
-use comic_tasks::floor::RawFloor;
+use comic_tasks::floor::{FloorState, RawFloor};
 use comic_tasks::{Environment as _, Outcome};
 use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
@@ -11,17 +11,18 @@ use rand_pcg::Pcg64;
 use super::Subject;
 use super::figure::{Figure, Medians, interleave};
 use super::tape::Recorded;
+use crate::Error;
 
-/// Control steps of a segment: about a tenth of a second.
-const STEPS: usize = 256;
+/// Control steps of a segment: a fifth of a second, and as many as a corridor is used for before the next is compiled.
+const STEPS: usize = 512;
 /// Resets of a segment.
 const RESETS: usize = 32;
 
 /// One environment under uniformly random actions, observations and resets included.
-pub(super) fn environment(subject: &Subject) -> Figure {
+pub(super) fn environment(subject: &Subject) -> Result<Figure, Error> {
     let spec = subject.task.spec();
-    let (mut environment, tape) = Recorded::new(subject.task.environment(1));
-    let mut floor = RawFloor::new(&subject.task);
+    let (mut environment, tape) = Recorded::new(subject.environment(1)?);
+    let mut floor = RawFloor::default();
     let mut rng = Pcg64::seed_from_u64(1);
     let mut actions = vec![0.0_f32; STEPS * spec.action];
     let (mut proprioception, mut task) = (vec![0.0; spec.proprioception], vec![0.0; spec.task]);
@@ -43,35 +44,35 @@ pub(super) fn environment(subject: &Subject) -> Figure {
         Ok((value, steps as f64 / begin.elapsed().as_secs_f64()))
     }));
     let note = "one thread, random actions, resets and observations included; floor: 6 x mj_step + mj_forward";
-    Figure::new("actor.env", "steps/s", medians, note)
+    Ok(Figure::new("actor.env", "steps/s", medians, note))
 }
 
 /// A reset with its first observation, against `mj_resetData` and `mj_forward`.
-pub(super) fn reset(subject: &Subject) -> Figure {
+pub(super) fn reset(subject: &Subject) -> Result<Figure, Error> {
     let spec = subject.task.spec();
-    let mut environment = subject.task.environment(1);
-    let mut floor = RawFloor::new(&subject.task);
+    let mut environment = subject.environment(1)?;
+    let mut floor = RawFloor::default();
     let (mut proprioception, mut task) = (vec![0.0; spec.proprioception], vec![0.0; spec.task]);
-    let mut episodes = Vec::with_capacity(RESETS);
+    let mut states = Vec::with_capacity(RESETS);
     let medians = infallible(interleave(subject.budget, || {
-        episodes.clear();
+        states.clear();
         let begin = Instant::now();
         for _ in 0..RESETS {
             environment.reset();
             environment.observe(&mut proprioception, &mut task);
-            episodes.push(environment.episode());
+            states.push(FloorState::of(environment.as_ref()));
         }
         let value = begin.elapsed().as_secs_f64();
         let begin = Instant::now();
-        for episode in &episodes {
-            floor.reset_to(episode.clip, episode.start);
+        for state in &states {
+            floor.reset_to(state);
             floor.forward();
         }
         let milliseconds = 1000.0 / RESETS as f64;
         Ok((value * milliseconds, begin.elapsed().as_secs_f64() * milliseconds))
     }));
     let note = "a reset with its first observation; floor: mj_resetData + mj_forward";
-    Figure::new("actor.reset", "ms", medians, note)
+    Ok(Figure::new("actor.reset", "ms", medians, note))
 }
 
 fn infallible(medians: Result<Medians, Infallible>) -> Medians {

@@ -2,14 +2,17 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use comic_tasks::floor::RawFloor;
-use comic_tasks::{Environment, Episode, Step, TrackingEnvironment};
+use comic_tasks::floor::{FloorState, RawFloor};
+use comic_tasks::{Environment, Episode, Simulated, Step};
 
-/// Resets (with their starts) and controls, in order.
+/// Physics steps in a control step of 0.03 s.
+pub(super) const SUBSTEPS: usize = 6;
+
+/// Resets (with the states they led to) and controls, in order.
 #[derive(Debug, Default)]
 struct Recording {
     /// A reset, or a step that takes the next action.
-    events: Vec<Option<Episode>>,
+    events: Vec<Option<FloorState>>,
     actions: Vec<f32>,
     width: usize,
 }
@@ -26,11 +29,11 @@ impl Tape {
         let mut steps = 0;
         for event in recording.events {
             match event {
-                Some(episode) => floor.reset_to(episode.clip, episode.start),
+                Some(state) => floor.reset_to(&state),
                 None => {
                     steps += 1;
                     if let Some(action) = actions.next() {
-                        floor.step(action);
+                        floor.step(action, SUBSTEPS);
                     }
                 }
             }
@@ -42,12 +45,12 @@ impl Tape {
 /// An environment that keeps a tape.
 #[derive(Debug)]
 pub(super) struct Recorded {
-    environment: TrackingEnvironment,
+    environment: Box<dyn Simulated>,
     tape: Tape,
 }
 
 impl Recorded {
-    pub(super) fn new(environment: TrackingEnvironment) -> (Self, Tape) {
+    pub(super) fn new(environment: Box<dyn Simulated>) -> (Self, Tape) {
         let tape = Tape::default();
         (Self { environment, tape: tape.clone() }, tape)
     }
@@ -61,7 +64,10 @@ impl Recorded {
 impl Environment for Recorded {
     fn reset(&mut self) {
         self.environment.reset();
-        self.record(|recording| recording.events.push(Some(self.environment.episode())));
+        self.record(|recording| recording.events.push(Some(FloorState::of(self.environment.as_ref()))));
+    }
+    fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), comic_tasks::Error> {
+        self.environment.reset_to(clip, start)
     }
     fn step(&mut self, action: &[f32]) -> Step {
         self.record(|recording| {

@@ -2,13 +2,12 @@
 
 use std::io::{IsTerminal as _, Write as _};
 use std::path::PathBuf;
-use std::sync::Arc;
 
 use clap::Args;
 use comic_clips::Catalogue;
 use comic_experiment::{ClipSource, Experiment};
 use comic_proto::v1::EvaluationReport;
-use comic_tasks::TrackingTask;
+use comic_tasks::Task;
 
 use super::delivery::deliver;
 use super::{Evaluated, Options, Report, evaluate};
@@ -26,8 +25,8 @@ With --json one object goes to standard output:
     diverged           how many of them ended because the simulation diverged
     length_mean        mean steps of an episode
     return_mean        mean return
-    normalised_reward  mean of return / (1.45 x steps left in the clip at the episode's start)
-    reward_per_step    reward per survived step / 1.45
+    normalised_reward  mean of return / (most a step pays x steps left at the episode's start)
+    reward_per_step    reward per survived step / most a step pays, 1.45 in tracking
     fraction_survived  mean of steps / steps left in the clip at the episode's start
     reward_terms       each reward term's mean per step, by name
   overall        the same over all episodes; its clip is \"overall\"";
@@ -42,7 +41,7 @@ pub struct Evaluate {
     /// The experiment to evaluate without a checkpoint: a preset's name or a TOML file.
     #[arg(long, value_name = "NAME|FILE", conflicts_with = "checkpoint")]
     preset: Option<String>,
-    /// Overrides a field of the preset, for instance `--set task.termination_threshold=0.5`.
+    /// Overrides a field of the preset, for instance `--set tracking.termination_threshold=0.5`.
     #[arg(long, value_name = "FIELD=VALUE", requires = "preset")]
     set: Vec<String>,
     /// The policy as it is before any learning.
@@ -105,7 +104,7 @@ impl Evaluate {
             experiment.clips = self.clips.iter().map(|source| ClipSource::parse(source)).collect();
         }
         let catalogue = Catalogue::open(&experiment.clips)?;
-        let task = Arc::new(TrackingTask::new(&experiment.task, &catalogue)?);
+        let task = comic_tasks::build(&experiment, &catalogue)?;
         let options = Options {
             episodes: self.episodes.map(|episodes| episodes as usize),
             deterministic: self.deterministic,
@@ -113,7 +112,7 @@ impl Evaluate {
             ..Options::default()
         };
         let latent = experiment.network.latent.size;
-        let mut policy = self.policy(&experiment, &task, own.as_ref(), parameters.as_deref())?;
+        let mut policy = self.policy(&experiment, task.as_ref(), own.as_ref(), parameters.as_deref())?;
         let mut evaluated = policy.as_mut().map_or(Evaluated::Servo, Evaluated::Policy);
         evaluate(&mut evaluated, &task, latent, &options, &mut show_progress)
     }
@@ -139,7 +138,7 @@ impl Evaluate {
     fn policy(
         &self,
         experiment: &Experiment,
-        task: &TrackingTask,
+        task: &dyn Task,
         own: Option<&Catalogue>,
         parameters: Option<&[u8]>,
     ) -> Result<Option<TorchPolicy>, Error> {

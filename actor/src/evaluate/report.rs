@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use comic_experiment::{TRACKING_MAX_REWARD, TaskSpec};
+use comic_experiment::TaskSpec;
 use comic_tasks::MAX_REWARD_TERMS;
 use serde::{Deserialize, Serialize};
 
@@ -51,9 +51,9 @@ pub struct ClipReport {
     pub length_mean: f64,
     /// Mean return.
     pub return_mean: f64,
-    /// Mean of return / (1.45 × steps left in the clip at the start).
+    /// Mean of return / (the most a step pays × steps left at the start).
     pub normalised_reward: f64,
-    /// Mean over all steps of reward / 1.45.
+    /// Mean over all steps of reward / the most a step pays.
     pub reward_per_step: f64,
     /// Mean of steps / steps left in the clip at the start.
     pub fraction_survived: f64,
@@ -70,17 +70,17 @@ impl Report {
             .enumerate()
             .map(|(index, name)| {
                 let of_clip: Vec<Finished> = finished.iter().filter(|e| e.clip == index).copied().collect();
-                ClipReport::new(name, &spec.reward_terms, &of_clip)
+                ClipReport::new(name, spec, &of_clip)
             })
             .filter(|clip| clip.episodes > 0)
             .collect();
-        let overall = ClipReport::new("overall", &spec.reward_terms, finished);
+        let overall = ClipReport::new("overall", spec, finished);
         Self { deterministic: options.deterministic, seed: options.seed, clips, overall }
     }
 }
 
 impl ClipReport {
-    fn new(clip: &str, terms: &[String], finished: &[Finished]) -> Self {
+    fn new(clip: &str, spec: &TaskSpec, finished: &[Finished]) -> Self {
         let mean = |value: &dyn Fn(&Finished) -> f64| ratio(finished.iter().map(value).sum(), finished.len() as f64);
         let total = |episode: &Finished| episode.returns.iter().sum::<f64>();
         let steps: f64 = finished.iter().map(|episode| episode.steps as f64).sum();
@@ -91,10 +91,11 @@ impl ClipReport {
             diverged: finished.iter().filter(|episode| episode.diverged).count(),
             length_mean: mean(&|episode| episode.steps as f64),
             return_mean: mean(&total),
-            normalised_reward: mean(&|episode| ratio(total(episode), TRACKING_MAX_REWARD * episode.steps_left as f64)),
-            reward_per_step: per_step(&total) / TRACKING_MAX_REWARD,
+            normalised_reward: mean(&|episode| ratio(total(episode), spec.max_reward * episode.steps_left as f64)),
+            reward_per_step: ratio(per_step(&total), spec.max_reward),
             fraction_survived: mean(&|episode| ratio(episode.steps as f64, episode.steps_left as f64)),
-            reward_terms: terms
+            reward_terms: spec
+                .reward_terms
                 .iter()
                 .zip(0..MAX_REWARD_TERMS)
                 .map(|(name, term)| (name.clone(), per_step(&|episode| episode.returns[term])))
@@ -118,6 +119,7 @@ mod tests {
             task: 1,
             action: 1,
             reward_terms: vec!["pose".into(), "velocity".into()],
+            max_reward: 1.45,
             clips: vec!["walk".into(), "run".into(), "unused".into()],
         }
     }

@@ -1,6 +1,6 @@
 //! Rolling out a list of starts, many environments in one forward pass.
 
-use comic_tasks::{Environment, MAX_REWARD_TERMS, Outcome, TrackingEnvironment};
+use comic_tasks::{Environment, MAX_REWARD_TERMS, Outcome};
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
 
@@ -26,21 +26,6 @@ pub struct Start {
     pub start: usize,
 }
 
-/// An environment that can be told where to start.
-pub trait Startable: Environment {
-    /// Begins an episode there.
-    ///
-    /// # Errors
-    /// When the clip has no such start.
-    fn start_at(&mut self, start: Start) -> Result<(), Error>;
-}
-
-impl Startable for TrackingEnvironment {
-    fn start_at(&mut self, start: Start) -> Result<(), Error> {
-        Ok(self.reset_to(start.clip, start.start)?)
-    }
-}
-
 /// An environment, and the episode it is in.
 struct Lane<E> {
     environment: E,
@@ -48,7 +33,7 @@ struct Lane<E> {
 }
 
 /// Rolls out every start; episodes come back in the order they end.
-pub(super) fn run<E: Startable, F: ForwardPass>(
+pub(super) fn run<E: Environment, F: ForwardPass>(
     evaluated: &mut Evaluated<'_, F>,
     environments: Vec<E>,
     sizes: ActingSizes,
@@ -79,7 +64,7 @@ pub(super) fn run<E: Startable, F: ForwardPass>(
     Ok(finished)
 }
 
-fn act<E: Startable, F: ForwardPass>(
+fn act<E: Environment, F: ForwardPass>(
     evaluated: &mut Evaluated<'_, F>,
     lanes: &[Lane<E>],
     batch: &mut ActingBatch,
@@ -103,11 +88,11 @@ fn act<E: Startable, F: ForwardPass>(
     }
 }
 
-impl<E: Startable> Lane<E> {
+impl<E: Environment> Lane<E> {
     fn begin(&mut self, start: Option<Start>, batch: &mut ActingBatch, index: usize) -> Result<(), Error> {
         self.episode = None;
         let Some(start) = start else { return Ok(()) };
-        self.environment.start_at(start)?;
+        self.environment.reset_to(start.clip, start.start)?;
         let row = batch.row(index);
         self.environment.observe(row.proprioception, row.task);
         row.previous_latent.fill(0.0);
@@ -158,6 +143,7 @@ mod tests {
     use super::*;
 
     /// Falls after three steps when it starts at an odd frame; pays 1 a step for an action of exactly 0.25.
+    #[derive(Debug)]
     struct Fixed {
         start: usize,
         step: usize,
@@ -165,6 +151,10 @@ mod tests {
 
     impl Environment for Fixed {
         fn reset(&mut self) {}
+        fn reset_to(&mut self, _clip: usize, start: usize) -> Result<(), comic_tasks::Error> {
+            (self.start, self.step) = (start, 0);
+            Ok(())
+        }
         fn step(&mut self, action: &[f32]) -> Step {
             self.step += 1;
             let mut reward_terms = [0.0; MAX_REWARD_TERMS];
@@ -184,13 +174,6 @@ mod tests {
         }
         fn servo_action(&self, action: &mut [f32]) {
             action.fill(0.25);
-        }
-    }
-
-    impl Startable for Fixed {
-        fn start_at(&mut self, start: Start) -> Result<(), Error> {
-            (self.start, self.step) = (start.start, 0);
-            Ok(())
         }
     }
 

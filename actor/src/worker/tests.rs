@@ -30,6 +30,9 @@ impl Environment for Counter {
         self.episodes += 1;
         self.step = 0;
     }
+    fn reset_to(&mut self, _clip: usize, _start: usize) -> Result<(), comic_tasks::Error> {
+        Ok(())
+    }
     fn step(&mut self, action: &[f32]) -> Step {
         assert!(self.step < self.length(), "an episode was stepped beyond its end");
         assert!(action.iter().all(|value| (-1.0..=1.0).contains(value)), "the simulator saw an unclipped action");

@@ -19,8 +19,9 @@ pub(crate) struct FixtureOptions {
 }
 
 /// The scripts that make fixtures: script, its requirements, the directory of its fixtures; all under `tests/`.
-const FIXTURES: [(&str, &str, &str); 2] = [
-    ("make_tracking_fixtures.py", "requirements-tracking.txt", "tracking"),
+const FIXTURES: [(&str, &str, &str); 3] = [
+    ("make_tracking_fixtures.py", "requirements-tracking.txt", "golden"),
+    ("make_task_fixtures.py", "requirements-tracking.txt", "golden"),
     ("make_vmpo_fixtures.py", "requirements-vmpo.txt", "vmpo"),
 ];
 

@@ -23,6 +23,7 @@ pub(crate) fn spec() -> TaskSpec {
         task: WIDTHS.task,
         action: WIDTHS.action,
         reward_terms: vec!["near".into(), "far".into()],
+        max_reward: 1.0,
         clips: vec!["walk".into(), "run".into(), "jump".into()],
     }
 }

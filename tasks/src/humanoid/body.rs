@@ -7,7 +7,8 @@ use mujoco_rs::prelude::*;
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjtLimited};
 
 use super::servos::{self, FILTER_TIME_CONSTANT, Servo};
-use super::{END_EFFECTORS, assets, missing, refused};
+use super::{END_EFFECTORS, missing, refused};
+use crate::assets;
 use crate::error::Error;
 
 /// Lengths and sizes of the V2020 body relative to its XML, and its mass in kg (`rescale_humanoid(self, 1.2, 1.2, 70)`).

@@ -133,7 +133,7 @@ impl Learner for FakeLearner {
         }
         self.inner.seen.send_modify(|seen| seen.joins.push(request.into_inner()));
         let experiment = self.inner.experiment.lock().unwrap().clone();
-        let spec = TaskSpec::tracking(&experiment.task, vec!["walk".into()]).unwrap();
+        let spec = TaskSpec::new(&experiment, vec!["walk".into()]).unwrap();
         let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
         let layout_hash = if self.inner.script.wrong_layout { vec![0; 32] } else { layout.hash().to_vec() };
         let asset = |bytes: &Vec<u8>| Asset {

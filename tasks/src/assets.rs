@@ -8,7 +8,7 @@ const VARIABLE: &str = "COMIC_DM_CONTROL_DIR";
 
 /// The directory of dm_control's XML files: the environment variable `COMIC_DM_CONTROL_DIR` when the program runs,
 /// else its value when the program was built, else `.deps/dm_control`.
-pub(super) fn directory() -> Result<PathBuf, Error> {
+pub(crate) fn directory() -> Result<PathBuf, Error> {
     let candidates = [
         std::env::var_os(VARIABLE).map(PathBuf::from),
         option_env!("COMIC_DM_CONTROL_DIR").map(PathBuf::from),
@@ -26,7 +26,7 @@ pub(super) fn directory() -> Result<PathBuf, Error> {
 }
 
 /// The path of one of its files.
-pub(super) fn file(directory: &Path, name: &str) -> Result<PathBuf, Error> {
+pub(crate) fn file(directory: &Path, name: &str) -> Result<PathBuf, Error> {
     let path = directory.join(name);
     if path.is_file() {
         Ok(path)

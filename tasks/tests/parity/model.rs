@@ -1,10 +1,12 @@
 //! The compiled model against dm_control's: every array, bit for bit.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use comic_clips::WalkerModel;
-use comic_tasks::humanoid;
+use comic_tasks::{comparison, humanoid};
+use mujoco_rs::prelude::MjModel;
 
+use crate::rules::RecordedArena;
 use crate::{model_arrays, npz};
 
 fn golden(name: &str) -> Option<PathBuf> {
@@ -16,9 +18,9 @@ fn golden(name: &str) -> Option<PathBuf> {
     None
 }
 
-fn assert_every_array_equal(model: WalkerModel, file: &str) {
+fn assert_every_array_equal(build: impl FnOnce(&Path) -> MjModel, file: &str) {
     let Some(path) = golden(file) else { return };
-    let ours = humanoid::build(model).unwrap();
+    let ours = build(&path);
     let arrays = npz::read(&path).unwrap();
     // Sizes first: they vouch for the lengths of the arrays.
     let (sizes, rest): (Vec<_>, Vec<_>) = arrays.iter().partition(|(_, array)| array.shape.is_empty());
@@ -42,10 +44,31 @@ fn assert_every_array_equal(model: WalkerModel, file: &str) {
 
 #[test]
 fn parity_of_every_array_of_the_2020_body() {
-    assert_every_array_equal(WalkerModel::Cmu2020, "tracking_model.npz");
+    assert_every_array_equal(|_| humanoid::build(WalkerModel::Cmu2020).unwrap(), "tracking_model.npz");
 }
 
 #[test]
 fn parity_of_every_array_of_the_2019_body() {
-    assert_every_array_equal(WalkerModel::Cmu2019, "tracking2019_model.npz");
+    assert_every_array_equal(|_| humanoid::build(WalkerModel::Cmu2019).unwrap(), "tracking2019_model.npz");
+}
+
+#[test]
+fn parity_of_every_array_of_go_to_target() {
+    assert_every_array_equal(|_| comparison::go_to_target_model().unwrap(), "go_to_target_model.npz");
+}
+
+fn corridor(model: &Path) -> MjModel {
+    let name = model.file_name().unwrap().to_string_lossy().replace("_model.npz", "_arena.json");
+    let recorded = RecordedArena::read(&model.with_file_name(name)).unwrap();
+    comparison::corridor_model(recorded.length, recorded.width, &recorded.platforms, &recorded.walls).unwrap()
+}
+
+#[test]
+fn parity_of_every_array_of_the_gaps() {
+    assert_every_array_equal(corridor, "gaps_model.npz");
+}
+
+#[test]
+fn parity_of_every_array_of_the_walls() {
+    assert_every_array_equal(corridor, "walls_model.npz");
 }

@@ -1,25 +1,48 @@
-//! The tracking task against dm_control's own rollouts.
+//! The tasks that dm_control publishes against its own rollouts.
 //!
-//! `COMIC_GOLDEN_DIR` names a folder of rollouts (files `tracking_*.npz`, `tracking2019_*.npz` and the `.h5` files of
-//! their clips); without it the repository's own are used. Every number of every row is compared.
+//! `COMIC_GOLDEN_DIR` names a folder of rollouts: `tracking_*.npz`, `tracking2019_*.npz` and the `.h5` files of their
+//! clips, `go_to_target_*.npz`, `gaps*_rollout.npz` and `walls*_rollout.npz` with the `*_arena.json` of the same stem.
+//! Without it the repository's own are used. Every number of every row is compared.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
 mod model;
 mod model_arrays;
 mod npz;
-mod rollout;
+mod recording;
+mod rules;
+mod tracking;
 
 use npz::{Array, Values};
-use rollout::{KINDS, Rollout, folder, rollouts};
+use recording::{Rollout, folder, rollouts};
+
+/// A kind of rollout: how its files' names begin and end, and how one is compared.
+struct Kind {
+    prefix: &'static str,
+    suffix: &'static str,
+    compare: fn(&Rollout) -> Result<(), String>,
+}
+
+const KINDS: [Kind; 5] = [
+    Kind { prefix: "tracking_", suffix: "", compare: tracking::compare },
+    Kind { prefix: "tracking2019_", suffix: "", compare: tracking::compare },
+    Kind { prefix: "go_to_target_", suffix: "", compare: rules::compare_go_to_target },
+    Kind { prefix: "gaps", suffix: "_rollout", compare: rules::compare_corridor },
+    Kind { prefix: "walls", suffix: "_rollout", compare: rules::compare_corridor },
+];
+
+fn compare(rollout: &Rollout) -> Result<(), String> {
+    let kind = KINDS.iter().find(|kind| rollout.file.starts_with(kind.prefix)).unwrap();
+    (kind.compare)(rollout)
+}
 
 fn all_rollouts() -> Vec<Rollout> {
     let folder = folder();
     let mut all = Vec::new();
-    for kind in KINDS {
-        let found = rollouts(&folder, kind).unwrap();
+    for Kind { prefix, suffix, .. } in KINDS {
+        let found = rollouts(&folder, (prefix, suffix)).unwrap();
         if found.is_empty() {
-            eprintln!("reported: {} has no rollouts {kind}*.npz", folder.display());
+            eprintln!("reported: {} has no rollouts {prefix}*{suffix}.npz", folder.display());
         }
         all.extend(found);
     }
@@ -34,7 +57,7 @@ fn all_rollouts() -> Vec<Rollout> {
 #[test]
 fn parity_of_every_rollout() {
     let all = all_rollouts();
-    let differences: Vec<String> = all.iter().filter_map(|rollout| rollout.compare().err()).collect();
+    let differences: Vec<String> = all.iter().filter_map(|rollout| compare(rollout).err()).collect();
     assert!(
         differences.is_empty(),
         "{} of {} rollouts differ:\n{}",
@@ -50,7 +73,8 @@ fn altered(name: &str, value: f64) -> f64 {
     match name {
         _ if value.is_nan() => 0.25,
         "qpos" | "qvel" | "act" | "time" | "qacc_warmstart_after_reset" => value.next_up(),
-        "clip" | "start" | "ncon" | "mocap_step" | "truncate" | "end_mocap" | "step_type" | "discount" => value + 1.0,
+        "clip" | "start" | "ncon" | "mocap_step" | "truncate" | "end_mocap" | "step_type" | "discount" | "counter"
+        | "disallowed" => value + 1.0,
         // Controls are clipped to their range, so the change goes inwards.
         "actions" => value * 0.5 + if value == 0.0 { 0.5 } else { 0.0 },
         _ => value + 1e-9,
@@ -69,9 +93,9 @@ fn alter(rollout: &Rollout, name: &str, index: usize) -> Rollout {
 fn parity_fails_when_any_quantity_is_altered() {
     let all = all_rollouts();
     for kind in KINDS {
-        let Some(rollout) = all.iter().find(|rollout| rollout.file.starts_with(kind)) else { continue };
+        let Some(rollout) = all.iter().find(|rollout| rollout.file.starts_with(kind.prefix)) else { continue };
         let rollout = rollout.clone().head(3);
-        rollout.compare().unwrap();
+        compare(&rollout).unwrap();
         let names: Vec<String> = rollout.arrays.keys().cloned().collect();
         for name in &names {
             let length = match &rollout.arrays[name].values {
@@ -83,7 +107,7 @@ fn parity_fails_when_any_quantity_is_altered() {
                 if index == 0 && ["truncate", "end_mocap"].contains(&name.as_str()) {
                     continue;
                 }
-                let outcome = alter(&rollout, name, index).compare();
+                let outcome = compare(&alter(&rollout, name, index));
                 assert!(outcome.is_err(), "{}: altering {name}[{index}] went unseen", rollout.file);
             }
         }
@@ -100,7 +124,7 @@ fn parity_fails_when_any_observation_is_altered() {
         for (name, size) in layout {
             if size > 0 {
                 for row in 0..2 {
-                    let difference = alter(&rollout, "obs", row * width + place).compare().unwrap_err();
+                    let difference = compare(&alter(&rollout, "obs", row * width + place)).unwrap_err();
                     assert!(difference.contains(&format!("row {row}: {name}[0]")), "{difference}");
                 }
             }
@@ -121,7 +145,7 @@ fn parity_fails_when_names_are_altered() {
                 assert!(text[0].contains(from));
                 text[0] = text[0].replacen(from, to, 1);
             }
-            assert!(copy.compare().is_err(), "altering {name} went unseen");
+            assert!(compare(&copy).is_err(), "altering {name} went unseen");
         }
     }
 }

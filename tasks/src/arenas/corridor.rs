@@ -1,0 +1,171 @@
+//! The corridors (`locomotion/arenas/corridors.py`): an empty one, with gaps in its floor, or with walls across it.
+
+use std::path::Path;
+
+use mujoco_rs::prelude::*;
+use mujoco_rs::wrappers::mj_editing::{MjsBody, MjsGeom, MjtBuiltin};
+
+use super::base;
+use crate::error::Error;
+use crate::humanoid::{missing, refused};
+
+/// How far the corridor reaches beyond both its ends (m, `_CORRIDOR_X_PADDING`).
+pub(crate) const X_PADDING: f64 = 2.0;
+/// Thickness of walls and half of the platforms' (m, `_WALL_THICKNESS`).
+const THICKNESS: f64 = 0.16;
+/// Height of the planes at the sides (m, `_SIDE_WALL_HEIGHT`), and the group by which they are not drawn.
+const SIDE_HEIGHT: f64 = 4.0;
+const SIDE_GROUP: i32 = 3;
+/// Depth at which the ground lies under the gaps (m).
+const GAP_DEPTH: f64 = 10.0;
+/// Height above that ground at which spare boxes lie (m): within the model's extent, which decides what is drawn.
+const HIDDEN_DEPTH: f64 = 0.5;
+/// Clipping planes relative to the model's extent (`tasks/corridors.py`).
+const NEAR: f32 = 0.00025;
+const FAR: f32 = 4.0;
+/// Name of the body that walls belong to.
+const WALLS: &str = "walls";
+/// Name of the body that platforms belong to.
+pub(crate) const GROUND: &str = "ground";
+
+/// Length and width of a corridor, m.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Extent {
+    pub(crate) length: f64,
+    pub(crate) width: f64,
+}
+
+/// A box that stands in the corridor: a platform or a wall.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Block {
+    /// The geom's name.
+    pub name: String,
+    /// Centre, m.
+    pub position: [f64; 3],
+    /// Half of its extent in x, y and z, m.
+    pub half_size: [f64; 3],
+    /// Red, green, blue and opacity.
+    pub colour: [f32; 4],
+}
+
+/// Length of the platform that the humanoid starts on, m.
+pub(crate) fn first_platform_length() -> f64 {
+    3.0 * X_PADDING
+}
+
+/// The platform that the humanoid starts on.
+pub(crate) fn first_platform(extent: Extent) -> Block {
+    Block { name: "start_floor".into(), ..platform(0, 0.0, first_platform_length(), extent) }
+}
+
+/// A stretch of floor that begins at `start`, m.
+pub(crate) fn platform(index: usize, start: f64, length: f64, extent: Extent) -> Block {
+    Block {
+        name: format!("floor_{index}"),
+        position: [start + length / 2.0, 0.0, -THICKNESS],
+        half_size: [length / 2.0, extent.width / 2.0, THICKNESS],
+        colour: [0.5, 0.5, 0.5, 1.0],
+    }
+}
+
+/// A wall at `x` that reaches `width` into the corridor from the left, the side of positive y, or from the right; m.
+pub(crate) fn wall(index: usize, x: f64, [width, height]: [f64; 2], left: bool, extent: Extent) -> Block {
+    let side = if left { 1.0 } else { -1.0 };
+    Block {
+        name: format!("wall_{index}"),
+        position: [x, side * (extent.width - width) / 2.0, height / 2.0],
+        half_size: [THICKNESS / 2.0, width / 2.0, height / 2.0],
+        colour: [1.0; 4],
+    }
+}
+
+/// The corridor with gaps between `platforms`.
+///
+/// `spare` boxes more lie in the depth under the first platform, seen and reached by nobody: arenas with equally many
+/// boxes have equal memory layouts, so a simulation and a renderer can go from one to the next.
+pub(crate) fn with_gaps(directory: &Path, extent: Extent, platforms: &[Block], spare: usize) -> Result<MjSpec, Error> {
+    let mut spec = empty(directory, "gaps_corridor", extent, Some(GAP_DEPTH), 0)?;
+    let ground = spec.world_body_mut().add_body();
+    ground.set_name(GROUND).map_err(refused("adding the platforms"))?;
+    for platform in platforms {
+        add_block(ground, platform)?;
+    }
+    for index in platforms.len()..platforms.len() + spare {
+        // It collides like any other: what does not is left out of MuJoCo's bounding volumes, which are counted.
+        let hidden = Block {
+            position: [first_platform_length() / 2.0, 0.0, HIDDEN_DEPTH - GAP_DEPTH],
+            half_size: [THICKNESS / 2.0; 3],
+            ..platform(index.saturating_sub(1), 0.0, 1.0, extent)
+        };
+        add_block(ground, &hidden)?.set_group(SIDE_GROUP);
+    }
+    Ok(spec)
+}
+
+/// The corridor with walls.
+pub(crate) fn with_walls(directory: &Path, extent: Extent, walls: &[Block]) -> Result<MjSpec, Error> {
+    let mut spec = empty(directory, "walls_corridor", extent, None, walls.len())?;
+    let body = spec.body_mut(WALLS).ok_or_else(|| missing("body", WALLS))?;
+    for wall in walls {
+        add_block(body, wall)?;
+    }
+    Ok(spec)
+}
+
+fn add_block<'a>(body: &'a mut MjsBody, block: &Block) -> Result<&'a mut MjsGeom, Error> {
+    let geom = body.add_geom();
+    geom.set_name(&block.name).map_err(refused("adding a platform or a wall"))?;
+    geom.set_type(MjtGeomBase::mjGEOM_BOX);
+    *geom.pos_mut() = block.position;
+    *geom.size_mut() = block.half_size;
+    *geom.rgba_mut() = block.colour;
+    Ok(geom)
+}
+
+/// `EmptyCorridor`: the ground, invisible planes at the sides and ends, a sky. With `depth` the ground lies so far
+/// below and is not seen. dm_control numbers what has no name by its place among all geoms, `first` of them before.
+fn empty(directory: &Path, name: &str, extent: Extent, depth: Option<f64>, first: usize) -> Result<MjSpec, Error> {
+    let mut spec = base(directory, name)?;
+    let map = &mut spec.visual_mut().map;
+    (map.znear, map.zfar) = (NEAR, FAR);
+
+    let sky = spec.add_texture();
+    sky.set_name("//unnamed_texture_0").map_err(refused("adding the sky"))?;
+    sky.set_type(MjtTexture::mjTEXTURE_SKYBOX);
+    sky.set_builtin(MjtBuiltin::mjBUILTIN_GRADIENT);
+    *sky.rgb1_mut() = [0.4, 0.6, 0.8];
+    *sky.rgb2_mut() = [0.0; 3];
+    sky.set_width(100);
+    sky.set_height(600);
+
+    let Extent { length, width } = extent;
+    let world = spec.world_body_mut();
+    world.add_body().set_name(WALLS).map_err(refused("adding the walls"))?;
+
+    let ground = world.add_geom();
+    ground.set_name(&format!("//unnamed_geom_{first}")).map_err(refused("adding the ground"))?;
+    ground.set_type(MjtGeomBase::mjGEOM_PLANE);
+    *ground.pos_mut() = [length / 2.0, 0.0, depth.map_or(0.0, |depth| -depth)];
+    *ground.size_mut() = [length / 2.0 + X_PADDING, width / 2.0, 1.0];
+    *ground.rgba_mut() = if depth.is_some() { [0.0; 4] } else { [0.5, 0.5, 0.5, 1.0] };
+
+    let along = [length / 2.0 + X_PADDING, SIDE_HEIGHT / 2.0, 1.0];
+    let across = [width / 2.0, SIDE_HEIGHT / 2.0, 1.0];
+    let planes = [
+        ([length / 2.0, width / 2.0], along, [1.0, 0.0, 0.0, 0.0, 0.0, 1.0]),
+        ([length / 2.0, -width / 2.0], along, [-1.0, 0.0, 0.0, 0.0, 0.0, 1.0]),
+        ([-X_PADDING, 0.0], across, [0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+        ([length + X_PADDING, 0.0], across, [0.0, -1.0, 0.0, 0.0, 0.0, 1.0]),
+    ];
+    for (index, ([x, y], size, axes)) in planes.into_iter().enumerate() {
+        let plane = world.add_geom();
+        plane.set_name(&format!("//unnamed_geom_{}", first + index + 1)).map_err(refused("adding a side"))?;
+        plane.set_type(MjtGeomBase::mjGEOM_PLANE);
+        *plane.pos_mut() = [x, y, SIDE_HEIGHT / 2.0];
+        *plane.size_mut() = size;
+        plane.alt_mut().set_xy_axis(&axes);
+        plane.set_group(SIDE_GROUP);
+        *plane.rgba_mut() = [1.0, 0.0, 0.0, 0.0];
+    }
+    Ok(spec)
+}

@@ -1,0 +1,193 @@
+//! What running through a corridor means (`locomotion/tasks/corridors.py`), whatever stands in the way.
+
+use std::fmt::Debug;
+use std::sync::Arc;
+
+use comic_experiment::Corridor;
+use mujoco_rs::prelude::*;
+use rand_pcg::Pcg64;
+
+use crate::arenas::corridor::Extent;
+use crate::error::Error;
+use crate::observation::{Number, fill};
+use crate::rules::{Recorded, Rules, Verdict};
+use crate::stage::{Arena, Stage};
+use crate::start::Poses;
+
+/// Distance along the corridor at which the humanoid begins (m, `walker_spawn_position` of dm_control's examples).
+pub(crate) const START: f64 = 0.5;
+
+/// What stands in the way, drawn anew for every arena.
+pub(crate) trait Obstacles: Debug + Send + Sync + 'static {
+    /// # Errors
+    /// When MuJoCo refuses the arena.
+    fn draw(&self, extent: Extent, random: &mut Pcg64) -> Result<MjModel, Error>;
+}
+
+/// The rules of both corridors.
+#[derive(Debug)]
+pub(crate) struct CorridorRules<O> {
+    config: Corridor,
+    poses: Poses,
+    obstacles: O,
+}
+
+/// How long the current arena has been used.
+#[derive(Debug, Default)]
+pub(crate) struct Memory {
+    /// Control steps in the current arena; none when the next episode needs another one.
+    steps: Option<u32>,
+}
+
+impl<O: Obstacles> CorridorRules<O> {
+    pub(crate) fn new(config: &Corridor, poses: Poses, obstacles: O) -> Self {
+        Self { config: config.clone(), poses, obstacles }
+    }
+
+    fn draw_arena(&self, random: &mut Pcg64) -> Result<Arc<Arena>, Error> {
+        let extent = Extent { length: self.config.length, width: self.config.width };
+        Ok(Arc::new(Arena::new(self.obstacles.draw(extent, random)?)?))
+    }
+}
+
+/// 1 at `target` (m/s), falling linearly to 0 at 0 and at twice the target (`rewards.tolerance` with margin `target`).
+pub(crate) fn velocity_reward(velocity: f64, target: f64) -> f64 {
+    let distance = if velocity < target { target - velocity } else { velocity - target } / target;
+    if velocity == target {
+        1.0
+    } else if distance.abs() < 1.0 {
+        1.0 - distance
+    } else {
+        0.0
+    }
+}
+
+impl<O: Obstacles> Rules for CorridorRules<O> {
+    type Memory = Memory;
+
+    fn stage(&self, random: &mut Pcg64) -> Result<Stage, Error> {
+        Ok(Stage::new(self.draw_arena(random)?))
+    }
+
+    fn begin(&self, stage: &mut Stage, memory: &mut Memory, random: &mut Pcg64) {
+        let worn = memory.steps.is_none_or(|steps| steps >= self.config.arena_steps);
+        // One arena could be compiled, so the next can: should that ever fail, the old one serves on.
+        if worn && let Ok(arena) = self.draw_arena(random) {
+            stage.enter(arena);
+            memory.steps = Some(0);
+        }
+        let pose = self.poses.draw(random).moved(START, 0.0);
+        stage.place(&pose.qpos, &pose.qvel);
+    }
+
+    fn judge(&self, stage: &mut Stage, memory: &mut Memory, _: &mut Pcg64) -> Verdict {
+        memory.steps = memory.steps.map(|steps| steps.saturating_add(1));
+        stage.data.subtree_vel();
+        let walker = &stage.arena.walker;
+        let velocity = stage.data.subtree_linvel()[walker.root][0];
+        let [hands_and_feet @ .., _head] = walker.appendages;
+        let below = hands_and_feet.iter().any(|body| stage.data.xpos()[*body][2] < self.config.fall_height);
+        Verdict::of(velocity_reward(velocity, self.config.target_velocity), below || stage.has_fallen())
+    }
+
+    /// The root's height, m.
+    fn observe<T: Number>(&self, stage: &Stage, _: &Memory, out: &mut [T]) {
+        fill(out, [stage.root().0[2]]);
+    }
+
+    fn time_limit(&self) -> f64 {
+        self.config.time_limit
+    }
+}
+
+impl<O: Obstacles> Recorded for CorridorRules<O> {
+    fn observation(&self, _: &Stage, _: &Memory) -> Vec<(&'static str, Vec<f64>)> {
+        Vec::new()
+    }
+
+    fn quantities(&self, stage: &Stage, _: &Memory) -> Vec<(&'static str, Vec<f64>)> {
+        let walker = &stage.arena.walker;
+        let [hands_and_feet @ .., _head] = walker.appendages;
+        vec![
+            ("xvel", vec![stage.data.subtree_linvel()[walker.root][0]]),
+            ("ee_z", hands_and_feet.map(|body| stage.data.xpos()[body][2]).to_vec()),
+            ("disallowed", vec![stage.falls().count() as f64]),
+        ]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use comic_experiment::{Gaps, StartPose, Walls};
+    use rand::SeedableRng as _;
+
+    use super::*;
+
+    #[test]
+    fn the_reward_is_a_triangle_around_the_target_velocity() {
+        for (velocity, expected) in
+            [(-1.0, 0.0), (0.0, 0.0), (1.5, 0.5), (3.0, 1.0), (4.5, 0.5), (6.0, 0.0), (9.0, 0.0)]
+        {
+            assert_eq!(velocity_reward(velocity, 3.0), expected, "{velocity} m/s");
+        }
+    }
+
+    fn rules<O: Obstacles>(obstacles: O, arena_steps: u32) -> CorridorRules<O> {
+        let config = Corridor { start_pose: StartPose::Upright, arena_steps, ..Corridor::default() };
+        CorridorRules::new(&config, Poses::upright(), obstacles)
+    }
+
+    /// After each of `count` episodes of `steps` steps: whether the next one has another arena.
+    fn changes<O: Obstacles>(rules: &CorridorRules<O>, count: usize, steps: usize) -> Vec<bool> {
+        let (mut random, mut memory) = (Pcg64::seed_from_u64(1), Memory::default());
+        let mut stage = rules.stage(&mut random).unwrap();
+        rules.begin(&mut stage, &mut memory, &mut random);
+        let mut change = |_| {
+            let before = Arc::clone(&stage.arena);
+            for _ in 0..steps {
+                stage.step(&[0.0; 56]);
+                rules.judge(&mut stage, &mut memory, &mut random);
+            }
+            rules.begin(&mut stage, &mut memory, &mut random);
+            !Arc::ptr_eq(&before, &stage.arena)
+        };
+        (0..count).map(&mut change).collect()
+    }
+
+    #[test]
+    fn an_arena_serves_until_its_steps_are_used_up() {
+        assert_eq!(changes(&rules(Walls::default(), 0), 3, 2), [true; 3]);
+        assert_eq!(changes(&rules(Walls::default(), 5), 6, 2), [false, false, true, false, false, true]);
+    }
+
+    #[test]
+    fn arenas_of_gaps_are_laid_out_alike_so_that_a_simulation_moves_from_one_to_the_next() {
+        let (rules, mut random) = (rules(Gaps::default(), 0), Pcg64::seed_from_u64(1));
+        let mut stage = rules.stage(&mut random).unwrap();
+        for _ in 0..10 {
+            let arena = rules.draw_arena(&mut random).unwrap();
+            assert!(arena.models.take_over(&mut stage.data));
+        }
+    }
+
+    #[test]
+    fn hidden_boxes_change_nothing() {
+        let config = Gaps::default();
+        let extent = Extent { length: 30.0, width: 10.0 };
+        let one = crate::arenas::corridor::platform(0, 6.0, 2.0, extent);
+        let blocks = [crate::arenas::corridor::first_platform(extent), one];
+        let heights = [0, 7].map(|spare| {
+            let model = crate::humanoid::build_in(|directory| {
+                crate::arenas::corridor::with_gaps(directory, extent, &blocks, spare)
+            });
+            let mut stage = Stage::new(Arc::new(Arena::new(model.unwrap()).unwrap()));
+            let pose = Poses::upright().draw(&mut Pcg64::seed_from_u64(1)).moved(config.corridor.width / 2.0, 0.0);
+            stage.place(&pose.qpos, &pose.qvel);
+            for _ in 0..60 {
+                stage.step(&[0.1; 56]);
+            }
+            stage.data.qpos().to_vec()
+        });
+        assert_eq!(heights[0], heights[1]);
+    }
+}
