@@ -16,6 +16,8 @@ pub struct ActingSizes {
     pub latent: usize,
     /// A.
     pub action: usize,
+    /// I, bytes; 0 when the task is blind.
+    pub image: usize,
 }
 
 /// The observations of E environments, and what the behaviour policy makes of them: row-major f32 arrays.
@@ -27,6 +29,8 @@ pub struct ActingBatch {
     pub proprioception: Vec<f32>,
     /// `[E, X]`.
     pub task: Vec<f32>,
+    /// What the humanoids see, `[E, I]`.
+    pub image: Vec<u8>,
     /// z_{t−1} `[E, Z]`; zero at an episode's first step.
     pub previous_latent: Vec<f32>,
     /// The standard normal noise that makes z_t `[E, Z]`.
@@ -46,6 +50,8 @@ pub struct ActingRow<'a> {
     pub proprioception: &'a mut [f32],
     /// `[X]`.
     pub task: &'a mut [f32],
+    /// `[I]`.
+    pub image: &'a mut [u8],
     /// `[Z]`.
     pub previous_latent: &'a mut [f32],
     /// `[Z]`.
@@ -67,6 +73,7 @@ impl ActingBatch {
             sizes,
             proprioception: zeros(sizes.proprioception),
             task: zeros(sizes.task),
+            image: vec![0; environments * sizes.image],
             previous_latent: zeros(sizes.latent),
             latent_noise: zeros(sizes.latent),
             latent: zeros(sizes.latent),
@@ -87,13 +94,14 @@ impl ActingBatch {
 
     /// The row of one environment, counted from 0.
     pub fn row(&mut self, environment: usize) -> ActingRow<'_> {
-        fn part(array: &mut [f32], environment: usize, width: usize) -> &mut [f32] {
+        fn part<T>(array: &mut [T], environment: usize, width: usize) -> &mut [T] {
             &mut array[environment * width..(environment + 1) * width]
         }
-        let ActingSizes { proprioception, task, latent, action } = self.sizes;
+        let ActingSizes { proprioception, task, latent, action, image } = self.sizes;
         ActingRow {
             proprioception: part(&mut self.proprioception, environment, proprioception),
             task: part(&mut self.task, environment, task),
+            image: part(&mut self.image, environment, image),
             previous_latent: part(&mut self.previous_latent, environment, latent),
             latent_noise: part(&mut self.latent_noise, environment, latent),
             latent: part(&mut self.latent, environment, latent),

@@ -7,6 +7,7 @@ mod acting;
 mod figure;
 mod physics;
 mod tape;
+mod vision;
 mod wire;
 
 use std::sync::Arc;
@@ -48,6 +49,7 @@ enum Name {
     Threads,
     Reset,
     Wire,
+    Vision,
 }
 
 /// What all figures are measured on: the paper's networks, one built-in walk or another task.
@@ -75,14 +77,19 @@ impl Bench {
         let catalogue = Catalogue::open(&experiment.clips)?;
         let task = comic_tasks::build(&experiment, &catalogue)?;
         let subject = Subject { experiment, task, budget };
-        for name in Name::value_variants().iter().filter(|name| self.figures.is_empty() || self.figures.contains(name))
-        {
+        // Images need OpenGL, which a machine that only counts steps may lack: they are measured when asked for.
+        let wanted = |name: &&Name| match self.figures.as_slice() {
+            [] => **name != Name::Vision,
+            figures => figures.contains(name),
+        };
+        for name in Name::value_variants().iter().filter(wanted) {
             let figure = match name {
                 Name::Env => physics::environment(&subject)?,
                 Name::Policy => acting::policy(&subject)?,
                 Name::Threads => acting::threads(&subject)?,
                 Name::Reset => physics::reset(&subject)?,
                 Name::Wire => wire::wire(&subject)?,
+                Name::Vision => vision::vision(&subject)?,
             };
             figure.print()?;
         }

@@ -60,7 +60,13 @@ pub fn evaluate<F: ForwardPass>(
     let environments = (0..options.environments.min(starts.len()).max(1) as u64)
         .map(|index| Arc::clone(task).environment(derive(options.seed, index)))
         .collect::<Result<Vec<Box<dyn Simulated>>, _>>()?;
-    let sizes = ActingSizes { proprioception: spec.proprioception, task: spec.task, latent, action: spec.action };
+    let sizes = ActingSizes {
+        proprioception: spec.proprioception,
+        task: spec.task,
+        latent,
+        action: spec.action,
+        image: spec.image,
+    };
     let finished = rollout::run(evaluated, environments, sizes, &starts, options, progress)?;
     Ok(Report::new(spec, &finished, options))
 }

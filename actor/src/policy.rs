@@ -28,6 +28,7 @@ pub fn acting_sizes(spec: &TaskSpec, experiment: &Experiment) -> ActingSizes {
         task: spec.task,
         latent: experiment.network.latent.size,
         action: spec.action,
+        image: spec.image,
     }
 }
 
@@ -89,9 +90,13 @@ impl ForwardPass for TorchPolicy {
         let sizes = batch.sizes();
         let matrix = |values: &[f32], width: usize| Tensor::f_from_slice(values)?.f_view([environments, width as i64]);
         tch::no_grad(|| {
+            let image = (sizes.image > 0)
+                .then(|| Tensor::f_from_slice(&batch.image)?.f_view([environments, sizes.image as i64]))
+                .transpose()?;
             let acting = self.policy.act(
                 &matrix(&batch.proprioception, sizes.proprioception)?,
                 &matrix(&batch.task, sizes.task)?,
+                image.as_ref(),
                 &matrix(&batch.previous_latent, sizes.latent)?,
                 &matrix(&batch.latent_noise, sizes.latent)?,
             );

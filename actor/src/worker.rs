@@ -88,6 +88,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
             task: shape.task,
             latent: shape.latent,
             action: shape.action,
+            image: shape.image,
         };
         let mut batch = ActingBatch::new(environments.len(), sizes);
         let lanes = environments
@@ -153,18 +154,19 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
             if stopped() {
                 return Ok(None);
             }
-            self.observe(t);
+            self.observe(t)?;
             self.act()?;
             self.step(t, progress);
         }
-        self.observe(length);
+        self.observe(length)?;
         Ok(Some(self.finish()))
     }
 
-    fn observe(&mut self, t: usize) {
+    fn observe(&mut self, t: usize) -> Result<(), Error> {
         for (index, lane) in self.lanes.iter_mut().enumerate() {
-            lane.write_observation(t, &self.batch.row(index));
+            lane.write_observation(t, &mut self.batch.row(index))?;
         }
+        Ok(())
     }
 
     fn act(&mut self) -> Result<(), Error> {

@@ -195,6 +195,8 @@ fn network(network: &Network) -> Result<(), Fault> {
     }
     let Network { clip_embedding, initial_std, min_std, policy_head_scale, latent, .. } = network;
     ensure("network.clip_embedding", clip_embedding, (1..=4096).contains(clip_embedding), "must be 1 to 4096")?;
+    let features = network.image_features;
+    ensure("network.image_features", features, (1..=4096).contains(&features), "must be 1 to 4096")?;
     ensure("network.min_std", min_std, positive(*min_std) && *min_std >= SMALLEST_STD, AT_LEAST_STD)?;
     let holds = positive(*initial_std) && initial_std > min_std;
     ensure("network.initial_std", initial_std, holds, "must exceed network.min_std")?;

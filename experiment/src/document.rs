@@ -111,6 +111,8 @@ pub struct Network {
     pub value: Vec<usize>,
     /// Width of the learned clip embedding the value function sees (S: 30).
     pub clip_embedding: usize,
+    /// What is left of an image, in tasks that see (D).
+    pub image_features: usize,
     /// The latent between encoder and low level.
     pub latent: Latent,
     /// The policy's standard deviation before learning (D; softplus at 0 is ln 2).
@@ -133,6 +135,7 @@ impl Default for Network {
             low_level: vec![1024, 1024],
             value: vec![1024, 1024, 1024],
             clip_embedding: 30,
+            image_features: 64,
             latent: Latent::default(),
             initial_std: std::f64::consts::LN_2,
             min_std: 1e-3,

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Experiment, TaskName, Tracking};
+use crate::{Experiment, TaskName, Tracking, Vision};
 
 /// Tracking bodies of the V2020 humanoid, `face` among them.
 const BODIES: usize = 31;
@@ -25,6 +25,8 @@ pub struct TaskSpec {
     pub proprioception: usize,
     /// Length of the task observation vector (for tracking, the references).
     pub task: usize,
+    /// Bytes of an image of what the humanoid sees: 64 rows of 64 pixels of red, green and blue; 0 when it is blind.
+    pub image: usize,
     /// Length of the action vector, each in [−1, 1].
     pub action: usize,
     /// Names of the reward terms; their sum is the reward.
@@ -47,6 +49,15 @@ pub const BALL_CATCH_REWARD_TERMS: [&str; 4] = ["failure", "touch", "standing", 
 pub const IMAGE_SIZE: usize = 64;
 
 impl Experiment {
+    fn image_bytes(&self) -> usize {
+        let vision = match self.task {
+            TaskName::Gaps => self.gaps.corridor.vision,
+            TaskName::Walls => self.walls.corridor.vision,
+            _ => Vision::Off,
+        };
+        if vision == Vision::Off { 0 } else { IMAGE_SIZE * IMAGE_SIZE * 3 }
+    }
+
     /// The most a step of the task can pay.
     fn max_reward(&self) -> f64 {
         match self.task {
@@ -69,6 +80,7 @@ impl TaskSpec {
         let plain = |task, terms: &[&str]| Self {
             proprioception: PROPRIOCEPTION_SIZE,
             task,
+            image: experiment.image_bytes(),
             action: ACTION_SIZE,
             reward_terms: terms.iter().map(|term| (*term).to_string()).collect(),
             max_reward: experiment.max_reward(),
@@ -99,6 +111,7 @@ impl TaskSpec {
         Ok(Self {
             proprioception: PROPRIOCEPTION_SIZE,
             task,
+            image: 0,
             action: ACTION_SIZE,
             reward_terms: TRACKING_REWARD_TERMS.map(String::from).to_vec(),
             max_reward: TRACKING_MAX_REWARD,

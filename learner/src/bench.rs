@@ -103,6 +103,7 @@ fn random_minibatch(spec: &TaskSpec, experiment: &Experiment) -> Result<Minibatc
         action: spec.action,
         latent: experiment.network.latent.size,
         reward_terms: spec.reward_terms.len(),
+        image: 0,
     };
     let (rows, observations) = (shape.unrolls * shape.length, shape.unrolls * (shape.length + 1));
     let random = |count: usize| {
@@ -121,6 +122,7 @@ fn random_minibatch(spec: &TaskSpec, experiment: &Experiment) -> Result<Minibatc
         valid: &vec![1.0; rows],
         first: &vec![0.0; observations],
         clip: &vec![0; observations],
+        image: &[],
     };
     Ok(MinibatchTensors::new(&source, &shape, Device::Cpu)?)
 }

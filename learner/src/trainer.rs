@@ -240,9 +240,9 @@ impl Trainer {
 
     /// The batch on the device, `[B, T(+1), …]`.
     pub(crate) fn tensors(&self, batch: &Batch) -> Result<MinibatchTensors> {
-        let UnrollShape { length, proprioception, task, action, latent, reward_terms } = *batch.layout.shape();
-        let shape =
-            MinibatchShape { unrolls: batch.unrolls, length, proprioception, task, action, latent, reward_terms };
+        let UnrollShape { length, proprioception, task, action, latent, reward_terms, image } = *batch.layout.shape();
+        let unrolls = batch.unrolls;
+        let shape = MinibatchShape { unrolls, length, proprioception, task, action, latent, reward_terms, image };
         let source = MinibatchSource {
             proprioception: batch.f32(Field::Proprioception),
             task: batch.f32(Field::Task),
@@ -256,6 +256,7 @@ impl Trainer {
             valid: batch.f32(Field::Valid),
             first: batch.f32(Field::First),
             clip: batch.clip(),
+            image: batch.image(),
         };
         Ok(MinibatchTensors::new(&source, &shape, self.learner.device())?)
     }

@@ -2,6 +2,7 @@
 //!
 //! # Layout
 //! - [`Policy`] is everything acting needs: normaliser, reference encoder, MLP low level. Its parameters travel.
+//! - An image, where the task has one, becomes a few numbers beside the task observation, for policy and value alike.
 //! - [`Value`] is what only the learner needs. It lives in a parameter store of its own.
 //! - [`DiagonalGaussian`] is the one distribution: actions and latents.
 //! - [`to_safetensors`] and [`from_safetensors`] carry a parameter store over a wire or onto a disk.
@@ -19,6 +20,7 @@ mod layers;
 mod normaliser;
 mod parameters;
 mod policy;
+mod sight;
 mod value;
 
 pub use error::Error;

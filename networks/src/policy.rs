@@ -5,6 +5,7 @@ use tch::{Tensor, nn};
 
 use crate::layers::{GaussianHead, GaussianHeadConfig, Torso, rows};
 use crate::normaliser::Normaliser;
+use crate::sight::Sight;
 use crate::{DiagonalGaussian, Error, NormalisedObservation, NormaliserStatistics};
 
 /// What one pass of the policy gives, for N rows.
@@ -28,6 +29,7 @@ pub struct Acting {
 #[derive(Debug)]
 pub struct Policy {
     normaliser: Normaliser,
+    sight: Option<Sight>,
     encoder: Torso,
     encoder_head: GaussianHead,
     low_level: Torso,
@@ -45,8 +47,10 @@ impl Policy {
             return Err(Error::Length { name: "initial pose", expected: spec.action, found: pose.len() });
         }
         let (proprioception, task) = (spec.proprioception as i64, spec.task as i64);
+        let sight = (spec.image > 0).then(|| Sight::new(&(store / "sight"), config.image_features as i64));
+        let seen = sight.as_ref().map_or(0, Sight::output);
         let latent = config.latent.size as i64;
-        let input = task + proprioception + latent;
+        let input = task + seen + proprioception + latent;
         let encoder_path = store / "encoder";
         let encoder = Torso::new(&encoder_path, input, &config.encoder);
         let encoder_head = GaussianHead::new(
@@ -74,24 +78,32 @@ impl Policy {
             },
         );
         let normaliser = Normaliser::new(&(store / "normaliser"), proprioception, task, config.normaliser_steps > 0);
-        Ok(Self { normaliser, encoder, encoder_head, low_level, low_level_head })
+        Ok(Self { normaliser, sight, encoder, encoder_head, low_level, low_level_head })
     }
 
-    /// Acts, or learns: proprioception `[N, P]`, task observation `[N, X]`, previous sampled latent `[N, Z]`
-    /// (zeros at an episode's start) and standard-normal noise `[N, Z]`, all as they come from the environment.
+    /// Acts, or learns: proprioception `[N, P]`, task observation `[N, X]`, image `[N, I]` uint8 where the task has one,
+    /// previous sampled latent `[N, Z]` (zeros at an episode's start) and standard-normal noise `[N, Z]`, all as they
+    /// come from the environment.
     pub fn act(
         &self,
         proprioception: &Tensor,
         task: &Tensor,
+        image: Option<&Tensor>,
         previous_latent: &Tensor,
         latent_noise: &Tensor,
     ) -> Acting {
-        self.act_normalised(&self.normalise(proprioception, task), previous_latent, latent_noise)
+        self.act_normalised(&self.normalise(proprioception, task, image), previous_latent, latent_noise)
     }
 
-    /// Normalises observations of any leading dimensions: proprioception `[.., P]`, task observation `[.., X]`.
-    pub fn normalise(&self, proprioception: &Tensor, task: &Tensor) -> NormalisedObservation {
-        self.normaliser.forward(proprioception, task)
+    /// Normalises observations of any leading dimensions: proprioception `[.., P]`, task observation `[.., X]`, image
+    /// `[.., I]` uint8. What is seen in the image joins the task observation, so policy and value share one pair of eyes;
+    /// both learn it.
+    pub fn normalise(&self, proprioception: &Tensor, task: &Tensor, image: Option<&Tensor>) -> NormalisedObservation {
+        let mut observation = self.normaliser.forward(proprioception, task);
+        if let (Some(sight), Some(image)) = (&self.sight, image) {
+            observation.task = Tensor::cat(&[&observation.task, &sight.forward(image)], -1);
+        }
+        observation
     }
 
     /// [`Policy::act`] on observations that are normalised already, so a learner does that once for policy and value.

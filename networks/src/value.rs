@@ -22,7 +22,8 @@ impl Value {
         let width = config.clip_embedding as i64;
         let clips = spec.clips.len().max(1) as i64;
         let stdev = 1.0 / (config.clip_embedding.max(1) as f64).sqrt();
-        let input = (spec.task + spec.proprioception) as i64 + width;
+        let seen = if spec.image > 0 { config.image_features } else { 0 };
+        let input = (spec.task + seen + spec.proprioception) as i64 + width;
         let torso = Torso::new(store, input, &config.value);
         let head = linear(&(store / "head"), torso.output(), spec.reward_terms.len() as i64, 1.0);
         let embedding = store.var("clip_embedding", &[clips, width], nn::Init::Randn { mean: 0.0, stdev });

@@ -17,6 +17,7 @@ fn store() -> nn::VarStore {
         action: 2,
         reward_terms: vec!["a".into()],
         max_reward: 1.0,
+        image: 0,
         clips: vec!["x".into()],
     };
     let mut network = Network { encoder: vec![8], low_level: vec![8], normaliser_steps: 1, ..Network::default() };

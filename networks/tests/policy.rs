@@ -15,6 +15,7 @@ fn spec() -> TaskSpec {
         action: 3,
         reward_terms: vec!["a".into(), "b".into()],
         max_reward: 1.0,
+        image: 0,
         clips: vec!["x".into(), "y".into(), "z".into()],
     }
 }
@@ -45,7 +46,7 @@ fn inputs() -> [Tensor; 4] {
 
 fn act(policy: &Policy) -> comic_networks::Acting {
     let [proprioception, task, previous, noise] = inputs();
-    policy.act(&proprioception, &task, &previous, &noise)
+    policy.act(&proprioception, &task, None, &previous, &noise)
 }
 
 #[test]
@@ -64,7 +65,7 @@ fn rows_of_an_unroll_are_the_same_rows() {
     let (_store, policy) = policy(&network(), 1, &[0.0; 3]);
     let [proprioception, task, previous, noise] = inputs();
     let unrolled = |tensor: &Tensor| tensor.reshape([4, 6, -1]);
-    let observation = policy.normalise(&unrolled(&proprioception), &unrolled(&task));
+    let observation = policy.normalise(&unrolled(&proprioception), &unrolled(&task), None);
     let acting = policy.act_normalised(&observation, &unrolled(&previous), &unrolled(&noise));
     assert_eq!(acting.action.mean, act(&policy).action.mean);
 }
@@ -149,7 +150,7 @@ fn the_normaliser_travels_is_not_trained_and_clamps() {
     let [_, task, previous, noise] = inputs();
     let far = |value: f64| {
         let proprioception = Tensor::full([ROWS, 7], value, (Kind::Float, Device::Cpu));
-        policy.act(&proprioception, &task, &previous, &noise).action.mean
+        policy.act(&proprioception, &task, None, &previous, &noise).action.mean
     };
     const { assert!(NORMALISED_LIMIT < 1e3) };
     assert_eq!(far(1e3), far(1e6));
@@ -180,8 +181,55 @@ fn the_value_has_one_output_per_reward_term_and_sees_the_clip() {
     let store = nn::VarStore::new(Device::Cpu);
     let value = Value::new(&store.root(), &spec(), &network());
     let [proprioception, task, ..] = inputs();
-    let observation = policy.normalise(&proprioception, &task);
+    let observation = policy.normalise(&proprioception, &task, None);
     let of = |clip: i64| value.forward(&observation, &Tensor::full([ROWS], clip, (Kind::Int64, Device::Cpu)));
     assert_eq!(of(0).size(), [ROWS, 2]);
     assert_ne!(of(0), of(2));
+}
+
+#[test]
+fn what_is_seen_changes_what_is_done_and_is_learnt_from() {
+    let spec = TaskSpec { image: 64 * 64 * 3, ..spec() };
+    let network = Network { image_features: 6, ..network() };
+    let store = nn::VarStore::new(Device::Cpu);
+    let policy = {
+        let _guard = GENERATOR.lock().unwrap();
+        tch::manual_seed(3);
+        Policy::new(&store.root(), &spec, &network, &[0.0; 3]).unwrap()
+    };
+    let rows = 2;
+    let zeros = |width: i64| Tensor::zeros([rows, width], (Kind::Float, Device::Cpu));
+    let image = |grey: i64| Tensor::full([rows, 64 * 64 * 3], grey, (Kind::Uint8, Device::Cpu));
+    let latent = |grey| {
+        let image = image(grey);
+        policy.act(&zeros(7), &zeros(11), Some(&image), &zeros(5), &zeros(5)).latent_posterior.mean
+    };
+    let (dark, bright) = (latent(0), latent(255));
+    assert!((&dark - &bright).abs().max().double_value(&[]) > 1e-3);
+    bright.sum(Kind::Float).backward();
+    let sight: Vec<_> = store.variables().into_iter().filter(|(name, _)| name.starts_with("sight.")).collect();
+    assert_eq!(sight.len(), 8, "two convolutions, a linear layer and a norm, each with weight and bias");
+    for (name, parameter) in sight {
+        assert!(parameter.grad().abs().sum(Kind::Float).double_value(&[]) > 0.0, "{name} gets no gradient");
+    }
+}
+
+#[test]
+fn an_image_is_seen_alike_in_a_batch_of_unrolls_and_as_a_row() {
+    let spec = TaskSpec { image: 64 * 64 * 3, ..spec() };
+    let store = nn::VarStore::new(Device::Cpu);
+    let policy = {
+        let _guard = GENERATOR.lock().unwrap();
+        tch::manual_seed(4);
+        Policy::new(&store.root(), &spec, &network(), &[0.0; 3]).unwrap()
+    };
+    let image = Tensor::arange(64 * 64 * 3, (Kind::Int64, Device::Cpu)).remainder(251).to_kind(Kind::Uint8);
+    let acted = |leading: &[i64]| {
+        let shape = |width: i64| [leading, &[width]].concat();
+        let zeros = |width: i64| Tensor::zeros(shape(width), (Kind::Float, Device::Cpu));
+        let image = image.reshape(shape(64 * 64 * 3));
+        let observation = policy.normalise(&zeros(7), &zeros(11), Some(&image));
+        policy.act_normalised(&observation, &zeros(5), &zeros(5)).latent_posterior.mean
+    };
+    assert_eq!(acted(&[1]), acted(&[1, 1]));
 }

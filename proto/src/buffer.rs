@@ -33,7 +33,7 @@ impl UnrollBuffer {
         &self.layout
     }
 
-    /// Row `t` of a field of `f32`. (For [`Field::Clip`], which holds `u32`, use [`set_clip`](Self::set_clip).)
+    /// Row `t` of a field of `f32`. ([`Field::Clip`], which holds `u32`, and [`Field::Image`], which holds bytes, have methods of their own.)
     ///
     /// # Panics
     /// When the field has no row `t`.
@@ -48,6 +48,15 @@ impl UnrollBuffer {
     /// When the field has no row `t`.
     pub fn row(&self, field: Field, t: usize) -> &[f32] {
         bytemuck::cast_slice(&self.words[self.row_words(field, t)])
+    }
+
+    /// The image of row `t`; empty when the humanoid is blind.
+    ///
+    /// # Panics
+    /// When there is no row `t`.
+    pub fn image_mut(&mut self, t: usize) -> &mut [u8] {
+        let range = self.row_words(Field::Image, t);
+        bytemuck::cast_slice_mut(&mut self.words[range])
     }
 
     /// Sets the clip of row `t`.
@@ -97,8 +106,9 @@ impl UnrollBuffer {
     }
 
     fn row_words(&self, field: Field, t: usize) -> std::ops::Range<usize> {
-        let (rows, width) = (self.layout.rows(field), self.layout.width(field));
+        let rows = self.layout.rows(field);
         assert!(t < rows, "row {t} of {field}, which has {rows}");
+        let width = self.words(field).len() / rows;
         let start = self.words(field).start + t * width;
         start..start + width
     }

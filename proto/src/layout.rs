@@ -6,7 +6,7 @@ use std::ops::Range;
 use comic_experiment::{Experiment, TaskSpec};
 use sha2::{Digest, Sha256};
 
-/// Bytes of an element: every field is `f32` or `u32`.
+/// Bytes of an element of every field but the image, whose elements are bytes.
 const ELEMENT: usize = 4;
 /// Room in a message for everything of fixed size around payload and episode statistics.
 const HEADER_SLACK: usize = 4096;
@@ -28,6 +28,8 @@ pub struct UnrollShape {
     pub latent: usize,
     /// R: reward terms.
     pub reward_terms: usize,
+    /// I: bytes of an image, a multiple of 4; 0 when the humanoid is blind.
+    pub image: usize,
 }
 
 impl UnrollShape {
@@ -40,6 +42,8 @@ impl UnrollShape {
             action: spec.action,
             latent: experiment.network.latent.size,
             reward_terms: spec.reward_terms.len(),
+            // Whole words keep every row aligned.
+            image: spec.image.next_multiple_of(ELEMENT),
         }
     }
 }
@@ -71,11 +75,13 @@ pub enum Field {
     First,
     /// `[T+1]` u32: the clip's index.
     Clip,
+    /// `[T+1, I]` u8: what the humanoid sees, rows from the top, red, green, blue.
+    Image,
 }
 
 impl Field {
     /// Every field, in payload order.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::Proprioception,
         Self::Task,
         Self::PreviousLatent,
@@ -88,6 +94,7 @@ impl Field {
         Self::Valid,
         Self::First,
         Self::Clip,
+        Self::Image,
     ];
 
     /// Its name in layout descriptions and messages.
@@ -105,12 +112,13 @@ impl Field {
             Self::Valid => "valid",
             Self::First => "first",
             Self::Clip => "clip",
+            Self::Image => "image",
         }
     }
 
     fn rows(self, length: usize) -> usize {
         match self {
-            Self::Proprioception | Self::Task | Self::First | Self::Clip => length.saturating_add(1),
+            Self::Proprioception | Self::Task | Self::First | Self::Clip | Self::Image => length.saturating_add(1),
             _ => length,
         }
     }
@@ -123,11 +131,21 @@ impl Field {
             Self::Action | Self::Mean | Self::Std => shape.action,
             Self::Reward => shape.reward_terms,
             Self::Discount | Self::Valid | Self::First | Self::Clip => 1,
+            Self::Image => shape.image,
         }
     }
 
     fn element(self) -> &'static str {
-        if self == Self::Clip { "u32" } else { "f32" }
+        match self {
+            Self::Clip => "u32",
+            Self::Image => "u8",
+            _ => "f32",
+        }
+    }
+
+    /// Bytes of an element.
+    fn element_bytes(self) -> usize {
+        if self == Self::Image { 1 } else { ELEMENT }
     }
 }
 
@@ -149,11 +167,11 @@ impl UnrollLayout {
     /// The layout of unrolls of this shape.
     pub fn new(shape: UnrollShape) -> Self {
         let mut ranges = [(0, 0); Field::ALL.len()];
-        let mut description = format!("comic unroll layout 1, little-endian, T={}\n", shape.length);
+        let mut description = format!("comic unroll layout 2, little-endian, T={}\n", shape.length);
         let mut start = 0usize;
         for (range, field) in ranges.iter_mut().zip(Field::ALL) {
             let (rows, width) = (field.rows(shape.length), field.width(&shape));
-            let end = start.saturating_add(rows.saturating_mul(width).saturating_mul(ELEMENT));
+            let end = start.saturating_add(rows.saturating_mul(width).saturating_mul(field.element_bytes()));
             *range = (start, end);
             start = end;
             // Writing to a String cannot fail.
@@ -169,7 +187,7 @@ impl UnrollLayout {
 
     /// Bytes of a payload.
     pub fn size(&self) -> usize {
-        self.range(Field::Clip).end
+        self.range(Field::Image).end
     }
 
     /// SHA-256 over a canonical description: format version, T, and each field's name, rows, width and type.
@@ -195,7 +213,7 @@ impl UnrollLayout {
 
     /// Elements of the whole field, rows × width.
     pub fn elements(&self, field: Field) -> usize {
-        self.range(field).len() / ELEMENT
+        self.range(field).len() / field.element_bytes()
     }
 
     /// The most episodes that can end in one unroll: each has its last observation in a row of its own.

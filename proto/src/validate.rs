@@ -214,7 +214,7 @@ fn check_finite(layout: &UnrollLayout, payload: &[u8]) -> Result<(), Invalid> {
     }
     for name in Field::ALL {
         let place = field(layout, payload, name).position(|word| word & EXPONENT == EXPONENT);
-        if let Some(place) = place.filter(|_| name != Field::Clip) {
+        if let Some(place) = place.filter(|_| !matches!(name, Field::Clip | Field::Image)) {
             return Err(Invalid::NotFinite { field: name, row: place / layout.width(name).max(1) });
         }
     }

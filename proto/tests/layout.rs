@@ -15,6 +15,7 @@ fn shape() -> impl Strategy<Value = UnrollShape> {
             action,
             latent,
             reward_terms,
+            image: 0,
         },
     )
 }
@@ -37,9 +38,9 @@ fn the_paper_s_unroll_has_the_shapes_of_experiment_and_task() {
 
 #[test]
 fn the_hash_is_the_same_on_every_machine_and_in_every_build() {
-    let shape = UnrollShape { length: 2, proprioception: 3, task: 4, action: 5, latent: 6, reward_terms: 7 };
+    let shape = UnrollShape { length: 2, proprioception: 3, task: 4, action: 5, latent: 6, reward_terms: 7, image: 0 };
     let hash: String = UnrollLayout::new(shape).hash().iter().map(|byte| format!("{byte:02x}")).collect();
-    assert_eq!(hash, "7f4f2dd564f8543fb88ae34a6038dcd0b3d035dd91e6fc0471503e517969fbb3");
+    assert_eq!(hash, "09de3cc8f84ee5039192252b3ba87ee548ea7c2c7066183d33344c4ed6f0ed4a");
 }
 
 proptest! {
@@ -76,9 +77,21 @@ proptest! {
     #[test]
     fn dimensions_beyond_any_memory_do_not_overflow(length in any::<usize>(), width in any::<usize>()) {
         let shape = UnrollShape {
-            length, proprioception: width, task: width, action: width, latent: width, reward_terms: width,
+            length, proprioception: width, task: width, action: width, latent: width, reward_terms: width, image: 0,
         };
         let layout = UnrollLayout::new(shape);
         prop_assert!(layout.message_limit() >= layout.size());
     }
+}
+
+#[test]
+fn images_travel_as_bytes_and_keep_every_row_aligned() {
+    let mut spec = TaskSpec { image: 64 * 64 * 3, ..TaskSpec::default() };
+    let experiment = Experiment::default();
+    let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
+    assert_eq!((layout.rows(Field::Image), layout.width(Field::Image)), (33, 12_288));
+    assert_eq!(layout.range(Field::Image).len(), 33 * 12_288);
+    assert_eq!(layout.size(), layout.range(Field::Image).end);
+    spec.image = 10;
+    assert_eq!(UnrollLayout::new(UnrollShape::new(&spec, &experiment)).width(Field::Image), 12);
 }

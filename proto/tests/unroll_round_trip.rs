@@ -6,7 +6,15 @@ use comic_proto::{Field, Invalid, UnrollBuffer, UnrollLayout, UnrollShape};
 use proptest::prelude::*;
 
 fn layout() -> UnrollLayout {
-    UnrollLayout::new(UnrollShape { length: 3, proprioception: 5, task: 7, action: 2, latent: 4, reward_terms: 3 })
+    UnrollLayout::new(UnrollShape {
+        length: 3,
+        proprioception: 5,
+        task: 7,
+        action: 2,
+        latent: 4,
+        reward_terms: 3,
+        image: 0,
+    })
 }
 
 /// A number that tells field, row and column apart.
@@ -75,4 +83,17 @@ proptest! {
         let refused = UnrollBuffer::from_payload(&layout(), &bytes).err();
         prop_assert_eq!(refused, Some(Invalid::Length { found, expected: layout().size() }));
     }
+}
+
+#[test]
+fn images_come_back_as_they_were_written() {
+    let layout = UnrollLayout::new(UnrollShape { image: 8, ..*layout().shape() });
+    let mut unroll = UnrollBuffer::new(&layout);
+    for t in 0..layout.rows(Field::Image) {
+        unroll.image_mut(t).copy_from_slice(&[t as u8, 1, 2, 3, 4, 255, 254, 253]);
+    }
+    let payload = unroll.into_bytes();
+    let images = &payload[layout.range(Field::Image)];
+    assert_eq!(images.len(), 4 * 8);
+    assert!(images.chunks(8).enumerate().all(|(t, row)| row == [t as u8, 1, 2, 3, 4, 255, 254, 253]));
 }

@@ -12,9 +12,10 @@ use crate::ledger::Reason;
 /// The arrays of a batch: `[B, rows, width]` for each field. Made once and used again and again.
 #[derive(Debug)]
 pub(crate) struct Buffer {
-    /// In the order of [`Field::ALL`]; the last, the clips, stays empty here.
+    /// In the order of [`Field::ALL`]; the clips and the images stay empty here.
     floats: [Vec<f32>; Field::ALL.len()],
     clips: Vec<u32>,
+    images: Vec<u8>,
     pub(crate) headers: Vec<UnrollHeader>,
 }
 
@@ -22,8 +23,12 @@ impl Buffer {
     pub(crate) fn new(layout: &UnrollLayout, unrolls: usize) -> Self {
         let elements = |field: Field| layout.elements(field) * unrolls;
         Self {
-            floats: Field::ALL.map(|field| if field == Field::Clip { Vec::new() } else { vec![0.0; elements(field)] }),
+            floats: Field::ALL.map(|field| match field {
+                Field::Clip | Field::Image => Vec::new(),
+                _ => vec![0.0; elements(field)],
+            }),
             clips: vec![0; elements(Field::Clip)],
+            images: vec![0; elements(Field::Image)],
             headers: Vec::with_capacity(unrolls),
         }
     }
@@ -42,6 +47,7 @@ impl Buffer {
             let place = slot * elements..(slot + 1) * elements;
             let bytes: &mut [u8] = match field {
                 Field::Clip => bytemuck::cast_slice_mut(&mut self.clips[place]),
+                Field::Image => &mut self.images[place],
                 _ => bytemuck::cast_slice_mut(&mut self.floats[field as usize][place]),
             };
             bytes.copy_from_slice(&payload[layout.range(field)]);
@@ -88,7 +94,8 @@ impl Batch {
         Ok(Self { layout, unrolls: buffer.len(), buffer: Some(Box::new(buffer)), owner: None })
     }
 
-    /// A field of `f32`, `[B, rows, width]`; empty for [`Field::Clip`], which is [`clip`](Self::clip).
+    /// A field of `f32`, `[B, rows, width]`; empty for [`Field::Clip`] and [`Field::Image`], which are
+    /// [`clip`](Self::clip) and [`image`](Self::image).
     pub fn f32(&self, field: Field) -> &[f32] {
         self.buffer.as_ref().map_or(&[], |buffer| &buffer.floats[field as usize])
     }
@@ -96,6 +103,11 @@ impl Batch {
     /// The clips' indices, `[B, T+1]`.
     pub fn clip(&self) -> &[u32] {
         self.buffer.as_ref().map_or(&[], |buffer| &buffer.clips)
+    }
+
+    /// The images, `[B, T+1, I]`; empty when the humanoid is blind.
+    pub fn image(&self) -> &[u8] {
+        self.buffer.as_ref().map_or(&[], |buffer| &buffer.images)
     }
 
     /// The headers, `[B]`, without the layout hash, which all of them share.

@@ -1,7 +1,7 @@
 //! Recorded episodes of dm_control's go-to-target and corridors, replayed: the rules and the physics of training, with
 //! the draws taken from a record instead of a random number generator.
 
-use comic_experiment::{Corridor, GoToTarget, StartPose};
+use comic_experiment::{Corridor, GoToTarget, StartPose, Vision};
 use mujoco_rs::prelude::*;
 use rand_pcg::Pcg64;
 
@@ -12,7 +12,7 @@ use crate::error::Error;
 use crate::go_to_target::{GoToTargetRules, Memory as GoToTargetMemory};
 use crate::rules::{Recorded, RuledEnvironment};
 use crate::start::{Pose, Poses, UP};
-use crate::{Simulated, Simulation, Step, humanoid};
+use crate::{Simulated, Simulation, Step, humanoid, vision};
 
 /// Named numbers.
 type Named = Vec<(&'static str, Vec<f64>)>;
@@ -47,6 +47,15 @@ impl Replay {
     /// One control step.
     pub fn step_control(&mut self, control: &[f64; 56]) -> Step {
         self.0.step_control(control)
+    }
+
+    /// What the humanoid sees, as dm_control draws it (`full`) or as training does; [`vision::IMAGE_BYTES`] bytes.
+    ///
+    /// # Errors
+    /// [`Error::Graphics`] when there is nothing to draw with.
+    pub fn draw(&mut self, full: bool, image: &mut [u8]) -> Result<(), Error> {
+        let vision = if full { Vision::Full } else { Vision::Fast };
+        vision::draw(vision, self.0.simulation_mut(), image)
     }
 
     /// dm_control's observation dictionary without the camera, in its order.

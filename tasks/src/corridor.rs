@@ -3,7 +3,7 @@
 use std::fmt::Debug;
 use std::sync::Arc;
 
-use comic_experiment::Corridor;
+use comic_experiment::{Corridor, Vision};
 use mujoco_rs::prelude::*;
 use rand_pcg::Pcg64;
 
@@ -97,6 +97,10 @@ impl<O: Obstacles> Rules for CorridorRules<O> {
 
     fn time_limit(&self) -> f64 {
         self.config.time_limit
+    }
+
+    fn vision(&self) -> Vision {
+        self.config.vision
     }
 }
 

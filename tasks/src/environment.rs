@@ -136,6 +136,10 @@ impl Environment for TrackingEnvironment {
         }
     }
 
+    fn draw(&mut self, _: &mut [u8]) -> Result<(), Error> {
+        Ok(())
+    }
+
     fn episode(&self) -> Episode {
         let reference = self.reference();
         let steps_left = reference.last_step(self.task.look_ahead).saturating_sub(self.start);

@@ -24,6 +24,15 @@ pub enum Error {
     /// A clip could not be read.
     #[error(transparent)]
     Clips(#[from] comic_clips::Error),
+    /// Nothing can be drawn.
+    #[error(
+        "no OpenGL to draw with ({reason}); install Debian's libegl1 and libgl1-mesa-dri, which draw without a display, \
+         or leave images out with --set gaps.corridor.vision=off or walls.corridor.vision=off"
+    )]
+    Graphics {
+        /// What MuJoCo or EGL said.
+        reason: String,
+    },
     /// There is nothing to track.
     #[error("clips: no clip to track; name at least one source that has clips")]
     NoClips,

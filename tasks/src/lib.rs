@@ -35,6 +35,7 @@ mod stage;
 mod start;
 mod starts;
 mod tracking;
+pub mod vision;
 mod walker;
 mod walls;
 
@@ -134,6 +135,13 @@ pub trait Environment: Debug + Send {
     /// When the slices are shorter than [`TaskSpec`] says.
     fn observe(&self, proprioception: &mut [f32], task: &mut [f32]);
 
+    /// Draws what the humanoid sees after the last reset or step: [`vision::IMAGE_BYTES`] bytes, rows from the top, red,
+    /// green, blue; black when that step diverged. A task without sight leaves the image, which is empty, alone.
+    ///
+    /// # Errors
+    /// [`Error::Graphics`] when there is nothing to draw with.
+    fn draw(&mut self, image: &mut [u8]) -> Result<(), Error>;
+
     /// Where the current episode began.
     fn episode(&self) -> Episode;
 
@@ -157,6 +165,10 @@ impl<E: Environment + ?Sized> Environment for Box<E> {
 
     fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
         (**self).observe(proprioception, task);
+    }
+
+    fn draw(&mut self, image: &mut [u8]) -> Result<(), Error> {
+        (**self).draw(image)
     }
 
     fn episode(&self) -> Episode {

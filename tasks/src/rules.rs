@@ -5,7 +5,7 @@
 use std::fmt::Debug;
 use std::sync::Arc;
 
-use comic_experiment::TaskSpec;
+use comic_experiment::{TaskSpec, Vision};
 use mujoco_rs::prelude::MjModel;
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
@@ -16,7 +16,7 @@ use crate::physics::{Simulation, is_healthy};
 use crate::stage::{CONTROL_TIMESTEP, Stage};
 use crate::start::Pose;
 use crate::starts::ClipStarts;
-use crate::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Simulated, Step, Task, control};
+use crate::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Simulated, Step, Task, control, vision};
 
 /// Starts of an evaluation: episode k of a task is the one that its draws from seed k give.
 const EVALUATION_STARTS: usize = 64;
@@ -43,6 +43,11 @@ pub(crate) trait Rules: Debug + Send + Sync + 'static {
 
     /// Seconds an episode lasts.
     fn time_limit(&self) -> f64;
+
+    /// How the humanoid sees.
+    fn vision(&self) -> Vision {
+        Vision::Off
+    }
 }
 
 /// Rules that dm_control has too, so that its recordings can be replayed.
@@ -187,6 +192,14 @@ impl<R: Rules> Environment for RuledEnvironment<R> {
         }
         self.stage.body().write_proprioception(proprioception);
         self.task.rules.observe(&self.stage, &self.memory, task);
+    }
+
+    fn draw(&mut self, image: &mut [u8]) -> Result<(), Error> {
+        if self.diverged {
+            image.fill(0);
+            return Ok(());
+        }
+        vision::draw(self.task.rules.vision(), &mut self.stage.data, image)
     }
 
     fn episode(&self) -> Episode {

@@ -80,6 +80,9 @@ impl Environment for Recorded {
     fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
         self.environment.observe(proprioception, task);
     }
+    fn draw(&mut self, image: &mut [u8]) -> Result<(), comic_tasks::Error> {
+        self.environment.draw(image)
+    }
     fn episode(&self) -> Episode {
         self.environment.episode()
     }

@@ -120,6 +120,7 @@ mod tests {
             action: 1,
             reward_terms: vec!["pose".into(), "velocity".into()],
             max_reward: 1.45,
+            image: 0,
             clips: vec!["walk".into(), "run".into(), "unused".into()],
         }
     }

@@ -52,6 +52,9 @@ pub(super) fn run<E: Environment, F: ForwardPass>(
         lane.begin(queue.next(), &mut batch, index)?;
     }
     while lanes.iter().any(|lane| lane.episode.is_some()) {
+        for (index, lane) in lanes.iter_mut().enumerate().filter(|(_, lane)| lane.episode.is_some()) {
+            lane.environment.draw(batch.row(index).image)?;
+        }
         act(evaluated, &lanes, &mut batch, options, &mut rng)?;
         for (index, lane) in lanes.iter_mut().enumerate() {
             if let Some(episode) = lane.step(&mut batch, index, options, &mut rng, &mut scratch) {
@@ -169,6 +172,9 @@ mod tests {
         fn observe(&self, proprioception: &mut [f32], _task: &mut [f32]) {
             proprioception[0] = self.step as f32;
         }
+        fn draw(&mut self, _image: &mut [u8]) -> Result<(), comic_tasks::Error> {
+            Ok(())
+        }
         fn episode(&self) -> Episode {
             Episode { clip: 0, start: self.start, steps_left: 10 }
         }
@@ -202,7 +208,7 @@ mod tests {
         let environments = (0..environments).map(|_| Fixed { start: 0, step: 0 }).collect();
         let starts: Vec<Start> = (0..7).map(|start| Start { clip: 0, start }).collect();
         let options = Options { deterministic: true, ..Options::default() };
-        let sizes = ActingSizes { proprioception: 1, task: 0, latent: 1, action: 2 };
+        let sizes = ActingSizes { proprioception: 1, task: 0, latent: 1, action: 2, image: 0 };
         let finished = run(evaluated, environments, sizes, &starts, &options, &mut |_, _| ()).unwrap();
         let mut found: Vec<_> = finished.iter().map(|e| (e.steps, e.steps_left, e.returns[0])).collect();
         found.sort_by(|a, b| a.partial_cmp(b).unwrap());

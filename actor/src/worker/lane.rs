@@ -6,6 +6,7 @@ use comic_proto::{Field, UnrollBuffer, UnrollLayout};
 use comic_tasks::{Environment, Episode, MAX_REWARD_TERMS, Outcome};
 use rand::Rng;
 
+use crate::Error;
 use crate::acting::{ActingRow, clip_action, sample_action};
 
 #[derive(Debug)]
@@ -50,12 +51,15 @@ impl<E: Environment> Lane<E> {
         self.ended
     }
 
-    /// The current observation as row `t`.
-    pub(super) fn write_observation(&mut self, t: usize, row: &ActingRow<'_>) {
+    /// The current observation as row `t`. What it looks like is drawn here, once for the row and once for acting.
+    pub(super) fn write_observation(&mut self, t: usize, row: &mut ActingRow<'_>) -> Result<(), Error> {
+        self.environment.draw(row.image)?;
+        self.unroll.image_mut(t).copy_from_slice(row.image);
         self.unroll.row_mut(Field::Proprioception, t).copy_from_slice(row.proprioception);
         self.unroll.row_mut(Field::Task, t).copy_from_slice(row.task);
         self.unroll.row_mut(Field::First, t)[0] = f32::from(u8::from(self.first));
         self.unroll.set_clip(t, self.episode.clip as u32);
+        Ok(())
     }
 
     /// A transition: samples the action, writes row `t`, steps, observes.

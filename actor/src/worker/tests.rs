@@ -54,6 +54,9 @@ impl Environment for Counter {
         proprioception.copy_from_slice(&[self.episodes as f32, self.step as f32]);
         task.fill(self.last_action);
     }
+    fn draw(&mut self, _image: &mut [u8]) -> Result<(), comic_tasks::Error> {
+        Ok(())
+    }
     fn episode(&self) -> Episode {
         Episode { clip: self.episodes % 2, start: 0, steps_left: self.length() }
     }
@@ -91,6 +94,7 @@ fn layout(length: usize) -> Arc<UnrollLayout> {
         action: 3,
         latent: 2,
         reward_terms: 2,
+        image: 0,
     }))
 }
 

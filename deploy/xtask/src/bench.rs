@@ -25,6 +25,8 @@ enum Side {
     Actor,
     /// The update, against its matrix products and against PyTorch
     Learner,
+    /// Images of what the humanoid sees
+    Vision,
 }
 
 /// One figure; ratio = value / floor.
@@ -47,6 +49,10 @@ pub(crate) fn run(options: &Options) -> Result<()> {
     match options.side {
         Side::Actor => {
             show(&figures(Command::new(workspace::program("comic-actor")?).arg("bench").args(&options.arguments))?)
+        }
+        Side::Vision => {
+            let mut bench = Command::new(workspace::program("comic-actor")?);
+            show(&figures(bench.args(["bench", "vision"]).args(&options.arguments))?)
         }
         Side::Learner => learner(options.threads, &options.arguments),
     }

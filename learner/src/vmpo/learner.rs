@@ -251,6 +251,7 @@ impl VmpoLearner {
             action: self.spec.action,
             latent: self.network.latent.size,
             reward_terms: self.spec.reward_terms.len(),
+            image: self.spec.image,
         };
         let known = self.spec.clips.len();
         if found == expected && minibatch.clips <= known {
@@ -262,7 +263,7 @@ impl VmpoLearner {
     fn forward(&self, minibatch: &MinibatchTensors) -> Pass {
         let shape = minibatch.shape();
         let (unrolls, length) = (shape.unrolls as i64, shape.length as i64);
-        let observation = self.policy.normalise(&minibatch.proprioception, &minibatch.task);
+        let observation = self.policy.normalise(&minibatch.proprioception, &minibatch.task, minibatch.image.as_ref());
         let values = self.value.forward(&observation, &minibatch.clip).reshape([unrolls, length + 1, -1]);
         let acting = self.policy.act_normalised(
             &observation.first_steps(length),

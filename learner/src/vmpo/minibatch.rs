@@ -21,6 +21,8 @@ pub struct MinibatchShape {
     pub latent: usize,
     /// R, reward terms.
     pub reward_terms: usize,
+    /// I, bytes of an image; 0 when the task is blind.
+    pub image: usize,
 }
 
 /// The fields of a batch as contiguous slices, `[B, rows, width]` each, in the wire's own element types.
@@ -50,9 +52,11 @@ pub struct MinibatchSource<'a> {
     pub first: &'a [f32],
     /// The clip's index, `[B, T+1]`.
     pub clip: &'a [u32],
+    /// What the humanoid sees, `[B, T+1, I]`; empty when the task is blind.
+    pub image: &'a [u8],
 }
 
-/// A minibatch of unrolls, batch first, float32 except `clip`.
+/// A minibatch of unrolls, batch first, float32 except `clip` and `image`.
 ///
 /// What belongs to a row that is no transition (its action, distribution, reward, latent) is blanked when the tensors
 /// are made, so no formula can see it; its observation stays, since a truncated episode is bootstrapped there.
@@ -70,6 +74,8 @@ pub struct MinibatchTensors {
     pub(super) valid: Tensor,
     pub(super) first: Tensor,
     pub(super) clip: Tensor,
+    /// uint8; none when the task is blind.
+    pub(super) image: Option<Tensor>,
     /// One more than the largest clip index: known on the host, so no step has to ask the device.
     pub(super) clips: usize,
 }
@@ -94,6 +100,13 @@ impl MinibatchTensors {
             Ok::<Tensor, Error>(tensor(name, values, 0, width)?.f_where_scalarother(&mask, blank)?)
         };
         check("clip", source.clip.len(), &[shape.unrolls, rows[1]])?;
+        let size = [shape.unrolls, rows[1], shape.image];
+        check("image", source.image.len(), &size)?;
+        let image = if shape.image == 0 {
+            None
+        } else {
+            Some(Tensor::from_slice(source.image).f_reshape(size.map(|size| size as i64))?.f_to_device(device)?)
+        };
         let clip: Vec<i64> = source.clip.iter().map(|clip| i64::from(*clip)).collect();
         Ok(Self {
             proprioception: tensor("proprioception", source.proprioception, 1, shape.proprioception)?,
@@ -107,6 +120,7 @@ impl MinibatchTensors {
             discount: flag("discount", source.discount, 0)? * &valid,
             first: flag("first", source.first, 1)?,
             clip: Tensor::from_slice(&clip).f_reshape([shape.unrolls as i64, rows[1] as i64])?.f_to_device(device)?,
+            image,
             clips: source.clip.iter().max().map_or(0, |clip| *clip as usize + 1),
             valid,
         })
@@ -123,6 +137,7 @@ impl MinibatchTensors {
             action: width(&self.action, 2),
             latent: width(&self.latent_noise, 2),
             reward_terms: width(&self.reward, 2),
+            image: self.image.as_ref().map_or(0, |image| width(image, 2)),
         }
     }
 
@@ -147,6 +162,7 @@ impl MinibatchTensors {
             valid: take(&self.valid),
             first: take(&self.first),
             clip: take(&self.clip),
+            image: self.image.as_ref().map(take),
             clips: self.clips,
         }
     }

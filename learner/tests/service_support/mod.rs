@@ -54,6 +54,7 @@ impl World {
             action: 2,
             reward_terms: vec!["posture".into(), "progress".into()],
             max_reward: 1.0,
+            image: 0,
             clips: vec!["walk".into(), "run".into()],
         };
         let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));

@@ -24,6 +24,7 @@ pub(crate) fn spec() -> TaskSpec {
         action: WIDTHS.action,
         reward_terms: vec!["near".into(), "far".into()],
         max_reward: 1.0,
+        image: 0,
         clips: vec!["walk".into(), "run".into(), "jump".into()],
     }
 }
@@ -129,6 +130,7 @@ impl Unrolls {
             action: WIDTHS.action,
             latent: WIDTHS.latent,
             reward_terms: WIDTHS.reward_terms,
+            image: 0,
         }
     }
 
@@ -146,6 +148,7 @@ impl Unrolls {
             valid: &self.valid,
             first: &self.first,
             clip: &self.clip,
+            image: &[],
         }
     }
 
@@ -170,7 +173,7 @@ impl Unrolls {
         for start in (0..total).step_by(rows) {
             let length = rows.min(total - start) as i64;
             let [s, x, z, noise] = inputs.each_ref().map(|input| input.narrow(0, start as i64, length));
-            let acting = tch::no_grad(|| learner.policy().act(&s, &x, &z, &noise));
+            let acting = tch::no_grad(|| learner.policy().act(&s, &x, None, &z, &noise));
             means.extend(values(&acting.action.mean));
             stds.extend(values(&acting.action.std));
         }

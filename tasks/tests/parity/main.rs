@@ -12,6 +12,7 @@ mod npz;
 mod recording;
 mod rules;
 mod tracking;
+mod vision;
 
 use npz::{Array, Values};
 use recording::{Rollout, folder, rollouts};

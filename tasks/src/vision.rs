@@ -1,0 +1,95 @@
+//! What the humanoid sees: its egocentric camera, drawn by MuJoCo off-screen (`cmu_humanoid.py`, `egocentric_camera`).
+//!
+//! Drawing needs OpenGL through EGL, and no display. A context belongs to the thread that made it and is costly, so each
+//! thread keeps one of its own, at first use, for all its environments; the caller sees none of that.
+
+use std::cell::RefCell;
+
+use comic_experiment::{IMAGE_SIZE, Vision};
+use mujoco_rs::prelude::*;
+use mujoco_rs::renderer::{MjRenderer, RendererError};
+
+use crate::error::Error;
+use crate::humanoid::PREFIX;
+use crate::physics::Simulation;
+
+/// Bytes of an image: rows from the top, pixels from the left, red, green, blue.
+pub const IMAGE_BYTES: usize = IMAGE_SIZE * IMAGE_SIZE * 3;
+/// The camera's name.
+const CAMERA: &str = "egocentric";
+/// The group of what the humanoid does not see of itself: its nose (`_WALKER_INVIS_GROUP`).
+const INVISIBLE_GROUP: usize = 1;
+
+thread_local! {
+    /// The camera of this thread, and how it draws.
+    static CAMERA_OF_THREAD: RefCell<Option<(Vision, Camera)>> = const { RefCell::new(None) };
+}
+
+/// Draws what the humanoid of `simulation` sees into `image`, [`IMAGE_BYTES`] long. [`Vision::Off`] draws nothing.
+///
+/// # Errors
+/// [`Error::Graphics`] when there is no OpenGL.
+pub(crate) fn draw(vision: Vision, simulation: &mut Simulation, image: &mut [u8]) -> Result<(), Error> {
+    if vision == Vision::Off {
+        return Ok(());
+    }
+    CAMERA_OF_THREAD.with_borrow_mut(|kept| {
+        let camera = match kept {
+            Some((kind, camera)) if *kind == vision => camera,
+            _ => {
+                // The old context goes before the new one comes: both would be current in this thread.
+                *kept = None;
+                &mut kept.insert((vision, Camera::new(simulation.model(), vision)?)).1
+            }
+        };
+        camera.draw(simulation, image)
+    })
+}
+
+/// An off-screen context, and the egocentric camera in it.
+#[derive(Debug)]
+struct Camera {
+    renderer: MjRenderer,
+}
+
+impl Camera {
+    fn new(model: &MjModel, vision: Vision) -> Result<Self, Error> {
+        let camera = model
+            .name_to_id(MjtObjBase::mjOBJ_CAMERA, &format!("{PREFIX}{CAMERA}"))
+            .ok_or_else(|| crate::humanoid::missing("camera", CAMERA))?;
+        // How a context draws is decided by the model it is made for; drawn is whatever model comes.
+        let mut settings = model.clone();
+        if vision == Vision::Fast {
+            let visual = settings.vis_mut();
+            (visual.quality.shadowsize, visual.quality.offsamples) = (0, 0);
+            (visual.global.offwidth, visual.global.offheight) = (IMAGE_SIZE as i32, IMAGE_SIZE as i32);
+        }
+        let mut options = MjvOption::default();
+        options.geomgroup[INVISIBLE_GROUP] = 0;
+        options.flags[MjtVisFlag::mjVIS_RANGEFINDER as usize] = 0;
+        let size = IMAGE_SIZE as u32;
+        let renderer = MjRenderer::builder()
+            .width(size)
+            .height(size)
+            .camera(MjvCamera::new_fixed(camera))
+            .opts(options)
+            .build(&settings)
+            .map_err(graphics)?;
+        Ok(Self { renderer })
+    }
+
+    fn draw(&mut self, simulation: &mut Simulation, image: &mut [u8]) -> Result<(), Error> {
+        self.renderer.sync_data(simulation).map_err(graphics)?;
+        self.renderer.render().map_err(graphics)?;
+        if let Some(drawn) = self.renderer.rgb_flat() {
+            image.copy_from_slice(drawn);
+        }
+        Ok(())
+    }
+}
+
+/// What went wrong with OpenGL, and what helps.
+pub(crate) fn graphics(error: RendererError) -> Error {
+    let cause = std::error::Error::source(&error).map(|cause| format!(": {cause}")).unwrap_or_default();
+    Error::Graphics { reason: format!("{error}{cause}") }
+}
