@@ -16,6 +16,8 @@ const MANIFEST: &str = "MANIFEST.json";
 const EXPERIMENT: &str = "experiment.toml";
 const PROGRESS: &str = "progress.json";
 const POLICY: &str = "policy.safetensors";
+/// What a path should have named.
+const WANTED: &str = "name a run's directory (runs/… of `cargo xtask train`), its `checkpoints`, or one of them";
 
 /// What acting needs of a checkpoint.
 #[derive(Clone, Debug)]
@@ -48,6 +50,9 @@ pub fn read(path: &Path) -> Result<Checkpoint, Error> {
     if path.join(MANIFEST).is_file() {
         return read_one(path);
     }
+    if !path.is_dir() {
+        return Err(refuse(path, format!("no such directory; {WANTED}")));
+    }
     let below = path.join("checkpoints");
     let directory = if below.is_dir() { below } else { path.to_path_buf() };
     for candidate in numbered(&directory)?.into_iter().rev() {
@@ -56,7 +61,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, Error> {
             Err(error) => tracing::warn!("passed over a damaged checkpoint: {error}"),
         }
     }
-    Err(refuse(path, "no complete checkpoint here (a run directory, its `checkpoints`, or one of them is wanted)"))
+    Err(refuse(path, format!("no complete checkpoint here; {WANTED}")))
 }
 
 /// Numbered checkpoints, oldest first: the numbers are zero-padded.

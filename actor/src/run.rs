@@ -55,10 +55,17 @@ pub fn run(options: &Options) -> Result<(), Error> {
         .enable_all()
         .build()
         .map_err(Error::Thread)?;
+    let outcome = act(&runtime, options);
+    // A name that resolves slowly holds a thread of the runtime, and need not hold the process.
+    runtime.shutdown_background();
+    outcome
+}
+
+fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
     let mailbox = Arc::new(Mailbox::default());
     let (stopping, stop) = watch::channel(false);
     let closing = Closing { mailbox: Arc::clone(&mailbox), stopping };
-    stop_on_signal(&runtime, closing.clone())?;
+    stop_on_signal(runtime, closing.clone())?;
     let session = session::Options { learner: options.learner.clone(), cache: options.cache.clone() };
     let joined = match runtime.block_on(session::join(&session, stop.clone())) {
         Err(Error::Stopped) => return Ok(()),

@@ -38,6 +38,8 @@ pub struct Metrics {
     file: File,
     window: Window,
     since: Instant,
+    /// The books of the last line.
+    books: Value,
 }
 
 /// Where the run stands, for the line's head.
@@ -70,12 +72,18 @@ impl Metrics {
             file,
             window: Window::default(),
             since: Instant::now(),
+            books: Value::Null,
         })
     }
 
     /// Seconds since the last line.
     pub fn elapsed(&self) -> f64 {
         self.since.elapsed().as_secs_f64()
+    }
+
+    /// Whether a line would say anything that the last one did not: a learner that nobody feeds writes none.
+    pub fn has_news(&self, books: &Value) -> bool {
+        self.window.unrolls > 0 || self.window.environment_steps > 0 || self.books != *books
     }
 
     /// Appends an actor's evaluation to `RUN/evaluations.jsonl`.
@@ -95,10 +103,14 @@ impl Metrics {
         self.window.environment_steps += steps;
     }
 
+    /// Counts a batch that V-MPO trained on.
+    pub fn count_update(&mut self) {
+        self.window.updates += 1;
+    }
+
     /// Counts a batch's episodes, and the age of its unrolls where `version` is the newest.
     pub fn absorb(&mut self, headers: &[UnrollHeader], version: u64) {
         let window = &mut self.window;
-        window.updates += 1;
         window.returns.resize(self.terms.len(), 0.0);
         for header in headers {
             window.unrolls += 1;
@@ -126,6 +138,7 @@ impl Metrics {
         let seconds = self.since.elapsed().as_secs_f64().max(1e-9);
         let window = std::mem::take(&mut self.window);
         self.since = Instant::now();
+        self.books = books.clone();
         let total: f64 = window.returns.iter().sum();
         // Shares of nothing are absent, not 0.
         let per = |value: f64, count: u64| if count == 0 { Value::Null } else { json!(value / count as f64) };

@@ -206,6 +206,7 @@ impl Trainer {
             self.report(&losses.to_metrics())?;
         }
         self.progress.updates += 1;
+        self.metrics.count_update();
         self.metrics.absorb(batch.headers(), self.progress.version);
         // Published before the batch goes back: whoever waits for its room goes on with these parameters.
         if self.progress.updates.is_multiple_of(self.experiment.vmpo.target_period) {
@@ -376,7 +377,17 @@ impl Trainer {
     }
 
     pub(crate) fn write_metrics_when_due(&mut self) -> Result<()> {
-        if self.metrics.elapsed() >= self.experiment.learner.metrics_seconds { self.write_metrics() } else { Ok(()) }
+        if self.metrics.elapsed() < self.experiment.learner.metrics_seconds {
+            return Ok(());
+        }
+        for evaluation in self.shared.take_evaluations() {
+            self.metrics.keep_evaluation(&evaluation)?;
+        }
+        if self.metrics.has_news(&self.books()?) { self.write_metrics() } else { Ok(()) }
+    }
+
+    fn books(&self) -> Result<Value> {
+        Ok(serde_json::to_value(self.batcher.books())?)
     }
 
     fn write_metrics(&mut self) -> Result<()> {
@@ -387,7 +398,7 @@ impl Trainer {
             version: self.progress.version,
             epoch: self.epoch,
         };
-        let books = serde_json::to_value(self.batcher.books())?;
+        let books = self.books()?;
         for evaluation in self.shared.take_evaluations() {
             self.metrics.keep_evaluation(&evaluation)?;
         }

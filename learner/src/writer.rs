@@ -1,7 +1,7 @@
 //! Checkpoints are written by a thread of their own, so that training goes on.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
@@ -13,7 +13,8 @@ use crate::checkpoint::{Name, Snapshot, Store};
 #[derive(Debug)]
 pub struct Writer {
     queue: SyncSender<(Name, Snapshot)>,
-    busy: Arc<AtomicBool>,
+    /// Snapshots handed over and not yet written.
+    pending: Arc<AtomicUsize>,
     thread: JoinHandle<Result<()>>,
 }
 
@@ -24,18 +25,18 @@ impl Writer {
     /// When the system gives no thread.
     pub fn start(store: Store) -> Result<Self> {
         let (queue, received) = sync_channel(1);
-        let busy = Arc::new(AtomicBool::new(false));
-        let shared = busy.clone();
+        let pending = Arc::<AtomicUsize>::default();
+        let shared = Arc::clone(&pending);
         let thread = std::thread::Builder::new()
             .name("checkpoints".into())
             .spawn(move || write_all(&store, &received, &shared))
             .context("cannot start the checkpoint thread")?;
-        Ok(Self { queue, busy, thread })
+        Ok(Self { queue, pending, thread })
     }
 
     /// Whether a snapshot is still being written.
     pub fn is_busy(&self) -> bool {
-        self.busy.load(Ordering::Acquire)
+        self.pending.load(Ordering::Acquire) > 0
     }
 
     /// Has `snapshot` written; waits while another one waits.
@@ -43,7 +44,7 @@ impl Writer {
     /// # Errors
     /// When the thread is gone.
     pub fn write(&self, name: Name, snapshot: Snapshot) -> Result<()> {
-        self.busy.store(true, Ordering::Release);
+        self.pending.fetch_add(1, Ordering::AcqRel);
         self.queue.send((name, snapshot)).map_err(|_| anyhow!("the checkpoint thread is gone"))
     }
 
@@ -58,14 +59,14 @@ impl Writer {
 }
 
 /// A disk that refuses once may take the next one: training goes on, and the log says so. The last one counts.
-fn write_all(store: &Store, queue: &Receiver<(Name, Snapshot)>, busy: &AtomicBool) -> Result<()> {
+fn write_all(store: &Store, queue: &Receiver<(Name, Snapshot)>, pending: &AtomicUsize) -> Result<()> {
     let mut last = Ok(());
     while let Ok((name, snapshot)) = queue.recv() {
         last = store.write(name, &snapshot).map(|path| tracing::info!(checkpoint = %path.display(), "written"));
         if let Err(error) = &last {
             tracing::error!(checkpoint = %name, "checkpoint not written: {error:#}");
         }
-        busy.store(false, Ordering::Release);
+        pending.fetch_sub(1, Ordering::AcqRel);
     }
     last
 }

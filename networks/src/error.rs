@@ -38,7 +38,7 @@ pub enum Error {
         found: String,
     },
     /// A parameter that holds an infinity or a NaN, or a standard deviation that is not positive.
-    #[error("`{name}` holds {what}; refuse these parameters and keep the previous ones")]
+    #[error("`{name}` holds {what}; these parameters are not taken")]
     Number {
         /// The parameter's name.
         name: String,

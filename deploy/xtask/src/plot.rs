@@ -17,7 +17,7 @@ const SMOOTHED_OVER: usize = 5;
 pub(crate) enum Quantity {
     /// Return of an episode, with the acting policy's noise; baselines have it too.
     EpisodeReturn,
-    /// Return / (1.45 × the steps that were left in the clip).
+    /// Return / (the most a step pays × the steps that were left).
     NormalisedReward,
     /// Reward per survived step.
     RewardPerStep,

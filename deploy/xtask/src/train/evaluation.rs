@@ -25,9 +25,9 @@ struct ClipEvaluation {
     clip: String,
     episodes: u64,
     return_mean: f64,
-    /// Return / (1.45 × the steps that were left in the clip at the episode's start).
+    /// Return / (the most a step pays × the steps that were left at the episode's start).
     normalised_reward: f64,
-    /// Reward per survived step / 1.45.
+    /// Reward per survived step / the most a step pays.
     reward_per_step: f64,
     fraction_survived: f64,
     /// Per survived step.
@@ -104,7 +104,7 @@ fn table(columns: &[(&str, Evaluation)]) -> String {
         };
         row("return", &|clip| Some(clip.return_mean));
         row("normalised reward", &|clip| Some(clip.normalised_reward));
-        row("reward per step / 1.45", &|clip| Some(clip.reward_per_step));
+        row("reward per step / most", &|clip| Some(clip.reward_per_step));
         row("fraction survived", &|clip| Some(clip.fraction_survived));
         for term in clip.reward_terms.keys() {
             row(&format!("{term}, per step"), &|clip| clip.reward_terms.get(term).copied());

@@ -21,7 +21,7 @@ pub(crate) struct Line {
     #[serde(alias = "length")]
     pub(crate) episode_length: Option<f64>,
     pub(crate) episode_return: Option<f64>,
-    /// Return / (1.45 × the steps that were left in the clip at the episode's start).
+    /// Return / (the most a step pays × the steps that were left at the episode's start).
     pub(crate) normalised_reward: Option<f64>,
     pub(crate) fraction_survived: Option<f64>,
     /// Versions between the parameters that acted and those that were trained.
