@@ -21,7 +21,7 @@ use crate::acting::{ActingSizes, ForwardPass};
 use crate::seeds::derive;
 
 pub use report::{ClipReport, Finished, Report};
-pub use rollout::{Evaluated, Start};
+pub use rollout::{Audience, Evaluated, Start};
 
 /// How to evaluate.
 #[derive(Clone, Copy, Debug)]
@@ -44,19 +44,33 @@ impl Default for Options {
 
 /// Evaluates over the starts of the clips of `task`; `latent` is Z.
 ///
-/// `progress` is called with (episodes done, episodes in all) after each episode.
-///
 /// # Errors
-/// A failing forward pass, a start that the task does not have.
+/// A failing forward pass, a start that the task does not have, or what the audience returns.
 pub fn evaluate<F: ForwardPass>(
     evaluated: &mut Evaluated<'_, F>,
     task: &Arc<dyn Task>,
     latent: usize,
     options: &Options,
-    progress: &mut dyn FnMut(usize, usize),
+    audience: &mut dyn Audience<Box<dyn Simulated>>,
 ) -> Result<Report, Error> {
-    let spec = task.spec();
     let starts = chosen(task.starts(), options);
+    let finished = roll_out(evaluated, task, latent, &starts, options, audience)?;
+    Ok(Report::new(task.spec(), &finished, options))
+}
+
+/// Rolls out these starts, or as many as the audience wants to see.
+///
+/// # Errors
+/// As for [`evaluate`].
+pub fn roll_out<F: ForwardPass>(
+    evaluated: &mut Evaluated<'_, F>,
+    task: &Arc<dyn Task>,
+    latent: usize,
+    starts: &[Start],
+    options: &Options,
+    audience: &mut dyn Audience<Box<dyn Simulated>>,
+) -> Result<Vec<Finished>, Error> {
+    let spec = task.spec();
     let environments = (0..options.environments.min(starts.len()).max(1) as u64)
         .map(|index| Arc::clone(task).environment(derive(options.seed, index)))
         .collect::<Result<Vec<Box<dyn Simulated>>, _>>()?;
@@ -67,8 +81,7 @@ pub fn evaluate<F: ForwardPass>(
         action: spec.action,
         image: spec.image,
     };
-    let finished = rollout::run(evaluated, environments, sizes, &starts, options, progress)?;
-    Ok(Report::new(spec, &finished, options))
+    rollout::run(evaluated, environments, sizes, starts, options, audience)
 }
 
 /// What is to be rolled out: all starts, or random ones.

@@ -8,6 +8,7 @@
 //!   each is acknowledged, and comes back by itself after every loss.
 //! - [`run`] puts these together into an actor process.
 //! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads what the learner wrote.
+//! - [`render`] films a policy at work, or shows it in a window.
 //! - [`mod@bench`] holds the figures of `comic-actor bench`.
 //!
 //! Nothing here knows a loss, and nothing here is unbounded: finished unrolls wait in a bounded channel, unrolls that
@@ -20,6 +21,7 @@ mod error;
 pub mod evaluate;
 pub mod mailbox;
 pub mod policy;
+pub mod render;
 pub mod round;
 pub mod run;
 mod seeds;

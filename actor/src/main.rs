@@ -7,6 +7,8 @@ use std::process::ExitCode;
 use anyhow::Context as _;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use comic_actor::evaluate::command::Evaluate;
+use comic_actor::render::command::Render;
+use comic_actor::render::view::View;
 use comic_actor::{Error, bench, policy, run};
 use tracing_subscriber::EnvFilter;
 
@@ -32,6 +34,10 @@ struct Arguments {
 enum Command {
     /// Evaluates a policy, per clip and reward term.
     Evaluate(Evaluate),
+    /// Films a policy at work; needs no display.
+    Render(Render),
+    /// Shows a policy at work in a window.
+    View(View),
     /// Measures how fast an actor is, one JSON line a figure.
     #[command(hide = true)]
     Bench(bench::Bench),
@@ -78,6 +84,8 @@ fn main() -> ExitCode {
 fn command(arguments: Arguments) -> anyhow::Result<()> {
     match arguments.command {
         Some(Command::Evaluate(evaluate)) => evaluate.run().context("cannot evaluate"),
+        Some(Command::Render(render)) => render.run().context("cannot film"),
+        Some(Command::View(view)) => view.run().context("cannot show"),
         Some(Command::Bench(bench)) => bench.run().context("cannot measure"),
         None => {
             let Act { learner, threads, environments, cache } = arguments.act;

@@ -208,6 +208,10 @@ impl Rules for BallCatchRules {
     fn time_limit(&self) -> f64 {
         self.config.time_limit
     }
+
+    fn target(&self, memory: &Memory) -> Option<[f64; 2]> {
+        Some(memory.target)
+    }
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ use crate::observation::{ALL, Body, Observation, View};
 use crate::physics::{Data, Simulation, is_healthy};
 use crate::reference::Reference;
 use crate::tracking::TrackingTask;
-use crate::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Simulated, Step, control, reward};
+use crate::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Scenery, Simulated, Step, control, reward};
 
 /// An environment of a [`TrackingTask`]. Owns its simulation state and its random numbers, shares all else.
 #[derive(Debug)]
@@ -191,5 +191,9 @@ impl Simulated for TrackingEnvironment {
 
     fn simulation_mut(&mut self) -> &mut Simulation {
         &mut self.data
+    }
+
+    fn scenery(&self) -> Scenery {
+        Scenery { reference: Some(self.reference().qpos(self.frame).to_vec()), target: None }
     }
 }

@@ -97,6 +97,10 @@ impl Rules for GoToTargetRules {
     fn time_limit(&self) -> f64 {
         self.config.time_limit
     }
+
+    fn target(&self, memory: &Memory) -> Option<[f64; 2]> {
+        Some(memory.target)
+    }
 }
 
 impl Recorded for GoToTargetRules {

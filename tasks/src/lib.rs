@@ -5,6 +5,7 @@
 //!   one that an experiment names. An actor's hot path knows no more.
 //! - [`TrackingTask`] follows clips. Every other task is one file of rules (how an episode begins, what a step pays, when
 //!   it fails) that one environment plays: go-to-target, gaps, walls, get-up, ball catching.
+//! - [`film`] draws an environment for people, [`vision`] for the humanoid itself.
 //! - [`humanoid`] builds the compiled model from dm_control's XML; [`floor`] is the same physics without a task, the
 //!   yardstick of the benchmarks; [`comparison`] replays recorded episodes of dm_control's tasks.
 //!
@@ -19,9 +20,11 @@ mod corridor;
 mod environment;
 mod error;
 mod features;
+pub mod film;
 pub mod floor;
 mod gaps;
 mod get_up;
+mod ghost;
 mod go_to_target;
 pub mod humanoid;
 mod observation;
@@ -57,6 +60,7 @@ use start::Poses;
 
 pub use environment::TrackingEnvironment;
 pub use error::Error;
+pub use ghost::Ghost;
 pub use physics::Simulation;
 pub use starts::ClipStarts;
 pub use tracking::TrackingTask;
@@ -71,6 +75,9 @@ pub trait Task: Debug + Send + Sync {
 
     /// Where episodes can start: frames of clips, or, for a task without clips, numbered draws.
     fn starts(&self) -> &[ClipStarts];
+
+    /// Seconds of a control step.
+    fn control_timestep(&self) -> f64;
 
     /// An environment, already reset; `seed` decides all its draws.
     ///
@@ -196,6 +203,29 @@ pub trait Simulated: Environment {
 
     /// The simulation, to be drawn: MuJoCo fills in what its pictures need as it goes.
     fn simulation_mut(&mut self) -> &mut Simulation;
+
+    /// What a picture shows beside the simulation.
+    fn scenery(&self) -> Scenery;
+}
+
+/// What a task knows and its simulation does not, to be drawn.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Scenery {
+    /// The reference's generalised coordinates: the root's position (m, world) and quaternion, joints (rad).
+    pub reference: Option<Vec<f64>>,
+    /// Where the target lies on the floor: x and y, m.
+    pub target: Option<[f64; 2]>,
+}
+
+impl Scenery {
+    /// Moves the target's mark to where the target is. MuJoCo moves it back at its next step; nothing touches it and
+    /// no sensor reads it, so the physics does not notice.
+    pub(crate) fn mark_target(&self, site: Option<usize>, simulation: &mut Simulation) {
+        let mark = site.and_then(|site| simulation.site_xpos_mut().get_mut(site));
+        if let (Some(mark), Some([x, y])) = (mark, self.target) {
+            *mark = [x, y, 0.0];
+        }
+    }
 }
 
 /// An action in full precision; of another length it is no action, and not finite.

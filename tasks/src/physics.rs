@@ -31,6 +31,11 @@ impl Models {
         Self { active: Arc::new(model), passive: Arc::new(passive), substeps }
     }
 
+    /// Seconds of a control step.
+    pub(crate) fn control_timestep(&self) -> f64 {
+        self.substeps as f64 * self.active.opt().timestep
+    }
+
     /// A new simulation state; its arena is 18 MB of which the operating system commits what is used.
     pub(crate) fn data(&self) -> Data {
         Data::new(Arc::clone(&self.active))

@@ -16,7 +16,7 @@ use crate::physics::{Simulation, is_healthy};
 use crate::stage::{CONTROL_TIMESTEP, Stage};
 use crate::start::Pose;
 use crate::starts::ClipStarts;
-use crate::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Simulated, Step, Task, control, vision};
+use crate::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Scenery, Simulated, Step, Task, control, vision};
 
 /// Starts of an evaluation: episode k of a task is the one that its draws from seed k give.
 const EVALUATION_STARTS: usize = 64;
@@ -43,6 +43,11 @@ pub(crate) trait Rules: Debug + Send + Sync + 'static {
 
     /// Seconds an episode lasts.
     fn time_limit(&self) -> f64;
+
+    /// Where its target lies on the floor, in a task that marks one: x and y, m.
+    fn target(&self, _: &Self::Memory) -> Option<[f64; 2]> {
+        None
+    }
 
     /// How the humanoid sees.
     fn vision(&self) -> Vision {
@@ -97,6 +102,10 @@ impl<R: Rules> Task for RuledTask<R> {
 
     fn starts(&self) -> &[ClipStarts] {
         &self.starts
+    }
+
+    fn control_timestep(&self) -> f64 {
+        CONTROL_TIMESTEP
     }
 
     fn environment(self: Arc<Self>, seed: u64) -> Result<Box<dyn Simulated>, Error> {
@@ -247,5 +256,9 @@ impl<R: Rules> Simulated for RuledEnvironment<R> {
 
     fn simulation_mut(&mut self) -> &mut Simulation {
         &mut self.stage.data
+    }
+
+    fn scenery(&self) -> Scenery {
+        Scenery { reference: None, target: self.task.rules.target(&self.memory) }
     }
 }

@@ -94,6 +94,11 @@ impl Task for TrackingTask {
         self.starts.clips()
     }
 
+    /// That of the clips' frames, which all have the same.
+    fn control_timestep(&self) -> f64 {
+        self.models.control_timestep()
+    }
+
     fn environment(self: Arc<Self>, seed: u64) -> Result<Box<dyn Simulated>, Error> {
         Ok(Box::new(TrackingEnvironment::new(self, seed)))
     }

@@ -54,9 +54,7 @@ struct Camera {
 
 impl Camera {
     fn new(model: &MjModel, vision: Vision) -> Result<Self, Error> {
-        let camera = model
-            .name_to_id(MjtObjBase::mjOBJ_CAMERA, &format!("{PREFIX}{CAMERA}"))
-            .ok_or_else(|| crate::humanoid::missing("camera", CAMERA))?;
+        let (camera, options) = egocentric(model)?;
         // How a context draws is decided by the model it is made for; drawn is whatever model comes.
         let mut settings = model.clone();
         if vision == Vision::Fast {
@@ -64,14 +62,11 @@ impl Camera {
             (visual.quality.shadowsize, visual.quality.offsamples) = (0, 0);
             (visual.global.offwidth, visual.global.offheight) = (IMAGE_SIZE as i32, IMAGE_SIZE as i32);
         }
-        let mut options = MjvOption::default();
-        options.geomgroup[INVISIBLE_GROUP] = 0;
-        options.flags[MjtVisFlag::mjVIS_RANGEFINDER as usize] = 0;
         let size = IMAGE_SIZE as u32;
         let renderer = MjRenderer::builder()
             .width(size)
             .height(size)
-            .camera(MjvCamera::new_fixed(camera))
+            .camera(camera)
             .opts(options)
             .build(&settings)
             .map_err(graphics)?;
@@ -86,6 +81,17 @@ impl Camera {
         }
         Ok(())
     }
+}
+
+/// The egocentric camera, and what it sees.
+pub(crate) fn egocentric(model: &MjModel) -> Result<(MjvCamera, MjvOption), Error> {
+    let camera = model
+        .name_to_id(MjtObjBase::mjOBJ_CAMERA, &format!("{PREFIX}{CAMERA}"))
+        .ok_or_else(|| crate::humanoid::missing("camera", CAMERA))?;
+    let mut options = MjvOption::default();
+    options.geomgroup[INVISIBLE_GROUP] = 0;
+    options.flags[MjtVisFlag::mjVIS_RANGEFINDER as usize] = 0;
+    Ok((MjvCamera::new_fixed(camera), options))
 }
 
 /// What went wrong with OpenGL, and what helps.

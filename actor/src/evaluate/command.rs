@@ -1,19 +1,22 @@
 //! `comic-actor evaluate`.
 
 use std::io::{IsTerminal as _, Write as _};
+use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use clap::Args;
 use comic_clips::Catalogue;
 use comic_experiment::{ClipSource, Experiment};
 use comic_proto::v1::EvaluationReport;
-use comic_tasks::Task;
+use comic_tasks::{Simulated, Task};
 
 use super::delivery::deliver;
-use super::{Evaluated, Options, Report, evaluate};
+use super::{Audience, Evaluated, Options, Report, evaluate};
 use crate::Error;
 use crate::checkpoint::{self, Checkpoint, Position};
 use crate::policy::TorchPolicy;
+use crate::render::encode::Format;
+use crate::render::recorder::{Look, Recorder};
 
 const JSON_HELP: &str = "\
 With --json one object goes to standard output:
@@ -68,6 +71,11 @@ pub struct Evaluate {
     /// Report the evaluation of a checkpoint to this learner too, which keeps it in `evaluations.jsonl`.
     #[arg(long, value_name = "URL", requires = "checkpoint")]
     learner: Option<String>,
+    /// Films the first episode: .gif, .webp, .mp4 (through ffmpeg) or .png (a contact sheet).
+    #[arg(long, value_name = "FILE", help_heading = "Film")]
+    video: Option<PathBuf>,
+    #[command(flatten)]
+    look: Look,
 }
 
 /// What is evaluated.
@@ -98,6 +106,9 @@ impl Evaluate {
 
     fn evaluate(&self, subject: Subject) -> Result<Report, Error> {
         let Subject { mut experiment, parameters, .. } = subject;
+        if let Some(out) = &self.video {
+            Format::of(out)?;
+        }
         // A policy that was never trained starts from the pose of its own clips, whatever it is evaluated on.
         let own = if self.untrained { Some(Catalogue::open(&experiment.clips)?) } else { None };
         if !self.clips.is_empty() {
@@ -114,7 +125,12 @@ impl Evaluate {
         let latent = experiment.network.latent.size;
         let mut policy = self.policy(&experiment, task.as_ref(), own.as_ref(), parameters.as_deref())?;
         let mut evaluated = policy.as_mut().map_or(Evaluated::Servo, Evaluated::Policy);
-        evaluate(&mut evaluated, &task, latent, &options, &mut show_progress)
+        let recorder =
+            self.video.as_ref().map(|out| Recorder::new(&self.look, out, task.control_timestep())).transpose()?;
+        let mut follower = Follower { recorder };
+        let report = evaluate(&mut evaluated, &task, latent, &options, &mut follower)?;
+        follower.recorder.map(Recorder::finish).transpose()?;
+        Ok(report)
     }
 
     /// The experiment, and the parameters when there is a checkpoint.
@@ -152,6 +168,24 @@ impl Evaluate {
             })?,
         };
         Ok(Some(policy))
+    }
+}
+
+/// Shows how far the evaluation is, and films its first episode if that is wanted.
+struct Follower {
+    recorder: Option<Recorder>,
+}
+
+impl Audience<Box<dyn Simulated>> for Follower {
+    fn watch(&mut self, number: usize, environment: &mut Box<dyn Simulated>) -> Result<ControlFlow<()>, Error> {
+        if let (Some(recorder), 0) = (&mut self.recorder, number) {
+            recorder.shoot(environment.as_mut())?;
+        }
+        Ok(ControlFlow::Continue(()))
+    }
+
+    fn count(&mut self, done: usize, all: usize) {
+        show_progress(done, all);
     }
 }
 

@@ -1,5 +1,7 @@
 //! Rolling out a list of starts, many environments in one forward pass.
 
+use std::ops::ControlFlow;
+
 use comic_tasks::{Environment, MAX_REWARD_TERMS, Outcome};
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
@@ -15,6 +17,31 @@ pub enum Evaluated<'a, F> {
     Policy(&'a mut F),
     /// The servo action: the pose of the next reference frame, without noise.
     Servo,
+    /// The zero action: every servo aims at the middle of its joint's range.
+    Zero,
+}
+
+/// Whoever follows a rollout: to show how far it is, or to film it.
+pub trait Audience<E> {
+    /// An episode has begun or gone a step, and has not diverged; `number` is the place of its start among all. To
+    /// break ends the rollout.
+    ///
+    /// # Errors
+    /// Whatever ends the rollout with it.
+    fn watch(&mut self, number: usize, environment: &mut E) -> Result<ControlFlow<()>, Error> {
+        let _ = (number, environment);
+        Ok(ControlFlow::Continue(()))
+    }
+
+    /// So many episodes of so many are over.
+    fn count(&mut self, done: usize, all: usize);
+}
+
+/// One that only counts.
+impl<E, F: FnMut(usize, usize)> Audience<E> for F {
+    fn count(&mut self, done: usize, all: usize) {
+        self(done, all);
+    }
 }
 
 /// Where an episode starts.
@@ -30,37 +57,51 @@ pub struct Start {
 struct Lane<E> {
     environment: E,
     episode: Option<Finished>,
+    /// The place of the episode's start among all.
+    number: usize,
 }
 
-/// Rolls out every start; episodes come back in the order they end.
+/// Rolls out every start, or until the audience has seen enough; episodes come back in the order they end.
 pub(super) fn run<E: Environment, F: ForwardPass>(
     evaluated: &mut Evaluated<'_, F>,
     environments: Vec<E>,
     sizes: ActingSizes,
     starts: &[Start],
     options: &Options,
-    progress: &mut dyn FnMut(usize, usize),
+    audience: &mut dyn Audience<E>,
 ) -> Result<Vec<Finished>, Error> {
     let mut rng = Pcg64::seed_from_u64(options.seed);
     let mut batch = ActingBatch::new(environments.len(), sizes);
     let mut lanes: Vec<Lane<E>> =
-        environments.into_iter().map(|environment| Lane { environment, episode: None }).collect();
-    let mut queue = starts.iter().copied();
+        environments.into_iter().map(|environment| Lane { environment, episode: None, number: 0 }).collect();
+    let mut queue = starts.iter().copied().enumerate();
     let mut finished = Vec::with_capacity(starts.len());
     let mut scratch = (vec![0.0; sizes.action], vec![0.0; sizes.action]);
     for (index, lane) in lanes.iter_mut().enumerate() {
-        lane.begin(queue.next(), &mut batch, index)?;
+        if lane.begin(queue.next(), &mut batch, index, audience)?.is_break() {
+            return Ok(finished);
+        }
     }
     while lanes.iter().any(|lane| lane.episode.is_some()) {
         for (index, lane) in lanes.iter_mut().enumerate().filter(|(_, lane)| lane.episode.is_some()) {
             lane.environment.draw(batch.row(index).image)?;
         }
         act(evaluated, &lanes, &mut batch, options, &mut rng)?;
-        for (index, lane) in lanes.iter_mut().enumerate() {
-            if let Some(episode) = lane.step(&mut batch, index, options, &mut rng, &mut scratch) {
+        for (index, lane) in lanes.iter_mut().enumerate().filter(|(_, lane)| lane.episode.is_some()) {
+            let ended = lane.step(&mut batch, index, options, &mut rng, &mut scratch);
+            let mut seen = ControlFlow::Continue(());
+            if !ended.is_some_and(|episode| episode.diverged) {
+                seen = audience.watch(lane.number, &mut lane.environment)?;
+            }
+            if let Some(episode) = ended {
                 finished.push(episode);
-                progress(finished.len(), starts.len());
-                lane.begin(queue.next(), &mut batch, index)?;
+                audience.count(finished.len(), starts.len());
+                if seen.is_continue() {
+                    seen = lane.begin(queue.next(), &mut batch, index, audience)?;
+                }
+            }
+            if seen.is_break() {
+                return Ok(finished);
             }
         }
     }
@@ -88,13 +129,25 @@ fn act<E: Environment, F: ForwardPass>(
             }
             Ok(())
         }
+        Evaluated::Zero => {
+            batch.mean.fill(0.0);
+            batch.std.fill(0.0);
+            Ok(())
+        }
     }
 }
 
 impl<E: Environment> Lane<E> {
-    fn begin(&mut self, start: Option<Start>, batch: &mut ActingBatch, index: usize) -> Result<(), Error> {
+    fn begin(
+        &mut self,
+        start: Option<(usize, Start)>,
+        batch: &mut ActingBatch,
+        index: usize,
+        audience: &mut dyn Audience<E>,
+    ) -> Result<ControlFlow<()>, Error> {
         self.episode = None;
-        let Some(start) = start else { return Ok(()) };
+        let Some((number, start)) = start else { return Ok(ControlFlow::Continue(())) };
+        self.number = number;
         self.environment.reset_to(start.clip, start.start)?;
         let row = batch.row(index);
         self.environment.observe(row.proprioception, row.task);
@@ -107,7 +160,7 @@ impl<E: Environment> Lane<E> {
             returns: [0.0; MAX_REWARD_TERMS],
             diverged: false,
         });
-        Ok(())
+        audience.watch(number, &mut self.environment)
     }
 
     /// One step; the episode if it is over.
@@ -209,7 +262,7 @@ mod tests {
         let starts: Vec<Start> = (0..7).map(|start| Start { clip: 0, start }).collect();
         let options = Options { deterministic: true, ..Options::default() };
         let sizes = ActingSizes { proprioception: 1, task: 0, latent: 1, action: 2, image: 0 };
-        let finished = run(evaluated, environments, sizes, &starts, &options, &mut |_, _| ()).unwrap();
+        let finished = run(evaluated, environments, sizes, &starts, &options, &mut |_: usize, _: usize| ()).unwrap();
         let mut found: Vec<_> = finished.iter().map(|e| (e.steps, e.steps_left, e.returns[0])).collect();
         found.sort_by(|a, b| a.partial_cmp(b).unwrap());
         found

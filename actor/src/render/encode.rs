@@ -1,0 +1,152 @@
+//! Pictures into a file, in the form that the file's extension names.
+
+mod gif;
+mod mp4;
+mod sheet;
+mod webp;
+
+use std::fs::File;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use comic_tasks::film::Size;
+use tempfile::NamedTempFile;
+
+use crate::Error;
+
+/// What a film can be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// 256 colours a frame.
+    Gif,
+    /// All colours, without loss.
+    WebP,
+    /// Through ffmpeg.
+    Mp4,
+    /// A contact sheet: frames from begin to end beside one another.
+    Png,
+}
+
+impl Format {
+    /// The form of the file at `path`.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] when it has none of the known extensions.
+    pub fn of(path: &Path) -> Result<Self, Error> {
+        let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        match extension.as_str() {
+            "gif" => Ok(Self::Gif),
+            "webp" => Ok(Self::WebP),
+            "mp4" => Ok(Self::Mp4),
+            "png" => Ok(Self::Png),
+            _ => Err(Error::Usage(format!(
+                "{}: its extension names no film; known are .gif, .webp, .mp4 (through ffmpeg) and .png (a contact sheet)",
+                path.display()
+            ))),
+        }
+    }
+
+    /// The size of a picture unless another one is asked for: what is small in the form, or is tiled, is drawn smaller.
+    pub fn usual_size(self) -> &'static str {
+        match self {
+            Self::Gif => "400x300",
+            Self::Png => "320x240",
+            Self::WebP | Self::Mp4 => "640x480",
+        }
+    }
+}
+
+/// Takes pictures, [`Size::bytes`] bytes each, in the order they are shown.
+trait Encoder {
+    fn frame(&mut self, picture: &[u8]) -> io::Result<()>;
+
+    /// Writes what is left.
+    fn finish(self: Box<Self>) -> io::Result<()>;
+}
+
+/// A film on its way into a file. The file appears, whole, when the film is finished; until then there is a temporary
+/// one beside it, which goes away with a film that is given up.
+pub struct Movie {
+    out: PathBuf,
+    // Before the file: an encoder that is given up ends its work before the file goes away.
+    encoder: Box<dyn Encoder>,
+    file: NamedTempFile,
+}
+
+impl Movie {
+    /// Begins a film of pictures of `size`, shown `frame_time` each.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for an unknown extension or a missing ffmpeg, [`Error::File`] when the file cannot be made.
+    pub fn create(out: &Path, size: Size, frame_time: Duration) -> Result<Self, Error> {
+        let format = Format::of(out)?;
+        let directory = out.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let mut builder = tempfile::Builder::new();
+        builder.prefix(".comic-film-");
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::PermissionsExt as _;
+            // The process's umask applies, as to any file that a program writes.
+            builder.permissions(std::fs::Permissions::from_mode(0o666));
+        }
+        let file = builder.tempfile_in(directory).map_err(Error::file(out))?;
+        let writer = || file.as_file().try_clone().map_err(Error::file(out));
+        let encoder: Box<dyn Encoder> = match format {
+            Format::Gif => Box::new(gif::Gif::new(writer()?, size, frame_time).map_err(Error::file(out))?),
+            Format::WebP => Box::new(webp::WebP::new(writer()?, size, frame_time).map_err(Error::file(out))?),
+            Format::Png => Box::new(sheet::Sheet::new(writer()?, size)),
+            Format::Mp4 => Box::new(mp4::Mp4::new(file.path(), size, frame_time)?),
+        };
+        Ok(Self { out: out.to_path_buf(), encoder, file })
+    }
+
+    /// Adds a picture.
+    ///
+    /// # Errors
+    /// [`Error::File`] when it cannot be written.
+    pub fn frame(&mut self, picture: &[u8]) -> Result<(), Error> {
+        self.encoder.frame(picture).map_err(Error::file(&self.out))
+    }
+
+    /// Ends the film, and gives the file its name.
+    ///
+    /// # Errors
+    /// [`Error::File`] when it cannot be written.
+    pub fn finish(self) -> Result<(), Error> {
+        let Self { out, encoder, file } = self;
+        encoder.finish().map_err(Error::file(&out))?;
+        file.as_file().sync_all().map_err(Error::file(&out))?;
+        file.persist(&out).map_err(|error| Error::file(&out)(error.error))?;
+        Ok(())
+    }
+}
+
+/// When frames change, in a form's own units of time: rounding does not add up.
+struct Clock {
+    frame_time: Duration,
+    unit: Duration,
+    frames: u32,
+}
+
+impl Clock {
+    fn new(frame_time: Duration, unit: Duration) -> Self {
+        Self { frame_time, unit, frames: 0 }
+    }
+
+    /// Units for which the next frame is shown.
+    fn tick(&mut self) -> u32 {
+        let at = |frames: u32| (f64::from(frames) * self.frame_time.as_secs_f64() / self.unit.as_secs_f64()).round();
+        let begin = at(self.frames);
+        self.frames = self.frames.saturating_add(1);
+        (at(self.frames) - begin).max(1.0) as u32
+    }
+}
+
+/// A buffered writer's file at its end, written out.
+fn written(writer: io::BufWriter<File>) -> io::Result<()> {
+    writer.into_inner().map(drop).map_err(io::IntoInnerError::into_error)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,90 @@
+//! MP4 through the program ffmpeg, which is given raw pictures.
+
+use std::ffi::OsStr;
+use std::io::{self, Read as _, Write as _};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use comic_tasks::film::Size;
+
+use super::Encoder;
+use crate::Error;
+
+const PROGRAM: &str = "ffmpeg";
+
+/// A running ffmpeg; dropped before its end, it is stopped.
+#[derive(Debug)]
+pub(super) struct Mp4 {
+    child: Child,
+}
+
+impl Mp4 {
+    pub(super) fn new(out: &Path, size: Size, frame_time: Duration) -> Result<Self, Error> {
+        let program = find(&std::env::var_os("PATH").unwrap_or_default())?;
+        let child = Command::new(&program)
+            .args(["-hide_banner", "-loglevel", "error", "-y"])
+            .args(["-f", "rawvideo", "-pix_fmt", "rgb24"])
+            .args(["-video_size", &format!("{}x{}", size.width(), size.height())])
+            .args(["-framerate", &format!("1000000/{}", frame_time.as_micros().max(1))])
+            .args(["-i", "-"])
+            // Players want pixels of half the colours' resolution, for which width and height must be even.
+            .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-movflags", "+faststart"])
+            .args(["-f", "mp4"])
+            .arg(out)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
+            .map_err(Error::file(program))?;
+        Ok(Self { child })
+    }
+
+    /// Waits for ffmpeg's end, and says what it had to say if it failed.
+    fn end(&mut self) -> io::Result<()> {
+        drop(self.child.stdin.take());
+        let mut complaint = String::new();
+        if let Some(mut stderr) = self.child.stderr.take() {
+            stderr.read_to_string(&mut complaint)?;
+        }
+        let status = self.child.wait()?;
+        if status.success() {
+            return Ok(());
+        }
+        Err(io::Error::other(format!("{PROGRAM} failed ({status}): {}", complaint.trim())))
+    }
+}
+
+impl Encoder for Mp4 {
+    fn frame(&mut self, picture: &[u8]) -> io::Result<()> {
+        let Some(pipe) = &mut self.child.stdin else { return Ok(()) };
+        match pipe.write_all(picture) {
+            // It has ended before its time: its own words say more than a broken pipe.
+            Err(error) if error.kind() == io::ErrorKind::BrokenPipe => self.end().and(Err(error)),
+            written => written,
+        }
+    }
+
+    fn finish(mut self: Box<Self>) -> io::Result<()> {
+        self.end()
+    }
+}
+
+impl Drop for Mp4 {
+    fn drop(&mut self) {
+        // Nothing happens to one that has been waited for.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// The program, in the directories of `path`.
+pub(super) fn find(path: &OsStr) -> Result<PathBuf, Error> {
+    let found = std::env::split_paths(path).map(|directory| directory.join(PROGRAM)).find(|program| program.is_file());
+    found.ok_or_else(|| {
+        Error::Usage(format!(
+            "an .mp4 is written through {PROGRAM}, which is not in PATH: install it (Debian's package {PROGRAM}), or ask \
+             for a .gif or a .webp, which need nothing"
+        ))
+    })
+}

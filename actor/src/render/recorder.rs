@@ -1,0 +1,131 @@
+//! An environment, step by step, into a film.
+
+use std::io::IsTerminal as _;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::{Args, ValueEnum};
+use comic_tasks::film::{Camera, Film, Shot, Size};
+use comic_tasks::{Ghost, Simulated};
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::encode::{Format, Movie};
+use crate::Error;
+
+/// Frames between two log lines, where there is no terminal for a bar.
+const FRAMES_A_LINE: usize = 100;
+
+/// How a film looks.
+#[derive(Args, Clone, Debug)]
+pub struct Look {
+    /// Whence it is filmed.
+    #[arg(long, value_enum, default_value_t = Place::Tracking, help_heading = "Film")]
+    camera: Place,
+    /// The reference as a ghost, in tracking: on the humanoid, or with `--ghost=beside` a metre beside it.
+    #[arg(long, value_name = "WHERE", num_args = 0..=1, require_equals = true, default_missing_value = "on")]
+    #[arg(help_heading = "Film")]
+    ghost: Option<Ghost>,
+    /// Width and height of a picture in pixels; 400x300 for a .gif, 320x240 a tile of a .png, else 640x480.
+    #[arg(long, value_name = "WxH", help_heading = "Film")]
+    size: Option<Size>,
+    /// The most pictures a second; every control step is one unless given. A film runs as fast as the world.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1000), help_heading = "Film")]
+    fps: Option<u16>,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Place {
+    /// From behind its right shoulder, following.
+    Tracking,
+    /// Through its own eyes.
+    Egocentric,
+    /// From its right, following.
+    Side,
+}
+
+/// Films environments of one task.
+pub struct Recorder {
+    film: Film,
+    movie: Movie,
+    out: PathBuf,
+    /// Seconds of a control step.
+    step: f64,
+    /// Control steps from frame to frame.
+    every: usize,
+    steps: usize,
+    frames: usize,
+    bar: Option<ProgressBar>,
+}
+
+impl Recorder {
+    /// Begins a film in the file `out` of a task with control steps of `step` seconds.
+    ///
+    /// # Errors
+    /// An extension that names no film, a file that cannot be made.
+    pub fn new(look: &Look, out: &Path, step: f64) -> Result<Self, Error> {
+        let size = match look.size {
+            Some(size) => size,
+            None => Format::of(out)?.usual_size().parse().map_err(Error::Usage)?,
+        };
+        let every = look.fps.map_or(1, |fps| ((1.0 / (f64::from(fps) * step)) - 1e-9).ceil().max(1.0) as usize);
+        let camera = match look.camera {
+            Place::Tracking => Camera::Tracking,
+            Place::Egocentric => Camera::Egocentric,
+            Place::Side => Camera::Side,
+        };
+        let film = Film::new(Shot { size, camera, ghost: look.ghost });
+        let movie = Movie::create(out, size, Duration::from_secs_f64(step * every as f64))?;
+        Ok(Self { film, movie, out: out.to_path_buf(), step, every, steps: 0, frames: 0, bar: None })
+    }
+
+    /// Shows on a terminal how much of so many seconds has been filmed.
+    #[must_use]
+    pub fn with_bar(mut self, seconds: f64) -> Self {
+        if std::io::stderr().is_terminal() {
+            let style = ProgressStyle::with_template("{bar:40} {pos} of {len} steps, {eta} left");
+            let bar = ProgressBar::new((seconds / self.step).ceil() as u64);
+            self.bar = Some(style.map_or(bar.clone(), |style| bar.with_style(style)));
+        }
+        self
+    }
+
+    /// Films the environment as it stands, when it is time for a picture. Called once at an episode's begin, and after
+    /// each of its steps.
+    ///
+    /// # Errors
+    /// [`comic_tasks::Error::Graphics`] when there is nothing to draw with, [`Error::File`] when the film cannot be
+    /// written.
+    pub fn shoot(&mut self, environment: &mut dyn Simulated) -> Result<(), Error> {
+        if self.steps.is_multiple_of(self.every) {
+            self.movie.frame(self.film.draw(environment)?)?;
+            self.frames += 1;
+            if self.bar.is_none() && self.frames.is_multiple_of(FRAMES_A_LINE) {
+                tracing::info!(frames = self.frames, "filming");
+            }
+        }
+        self.steps += 1;
+        if let Some(bar) = &self.bar {
+            bar.inc(1);
+        }
+        Ok(())
+    }
+
+    /// Seconds that have been filmed.
+    pub fn seconds(&self) -> f64 {
+        self.steps as f64 * self.step
+    }
+
+    /// Ends the film.
+    ///
+    /// # Errors
+    /// [`Error::File`] when it cannot be written.
+    pub fn finish(self) -> Result<(), Error> {
+        let (frames, seconds) = (self.frames, self.seconds());
+        self.movie.finish()?;
+        if let Some(bar) = self.bar {
+            bar.finish_and_clear();
+        }
+        tracing::info!(file = %self.out.display(), frames, seconds = format!("{seconds:.2}"), "filmed");
+        Ok(())
+    }
+}

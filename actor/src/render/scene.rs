@@ -1,0 +1,135 @@
+//! Who acts in which task, for films and windows.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use clap::Args;
+use comic_clips::Catalogue;
+use comic_experiment::{ClipSource, Experiment, TaskName};
+use comic_tasks::{Simulated, Task};
+
+use crate::Error;
+use crate::checkpoint::{self, Checkpoint};
+use crate::evaluate::{Audience, Evaluated, Finished, Options, Start, roll_out};
+use crate::policy::TorchPolicy;
+
+/// The preset of tracking; every other task has one of its own name.
+const TRACKING_PRESET: &str = "quickstart";
+
+/// What is played, and by whom.
+#[derive(Args, Clone, Debug)]
+pub(super) struct Scene {
+    /// The task: tracking, go-to-target, gaps, walls, get-up or ball-catch.
+    #[arg(long, value_name = "TASK")]
+    task: TaskName,
+    /// The clip to follow, or to start from, in place of the experiment's own: builtin:NAME, FILE.h5#CLIP.
+    #[arg(long, value_name = "SOURCE")]
+    clip: Option<String>,
+    /// The policy that acts: a run's directory, its `checkpoints`, or one checkpoint. Without, the servo action follows
+    /// a clip, and the zero action plays any other task.
+    #[arg(long, value_name = "DIR")]
+    checkpoint: Option<PathBuf>,
+    /// The experiment without a checkpoint: a preset's name or a TOML file; the task's own preset unless given.
+    #[arg(long, value_name = "NAME|FILE", conflicts_with = "checkpoint")]
+    preset: Option<String>,
+    /// Overrides a field of the preset, for instance `--set gaps.gap=[0.5,1.0]`.
+    #[arg(long, value_name = "FIELD=VALUE", conflicts_with = "checkpoint")]
+    set: Vec<String>,
+    /// Where the first episode starts: the clip's frame, or the number of a drawn episode; the task's first unless
+    /// given. Episodes that follow start one further on.
+    #[arg(long, value_name = "N")]
+    start: Option<usize>,
+    /// The mean action and the latent's mean instead of samples.
+    #[arg(long)]
+    deterministic: bool,
+    /// Seed of the noise.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+}
+
+/// A task, and who acts in it.
+pub(super) struct Cast {
+    pub(super) task: Arc<dyn Task>,
+    policy: Option<TorchPolicy>,
+    latent: usize,
+    name: TaskName,
+    starts: Vec<Start>,
+    options: Options,
+}
+
+impl Scene {
+    /// Reads what there is to read, and builds the task.
+    ///
+    /// # Errors
+    /// Whatever is wrong with experiment, checkpoint, clip or start.
+    pub(super) fn cast(&self) -> Result<Cast, Error> {
+        let (mut experiment, parameters) = self.experiment()?;
+        if let Some(clip) = &self.clip {
+            experiment.clips = vec![ClipSource::parse(clip)];
+        }
+        let task = comic_tasks::build(&experiment, &Catalogue::open(&experiment.clips)?)?;
+        let policy = parameters
+            .map(|parameters| TorchPolicy::from_parameters(task.spec(), &experiment, &parameters))
+            .transpose()?;
+        let starts = self.starts(task.as_ref())?;
+        let options =
+            Options { deterministic: self.deterministic, seed: self.seed, environments: 1, ..Options::default() };
+        Ok(Cast { task, policy, latent: experiment.network.latent.size, name: experiment.task, starts, options })
+    }
+
+    /// The experiment, and the parameters when there is a checkpoint.
+    fn experiment(&self) -> Result<(Experiment, Option<Vec<u8>>), Error> {
+        let own = if self.task == TaskName::Tracking { TRACKING_PRESET } else { self.task.name() };
+        let (experiment, parameters, origin) = match &self.checkpoint {
+            Some(path) => {
+                let Checkpoint { path, experiment, policy, .. } = checkpoint::read(path)?;
+                tracing::info!(checkpoint = %path.display(), "playing");
+                (experiment, Some(policy), format!("checkpoint {}", path.display()))
+            }
+            None => {
+                let preset = self.preset.as_deref().unwrap_or(own);
+                (comic_experiment::resolve(preset, &self.set)?, None, format!("preset {preset}"))
+            }
+        };
+        if experiment.task == self.task {
+            return Ok((experiment, parameters));
+        }
+        Err(Error::Usage(format!(
+            "{origin}: its task is {}, not {}: name that one with --task, or another checkpoint or preset",
+            experiment.task, self.task
+        )))
+    }
+
+    /// All starts of the first clip that has any, the wanted one first.
+    fn starts(&self, task: &dyn Task) -> Result<Vec<Start>, Error> {
+        let clip = task.starts().iter().find(|clip| !clip.frames.is_empty());
+        let clip = clip.ok_or_else(|| Error::Usage("the clip is too short for an episode to start".into()))?;
+        let first = self.start.unwrap_or(clip.frames.start);
+        if !clip.frames.contains(&first) {
+            let (from, to) = (clip.frames.start, clip.frames.end - 1);
+            return Err(Error::Usage(format!("--start {first}: no episode starts there, only at {from} to {to}")));
+        }
+        let frames = (first..clip.frames.end).chain(clip.frames.start..first);
+        Ok(frames.map(|start| Start { clip: clip.clip, start }).collect())
+    }
+}
+
+impl Cast {
+    /// Plays `episodes` episodes, or as many as the audience wants to see.
+    ///
+    /// # Errors
+    /// A failing forward pass, or what the audience returns.
+    pub(super) fn play(
+        &mut self,
+        episodes: usize,
+        audience: &mut dyn Audience<Box<dyn Simulated>>,
+    ) -> Result<Vec<Finished>, Error> {
+        let starts: Vec<Start> = self.starts.iter().copied().cycle().take(episodes).collect();
+        let mut evaluated = match &mut self.policy {
+            Some(policy) => Evaluated::Policy(policy),
+            None if self.name == TaskName::Tracking => Evaluated::Servo,
+            None => Evaluated::Zero,
+        };
+        roll_out(&mut evaluated, &self.task, self.latent, &starts, &self.options, audience)
+    }
+}
