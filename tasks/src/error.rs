@@ -33,6 +33,15 @@ pub enum Error {
         /// What MuJoCo or EGL said.
         reason: String,
     },
+    /// No window can be opened.
+    #[error(
+        "no display to open a window on ({reason}); start it in a graphical session, or film with `comic-actor render`, \
+         which needs none"
+    )]
+    Display {
+        /// What the window's library said.
+        reason: String,
+    },
     /// There is nothing to track.
     #[error("clips: no clip to track; name at least one source that has clips")]
     NoClips,

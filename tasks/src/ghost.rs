@@ -8,7 +8,7 @@ use mujoco_rs::prelude::*;
 use crate::Simulation;
 
 /// Red, green, blue and opacity of the ghost.
-const COLOUR: [f32; 4] = [0.35, 0.75, 1.0, 0.35];
+const COLOUR: [f32; 4] = [0.35, 0.75, 1.0, 0.3];
 /// How far beside the humanoid it stands, m.
 const ASIDE: f64 = 1.0;
 

@@ -38,6 +38,8 @@ mod stage;
 mod start;
 mod starts;
 mod tracking;
+#[cfg(feature = "viewer")]
+pub mod viewer;
 pub mod vision;
 mod walker;
 mod walls;

@@ -47,12 +47,12 @@ impl Format {
         }
     }
 
-    /// The size of a picture unless another one is asked for: what is small in the form, or is tiled, is drawn smaller.
+    /// The size of a picture unless another one is asked for: smaller where files grow large, or where it is a tile of many.
     pub fn usual_size(self) -> &'static str {
         match self {
-            Self::Gif => "400x300",
+            Self::Gif | Self::WebP => "400x300",
             Self::Png => "320x240",
-            Self::WebP | Self::Mp4 => "640x480",
+            Self::Mp4 => "640x480",
         }
     }
 }

@@ -25,7 +25,7 @@ pub struct Look {
     #[arg(long, value_name = "WHERE", num_args = 0..=1, require_equals = true, default_missing_value = "on")]
     #[arg(help_heading = "Film")]
     ghost: Option<Ghost>,
-    /// Width and height of a picture in pixels; 400x300 for a .gif, 320x240 a tile of a .png, else 640x480.
+    /// Width and height of a picture in pixels; 640x480 for an .mp4, 320x240 a tile of a .png, else 400x300.
     #[arg(long, value_name = "WxH", help_heading = "Film")]
     size: Option<Size>,
     /// The most pictures a second; every control step is one unless given. A film runs as fast as the world.

@@ -1,0 +1,86 @@
+//! `comic-actor render` and `evaluate --video`, as they are typed. Without OpenGL there is nothing to film, and the tests
+//! say so.
+
+use std::fs::File;
+use std::path::Path;
+use std::process::{Command, Output};
+
+fn actor(arguments: &[&str], out: &Path) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_comic-actor"));
+    command.args(arguments).arg(out).env_remove("RUST_LOG").output().unwrap()
+}
+
+/// Whether it went well; `false` where there is no OpenGL.
+fn filmed(output: &Output) -> bool {
+    let log = String::from_utf8_lossy(&output.stderr);
+    if log.contains("no OpenGL") {
+        eprintln!("skipped: {log}");
+        return false;
+    }
+    assert!(output.status.success(), "{log}");
+    true
+}
+
+/// Number of frames and hundredths of a second of a GIF.
+fn length(path: &Path) -> (usize, u32) {
+    let mut decoder = gif::DecodeOptions::new().read_info(File::open(path).unwrap()).unwrap();
+    let (mut frames, mut hundredths) = (0, 0);
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        frames += 1;
+        hundredths += u32::from(frame.delay);
+    }
+    (frames, hundredths)
+}
+
+#[test]
+fn a_film_lasts_as_long_as_was_asked_for_at_any_rate() {
+    let directory = tempfile::tempdir().unwrap();
+    let out = directory.path().join("walls.gif");
+    // The humanoid falls within this time: another episode follows, in another arena.
+    let base = ["render", "--task", "walls", "--set", "walls.corridor.arena_steps=0", "--size", "64x48"];
+    for (rate, frames) in [(&[][..], 25), (&["--fps", "10"][..], 7)] {
+        let arguments = [&base[..], rate, &["--seconds", "0.75", "--out"]].concat();
+        if !filmed(&actor(&arguments, &out)) {
+            return;
+        }
+        let (found, hundredths) = length(&out);
+        assert_eq!(found, frames);
+        assert!((75..=84).contains(&hundredths), "{hundredths}");
+    }
+}
+
+#[test]
+fn tracking_is_filmed_with_a_ghost_and_an_evaluation_films_its_first_episode() {
+    let directory = tempfile::tempdir().unwrap();
+    let (one, other) = (directory.path().join("render.gif"), directory.path().join("evaluate.gif"));
+    let ghost = ["--size", "64x48", "--ghost=beside", "--camera", "side"];
+    // Episodes of a few steps.
+    let brief = ["--set", "tracking.termination_threshold=0.03"];
+    let render = [&["render", "--task", "tracking"], &brief[..], &ghost[..], &["--out"]].concat();
+    if !filmed(&actor(&render, &one)) {
+        return;
+    }
+    let evaluate = [&["evaluate", "--preset", "quickstart", "--servo"], &brief[..], &ghost[..], &["--video"]].concat();
+    assert!(filmed(&actor(&evaluate, &other)));
+    // The servo action has no noise, so both show the same.
+    assert_eq!(std::fs::read(one).unwrap(), std::fs::read(other).unwrap());
+}
+
+#[test]
+fn what_cannot_be_filmed_is_refused_before_anything_is_built() {
+    let directory = tempfile::tempdir().unwrap();
+    for (arguments, name, complaint) in [
+        (&["--task", "gaps"][..], "film.avi", "known are .gif, .webp, .mp4"),
+        (&["--task", "gaps", "--preset", "walls"], "film.gif", "its task is walls, not gaps"),
+        (&["--task", "gaps", "--start", "64"], "film.gif", "only at 0 to 63"),
+        (&["--task", "gaps", "--checkpoint", "/nowhere"], "film.gif", "checkpoint /nowhere"),
+        (&["--task", "gap"], "film.gif", "tasks are tracking, go-to-target, gaps"),
+        (&["--task", "gaps", "--seconds", "0"], "film.gif", "not within 0 and 3600"),
+    ] {
+        let output = actor(&[&["render"], arguments, &["--out"]].concat(), &directory.path().join(name));
+        let log = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{log}");
+        assert!(log.contains(complaint), "{log}");
+        assert_eq!(std::fs::read_dir(directory.path()).unwrap().count(), 0, "something was left behind");
+    }
+}

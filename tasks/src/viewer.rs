@@ -1,0 +1,76 @@
+//! A window on an environment: MuJoCo's viewer, as mujoco-rs has it. Feature `viewer`.
+
+use std::sync::Arc;
+
+use mujoco_rs::prelude::*;
+use mujoco_rs::viewer::{MjViewer, MjViewerError};
+
+use crate::Simulated;
+use crate::arenas::floor::TARGET;
+use crate::error::Error;
+use crate::ghost::{Ghost, Phantom};
+
+/// The window, which belongs to the process's first thread.
+#[derive(Debug)]
+pub struct Viewer {
+    window: MjViewer,
+    ghost: Option<Ghost>,
+    phantom: Option<Phantom>,
+    model: Arc<MjModel>,
+}
+
+impl Viewer {
+    /// Opens a window on environments like this one.
+    ///
+    /// # Errors
+    /// [`Error::Display`] when there is no display, or no OpenGL on it.
+    pub fn open(environment: &dyn Simulated, ghost: Option<Ghost>) -> Result<Self, Error> {
+        // Asked first, since the window's library ends in a panic of its own for some displays that are not there.
+        if ["DISPLAY", "WAYLAND_DISPLAY"].iter().all(|name| std::env::var_os(name).is_none_or(|name| name.is_empty())) {
+            return Err(Error::Display { reason: "neither DISPLAY nor WAYLAND_DISPLAY is set".into() });
+        }
+        let model = environment.model();
+        let phantom = ghost.map(|_| Phantom::new(&model));
+        let parts = phantom.as_ref().map_or(0, Phantom::parts) as usize;
+        let window =
+            MjViewer::builder().window_name("CoMic").max_user_geoms(parts).build_passive(&model).map_err(display)?;
+        Ok(Self { window, ghost, phantom, model })
+    }
+
+    /// Shows the environment as it stands; `false` when the window has been closed. The model is shown as it was when
+    /// the window was opened until one of another layout comes. A push with the mouse pushes the humanoid.
+    ///
+    /// # Errors
+    /// [`Error::Display`] when OpenGL fails.
+    pub fn show(&mut self, environment: &mut dyn Simulated) -> Result<bool, Error> {
+        let (model, scenery) = (environment.model(), environment.scenery());
+        if !self.model.is_compatible_with_model(&model) {
+            self.phantom = self.ghost.map(|_| Phantom::new(&model));
+        }
+        let target = model.name_to_id(MjtObjBase::mjOBJ_SITE, TARGET);
+        scenery.mark_target(target, environment.simulation_mut());
+        self.model = model;
+        let phantom = match (&mut self.phantom, self.ghost, &scenery.reference) {
+            (Some(phantom), Some(ghost), Some(reference)) => {
+                phantom.stand(reference, ghost, 0.0);
+                Some(phantom)
+            }
+            _ => None,
+        };
+        let shown = self.window.with_state_lock(|mut state| {
+            state.sync_data(environment.simulation_mut());
+            if let Some(phantom) = phantom {
+                phantom.appear(state.user_scene_mut(), &MjvOption::default());
+            }
+        });
+        // A lock that another thread left broken: there is no other thread.
+        drop(shown);
+        self.window.render().map_err(display)?;
+        Ok(self.window.running())
+    }
+}
+
+fn display(error: MjViewerError) -> Error {
+    let cause = std::error::Error::source(&error).map(|cause| format!(": {cause}")).unwrap_or_default();
+    Error::Display { reason: format!("{error}{cause}") }
+}
