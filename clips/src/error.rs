@@ -182,6 +182,60 @@ pub enum Error {
         /// How many there are.
         clips: usize,
     },
+    /// A line of an ASF or AMC file.
+    #[error("{}:{line}: {reason}", path.display())]
+    Line {
+        /// The file.
+        path: PathBuf,
+        /// Counted from 1.
+        line: usize,
+        /// What is wrong with it, and what it should be.
+        reason: String,
+    },
+    /// A recording, skeleton or manifest that cannot be imported.
+    #[error("{}: {reason}", path.display())]
+    Recording {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        reason: String,
+    },
+    /// A constant of an import that is out of bounds.
+    #[error("{what} {value}: expected {expected}")]
+    Constant {
+        /// Which.
+        what: &'static str,
+        /// As given.
+        value: String,
+        /// What it may be.
+        expected: &'static str,
+    },
+    /// The output is there already.
+    #[error("{} exists; add --force to replace it, or name another file", path.display())]
+    Exists {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A file cannot be written.
+    #[error("{}: cannot be written: {reason}", path.display())]
+    Unwritable {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        reason: String,
+    },
+    /// Two clips of one name in one file.
+    #[error("clip `{name}` comes twice, and a file has each name once; choose clips with FILE.h5#CLIP,CLIP")]
+    NameTaken {
+        /// The name.
+        name: String,
+    },
+    /// A name that no clip can have.
+    #[error("`{name}` is no name for a clip: it takes 1 to 200 characters, none of them `/` or `.` or a space")]
+    Name {
+        /// The name.
+        name: String,
+    },
     /// An experiment without a clip source, or with weight 0 for each.
     #[error("clips: no source with a weight above 0; name a file or a built-in clip")]
     NoSources,

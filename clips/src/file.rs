@@ -17,9 +17,35 @@ const STEPS: RangeInclusive<u64> = 1..=100_000;
 /// Longest time step taken, s; dm_control's files have 0.03 and 0.05.
 const LONGEST_TIMESTEP: f64 = 1.0;
 /// How far a quaternion's norm may be from 1.
-const NORM_TOLERANCE: f64 = 1e-2;
+pub(crate) const NORM_TOLERANCE: f64 = 1e-2;
 /// The largest dataset of the longest clip: 31 quaternions a frame.
 const LARGEST_READ: usize = 100_000 * 31 * 4 * size_of::<f64>();
+
+/// A dataset as stored.
+pub(crate) struct Stored {
+    pub(crate) field: &'static str,
+    /// Numbers a frame.
+    pub(crate) width: usize,
+    pub(crate) rows: Result<Vec<f64>, Error>,
+}
+
+/// Every dataset of a clip and how many numbers it has a frame.
+pub(crate) fn widths(model: WalkerModel) -> [(&'static str, usize); 11] {
+    let bodies = model.bodies();
+    [
+        ("position", 3),
+        ("quaternion", 4),
+        ("joints", 56),
+        ("velocity", 3),
+        ("angular_velocity", 3),
+        ("joints_velocity", 56),
+        ("center_of_mass", 3),
+        ("end_effectors", 12),
+        ("appendages", 15),
+        ("body_positions", 3 * bodies),
+        ("body_quaternions", 4 * bodies),
+    ]
+}
 
 /// What a clip's attributes say.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -98,6 +124,17 @@ impl ClipFile {
         walker.check_quaternions("body_quaternions", &features.body_quaternions)?;
         let Header { dt, model, .. } = header;
         Ok(Clip { name: name.into(), model, dt, motion, features: Some(features) })
+    }
+
+    /// Reads whatever can be read of a clip, for a search for defects: its header, and each dataset, `(width, T)` row
+    /// by row, its shape checked and nothing else.
+    pub(crate) fn stored(&self, name: &str) -> Result<(Header, Vec<Stored>), Error> {
+        let root = self.root()?;
+        let header = self.header(&root, name)?;
+        let walker = self.walker(&root, name, header)?;
+        let widths = widths(header.model);
+        let read = |(field, width)| Stored { field, width, rows: walker.stored(field, width) };
+        Ok((header, widths.into_iter().map(read).collect()))
     }
 
     fn root(&self) -> Result<Group, Error> {
@@ -212,6 +249,19 @@ impl Walker<'_> {
 
     /// A dataset as stored, `(width, T)` row by row, its shape and every number checked.
     fn rows(&self, field: &str, width: usize) -> Result<Vec<f64>, Error> {
+        let (rows, steps) = (self.stored(field, width)?, self.header.steps);
+        match rows.iter().position(|number: &f64| !number.is_finite()) {
+            None => Ok(rows),
+            Some(place) => {
+                let reason = format!("{} in row {}, frame {}", rows[place], place / steps, place % steps);
+                let item = format!("{}/{field}", self.item);
+                Err(self.file.malformed(&item, format!("{reason}; every number must be finite")))
+            }
+        }
+    }
+
+    /// The same, whatever the numbers.
+    fn stored(&self, field: &str, width: usize) -> Result<Vec<f64>, Error> {
         let item = format!("{}/{field}", self.item);
         let steps = self.header.steps;
         let dataset = self.file.guarded(&item, || self.group.dataset(field))?;
@@ -223,18 +273,11 @@ impl Walker<'_> {
             );
             return Err(self.file.malformed(&item, reason));
         }
-        let rows = self.file.guarded(&item, || {
+        self.file.guarded(&item, || {
             let mut rows = vec![0.0; width * steps];
             dataset.read_into::<f64>(&mut rows)?;
             Ok(rows)
-        })?;
-        match rows.iter().position(|number: &f64| !number.is_finite()) {
-            None => Ok(rows),
-            Some(place) => {
-                let reason = format!("{} in row {}, frame {}", rows[place], place / steps, place % steps);
-                Err(self.file.malformed(&item, format!("{reason}; every number must be finite")))
-            }
-        }
+        })
     }
 
     fn check_quaternions(&self, field: &str, quaternions: &[f64]) -> Result<(), Error> {

@@ -70,6 +70,14 @@ impl WalkerModel {
         }
     }
 
+    /// As the attribute `model` has it.
+    pub(crate) fn attribute(self) -> i64 {
+        match self {
+            Self::Cmu2019 => 1,
+            Self::Cmu2020 => 4,
+        }
+    }
+
     /// From the attribute `model` of a file (`WalkerModel` in dm_control's `mocap.proto`).
     pub(crate) fn from_attribute(number: u64) -> Option<Self> {
         match number {

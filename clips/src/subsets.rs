@@ -29,3 +29,8 @@ pub fn subset(name: &str) -> Result<Vec<String>, Error> {
     ids.sort_unstable();
     Ok(ids)
 }
+
+/// The subsets that have a clip of that name, in the order of [`SUBSETS`].
+pub fn subsets_with(name: &str) -> Vec<&'static str> {
+    SUBSETS.into_iter().filter(|set| subset(set).is_ok_and(|ids| ids.iter().any(|id| id == name))).collect()
+}

@@ -4,6 +4,7 @@
 
 use std::path::{Path, PathBuf};
 
+use comic_clips::import::{Constants, Floor, Take};
 use comic_clips::{Catalogue, Error};
 use comic_experiment::ClipSource;
 
@@ -14,6 +15,14 @@ pub(crate) fn law() -> proptest::test_runner::Config {
 
 pub(crate) fn tiny() -> String {
     fixture("tiny.h5")
+}
+
+/// A recording of the CMU database beside these tests: a run of subject 2.
+pub(crate) fn run_take() -> Take {
+    let file = |name: &str| path(["tests", "data", "cmu", name]);
+    let constants =
+        Constants { sole_degrees: Some([13.5, 12.0]), floor: Some(Floor::DRIFTING), ..Constants::default() };
+    Take { name: "CMU_002_03".into(), asf: file("02.asf"), amc: file("02_03.amc"), constants }
 }
 
 pub(crate) fn defects() -> String {

@@ -1,0 +1,187 @@
+//! The CMU humanoid V2020 as rigid bodies: forward kinematics, centre of mass, and height above the floor.
+
+mod table;
+
+use crate::JOINTS;
+use crate::spatial::{
+    IDENTITY, Matrix, Quaternion, Vector, about, add, dot, matrix, multiply, norm, normalize, rotate, scale, subtract,
+};
+
+/// A rigid body; its frame lies at `position` and `quaternion` in its parent's.
+pub(crate) struct Body {
+    pub(crate) name: &'static str,
+    parent: usize,
+    /// First and one past the last of its hinges in [`JOINTS`]; they turn in that order.
+    hinges: (usize, usize),
+    position: Vector,
+    quaternion: Quaternion,
+    /// Where its hinges sit, in its frame.
+    anchor: Vector,
+    /// kg.
+    mass: f64,
+    /// In its frame.
+    center_of_mass: Vector,
+}
+
+/// A colliding geom, at `position` and `quaternion` in the frame of `body`.
+pub(crate) struct Geom {
+    pub(crate) name: &'static str,
+    pub(crate) body: usize,
+    shape: Shape,
+    position: Vector,
+    quaternion: Quaternion,
+}
+
+/// Metres; a capsule lies along its z axis.
+enum Shape {
+    Sphere { radius: f64 },
+    Capsule { radius: f64, half_length: f64 },
+    Ellipsoid { semi_axes: Vector },
+}
+
+/// How many bodies there are, the free frame and the root included.
+pub(crate) const BODIES: usize = table::BODIES.len();
+/// The root; the bodies after it are the tracking bodies, in dm_control's order.
+pub(crate) const ROOT: usize = 1;
+
+/// Where every body is, world frame.
+pub(crate) struct Frames {
+    pub(crate) position: [Vector; BODIES],
+    pub(crate) quaternion: [Quaternion; BODIES],
+    pub(crate) rotation: [Matrix; BODIES],
+    /// The axis of each of [`JOINTS`], a unit vector.
+    pub(crate) axis: [Vector; 56],
+}
+
+/// The place of the body of that name.
+pub(crate) fn index(name: &str) -> Option<usize> {
+    table::BODIES.iter().position(|body| body.name == name)
+}
+
+/// The place of a body of that name, which is one of the table's; for constants.
+pub(crate) const fn body(name: &str) -> usize {
+    let mut index = 0;
+    while index < BODIES {
+        if same(table::BODIES[index].name, name) {
+            return index;
+        }
+        index += 1;
+    }
+    panic!("no body of that name; found while compiling")
+}
+
+/// The place of a joint of that name in [`JOINTS`].
+pub(crate) const fn joint(name: &str) -> usize {
+    let mut index = 0;
+    while index < JOINTS.len() {
+        if same(JOINTS[index], name) {
+            return index;
+        }
+        index += 1;
+    }
+    panic!("no joint of that name; found while compiling")
+}
+
+const fn same(a: &str, b: &str) -> bool {
+    let (a, b) = (a.as_bytes(), b.as_bytes());
+    if a.len() != b.len() {
+        return false;
+    }
+    let mut index = 0;
+    while index < a.len() {
+        if a[index] != b[index] {
+            return false;
+        }
+        index += 1;
+    }
+    true
+}
+
+/// The coordinate axis (0, 1, 2) of a joint: names end in `rx`, `ry` or `rz`.
+fn axis(joint: usize) -> usize {
+    match JOINTS[joint].as_bytes().last() {
+        Some(b'x') => 0,
+        Some(b'y') => 1,
+        _ => 2,
+    }
+}
+
+pub(crate) fn geoms() -> &'static [Geom] {
+    &table::GEOMS
+}
+
+impl Frames {
+    /// Forward kinematics, in MuJoCo's order of operations (`mj_kinematics`), so that quaternions have its signs:
+    /// root at `position` (m) and `quaternion`, hinges at `joints` (rad, in the order of [`JOINTS`]).
+    pub(crate) fn of(position: &Vector, quaternion: &Quaternion, joints: &[f64; 56]) -> Self {
+        let free = normalize(*quaternion);
+        let mut frames = Self {
+            position: [*position; BODIES],
+            quaternion: [free; BODIES],
+            rotation: [matrix(free); BODIES],
+            axis: [[0.0; 3]; 56],
+        };
+        for (index, body) in table::BODIES.iter().enumerate().skip(1) {
+            let mut at = add(frames.position[body.parent], rotate(&frames.rotation[body.parent], body.position));
+            let mut turned = multiply(frames.quaternion[body.parent], body.quaternion);
+            let (first, end) = body.hinges;
+            for (hinge, angle) in joints.iter().enumerate().take(end).skip(first) {
+                let before = matrix(turned);
+                let axis = axis(hinge);
+                frames.axis[hinge] = std::array::from_fn(|row| before[row][axis]);
+                let anchor = add(at, rotate(&before, body.anchor));
+                turned = multiply(turned, about(axis, *angle));
+                at = subtract(anchor, rotate(&matrix(turned), body.anchor));
+            }
+            let turned = normalize(turned);
+            frames.position[index] = at;
+            frames.quaternion[index] = turned;
+            frames.rotation[index] = matrix(turned);
+        }
+        frames
+    }
+
+    /// At zero angles, the root at the origin.
+    pub(crate) fn zero() -> Self {
+        Self::of(&[0.0; 3], &IDENTITY, &[0.0; 56])
+    }
+
+    /// Of the whole body, m, world frame.
+    pub(crate) fn center_of_mass(&self) -> Vector {
+        let (mut moment, mut mass) = ([0.0; 3], 0.0);
+        for (index, body) in table::BODIES.iter().enumerate() {
+            let center = add(self.position[index], rotate(&self.rotation[index], body.center_of_mass));
+            moment = add(moment, scale(body.mass, center));
+            mass += body.mass;
+        }
+        scale(1.0 / mass, moment)
+    }
+
+    /// Height of the lowest point of a geom, m, world frame.
+    pub(crate) fn bottom(&self, geom: &Geom) -> f64 {
+        let rotation = &self.rotation[geom.body];
+        let center = self.position[geom.body][2] + dot(&rotation[2], &geom.position);
+        // World z in the geom's frame.
+        let local = matrix(geom.quaternion);
+        let up: Vector = std::array::from_fn(|column| (0..3).map(|row| rotation[2][row] * local[row][column]).sum());
+        match geom.shape {
+            Shape::Sphere { radius } => center - radius,
+            Shape::Capsule { radius, half_length } => center - radius - half_length * up[2].abs(),
+            Shape::Ellipsoid { semi_axes } => {
+                center - norm(&[semi_axes[0] * up[0], semi_axes[1] * up[1], semi_axes[2] * up[2]])
+            }
+        }
+    }
+
+    /// Height of the lowest point of all colliding geoms, m, and which geom it is.
+    pub(crate) fn lowest(&self) -> (f64, &'static Geom) {
+        let mut lowest = (self.bottom(&table::GEOMS[0]), &table::GEOMS[0]);
+        for geom in &table::GEOMS[1..] {
+            let height = self.bottom(geom);
+            if height < lowest.0 {
+                lowest = (height, geom);
+            }
+        }
+        lowest
+    }
+}

@@ -1,0 +1,155 @@
+//! Clips from CMU's own recordings: ASF (a skeleton) and AMC (its angles, 120 frames a second).
+//!
+//! # Layout
+//! The order of the work: `asf` and `amc` read, `sole` takes the subject's soles off the ankles, `angles` brings angles
+//! into the body's ranges and `arms` the arms that do not fit, `resample` smooths and goes from 1/120 s to 0.03 s,
+//! `floor` sets the body on the floor, and velocities and features follow from the poses.
+
+mod amc;
+mod angles;
+mod arms;
+mod asf;
+mod constants;
+mod floor;
+mod lines;
+mod manifest;
+mod resample;
+mod skeleton;
+mod sole;
+mod velocity;
+
+use std::f64::consts::FRAC_PI_2;
+use std::ops::Range;
+use std::path::PathBuf;
+
+pub use constants::{Constants, Floor, Taken};
+pub use manifest::read_manifest;
+
+use crate::spatial::{Quaternion, Vector, about, multiply};
+use crate::{Clip, Error, Features, WalkerModel};
+use amc::Recording;
+use asf::Skeleton;
+use floor::Poses;
+
+/// s: dm_control's control timestep for the CMU clips.
+const DT: f64 = 0.03;
+/// The smoothing looks this many recorded frames beyond the ones in use.
+const SMOOTHING_REACH: usize = 2;
+
+/// A recording and what its clip shall be.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Take {
+    /// The clip's name.
+    pub name: String,
+    /// The subject's skeleton.
+    pub asf: PathBuf,
+    /// The recording.
+    pub amc: PathBuf,
+    /// What is known of it.
+    pub constants: Constants,
+}
+
+/// Converts a recording to a clip of the CMU humanoid V2020, 0.03 s a frame.
+///
+/// Velocities are central differences, since what is compared with them is an instantaneous velocity. Everything but
+/// the time is scaled by the body's leg over the subject's.
+///
+/// # Errors
+/// [`Error::Unreadable`], [`Error::Line`] and [`Error::Recording`] for files that are not CMU's; [`Error::Constant`].
+pub fn import(take: &Take) -> Result<(Clip, Taken), Error> {
+    let constants = &take.constants;
+    constants.check()?;
+    let skeleton = Skeleton::read(&take.asf)?;
+    let recording = Recording::read(&take.amc)?;
+    let frames = window(take, recording.root.len())?;
+    let mut notes = Vec::new();
+    if let Some(gap) = recording.gap {
+        notes.push(format!("frame {gap} of {} does not follow the one before it", take.amc.display()));
+    }
+
+    let scale = constants.scale.unwrap_or(skeleton.scale);
+    let root = Root::of(&recording, skeleton.meters * scale);
+    let mut recorded: Vec<[f64; 56]> = recording.angles.iter().map(|angles| angles.map(f64::to_radians)).collect();
+    let sole_degrees = match constants.sole_degrees {
+        Some(degrees) => degrees,
+        None => find_soles(&root, &recorded, &frames, &mut notes),
+    };
+    recorded.iter_mut().for_each(|angles| sole::correct(angles, sole_degrees));
+
+    let arm_regularisation = constants.arm_regularisation.unwrap_or(arms::REGULARISATION);
+    let mut fitted = angles::fit(&recorded, &frames);
+    let reach = frames.start.saturating_sub(SMOOTHING_REACH)..(frames.end + SMOOTHING_REACH + 1).min(recorded.len());
+    for (free, joints) in fitted.free[reach.clone()].iter().zip(&mut fitted.joints[reach]) {
+        arms::fit(free, joints, arm_regularisation);
+    }
+
+    let mut poses = Poses {
+        position: resample::resample(&root.position, &frames),
+        quaternion: resample::resample_rotations(&root.quaternion, &frames),
+        joints: resample::resample(&fitted.joints, &frames),
+    };
+    poses.start_at_origin();
+    let floor = poses.set_on_floor(constants.floor);
+    let motion = velocity::motion(poses, DT);
+    let features = Features::of(&motion);
+    let name = take.name.clone();
+    let clip = Clip { name, model: WalkerModel::Cmu2020, dt: DT, motion, features: Some(features) };
+    Ok((clip, Taken { scale, sole_degrees, floor, arm_regularisation, frames, notes }))
+}
+
+/// The recorded frames in use; there must be two poses in them, for a velocity.
+fn window(take: &Take, recorded: usize) -> Result<Range<usize>, Error> {
+    let Range { start, end } = take.constants.frames.clone().unwrap_or(0..recorded);
+    let frames = start..end.min(recorded);
+    if resample::poses(&frames) < 2 {
+        let reason = format!(
+            "frames {start}..{end} of {recorded} are too few: a clip takes at least 5 frames, which are counted from 0"
+        );
+        return Err(Error::Recording { path: take.amc.clone(), reason });
+    }
+    Ok(frames)
+}
+
+/// The root of every recorded frame, in the body's world: z up, m.
+struct Root {
+    position: Vec<Vector>,
+    quaternion: Vec<Quaternion>,
+}
+
+impl Root {
+    /// `meters` in one of the file's units; there y is up.
+    fn of(recording: &Recording, meters: f64) -> Self {
+        let turn = |[_, _, _, x, y, z]: &[f64; 6]| {
+            let [x, y, z] = [x, y, z].map(|degrees| degrees.to_radians());
+            let recorded = multiply(about(2, z), multiply(about(1, y), about(0, x)));
+            multiply(about(0, FRAC_PI_2), recorded)
+        };
+        Self {
+            position: recording.root.iter().map(|[x, y, z, ..]| [meters * x, -meters * z, meters * y]).collect(),
+            quaternion: recording.root.iter().map(turn).collect(),
+        }
+    }
+}
+
+/// The sole pitch of the frames in use, with a note for a foot that has none.
+fn find_soles(root: &Root, recorded: &[[f64; 56]], frames: &Range<usize>, notes: &mut Vec<String>) -> [f64; 2] {
+    let fitted = angles::fit(recorded, frames);
+    let poses = frames.clone().map(|frame| (root.position[frame], root.quaternion[frame], fitted.joints[frame]));
+    let found = sole::find(poses);
+    for (side, _) in ["left", "right"].iter().zip(found).filter(|(_, found)| found.is_none()) {
+        notes.push(format!(
+            "the {side} foot never stands, so its sole is left as recorded; give --sole-deg if it is not level"
+        ));
+    }
+    found.map(Option::unwrap_or_default)
+}
+
+impl Poses {
+    fn start_at_origin(&mut self) {
+        let [x, y, _] = self.position.first().copied().unwrap_or_default();
+        for position in &mut self.position {
+            position[0] -= x;
+            position[1] -= y;
+        }
+    }
+}
