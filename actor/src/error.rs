@@ -88,6 +88,22 @@ pub enum Error {
     /// The command line asks for what makes no sense.
     #[error("{0}")]
     Usage(String),
+    /// A download.
+    #[error("cannot fetch {url}: {reason}")]
+    Download {
+        /// From where.
+        url: String,
+        /// Why not, and what can be done.
+        reason: String,
+    },
+    /// `clips check` found what it looks for.
+    #[error("{clips} of {of} clips have defects")]
+    Defects {
+        /// With defects.
+        clips: usize,
+        /// All that were checked.
+        of: usize,
+    },
     /// Reference clips.
     #[error(transparent)]
     Clips(#[from] comic_clips::Error),

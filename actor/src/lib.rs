@@ -9,6 +9,7 @@
 //! - [`run`] puts these together into an actor process.
 //! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads what the learner wrote.
 //! - [`render`] films a policy at work, or shows it in a window.
+//! - [`clips`] is `comic-actor clips`: motion capture in files, and off the network.
 //! - [`mod@bench`] holds the figures of `comic-actor bench`.
 //!
 //! Nothing here knows a loss, and nothing here is unbounded: finished unrolls wait in a bounded channel, unrolls that
@@ -17,6 +18,7 @@
 pub mod acting;
 pub mod bench;
 pub mod checkpoint;
+pub mod clips;
 mod error;
 pub mod evaluate;
 pub mod mailbox;

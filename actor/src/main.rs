@@ -6,6 +6,7 @@ use std::process::ExitCode;
 
 use anyhow::Context as _;
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use comic_actor::clips::Clips;
 use comic_actor::evaluate::command::Evaluate;
 use comic_actor::render::command::Render;
 use comic_actor::render::view::View;
@@ -38,6 +39,8 @@ enum Command {
     Render(Render),
     /// Shows a policy at work in a window.
     View(View),
+    /// Lists, checks, imports, merges and fetches motion capture.
+    Clips(Clips),
     /// Measures how fast an actor is, one JSON line a figure.
     #[command(hide = true)]
     Bench(bench::Bench),
@@ -86,6 +89,7 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
         Some(Command::Evaluate(evaluate)) => evaluate.run().context("cannot evaluate"),
         Some(Command::Render(render)) => render.run().context("cannot film"),
         Some(Command::View(view)) => view.run().context("cannot show"),
+        Some(Command::Clips(clips)) => clips.run().map_err(anyhow::Error::from),
         Some(Command::Bench(bench)) => bench.run().context("cannot measure"),
         None => {
             let Act { learner, threads, environments, cache } = arguments.act;

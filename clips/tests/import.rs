@@ -90,6 +90,10 @@ fn what_was_found_for_shared_recordings_is_near_what_a_person_chose() {
     for take in read_manifest(&manifest).unwrap() {
         let chosen = take.constants.clone();
         let (_, taken) = import(&Take { constants: Constants::default(), ..take.clone() }).unwrap();
-        println!("{}: chosen {chosen:?}, found {taken}", take.name);
+        println!("{}: found {taken}", take.name);
+        assert_eq!(Some(taken.floor), chosen.floor, "{}", take.name);
+        for (found, chosen) in taken.sole_degrees.into_iter().zip(chosen.sole_degrees.unwrap()) {
+            assert!((found - chosen).abs() <= 5.0, "{}: {found} degrees, chosen {chosen}", take.name);
+        }
     }
 }

@@ -3,7 +3,7 @@
 use anyhow::Result;
 
 use crate::workspace::{cargo, cargo_has, run};
-use crate::{setup, workspace};
+use crate::{python, setup, workspace};
 
 #[derive(clap::Args)]
 pub(crate) struct TestOptions {
@@ -15,6 +15,8 @@ pub(crate) struct TestOptions {
 /// Sets up and runs every test: by cargo-nextest where it is installed, else by cargo itself.
 pub(crate) fn test(options: &TestOptions) -> Result<()> {
     setup::run(&setup::Options::default())?;
+    // Files written here are read by dm_control's own loader.
+    python::prepare_tests()?;
     // The whole-system tests start the programs, so these are built first.
     workspace::build()?;
     let mut command = cargo();

@@ -37,6 +37,11 @@ pub(crate) fn fixtures(options: &FixtureOptions) -> Result<()> {
     Ok(())
 }
 
+/// Makes the environment in which tests run dm_control; under a second when it is there.
+pub(crate) fn prepare_tests() -> Result<()> {
+    environment(&workspace::root().join("tests/python/requirements-tracking.txt")).map(drop)
+}
+
 /// A command that runs `tests/python/SCRIPT` with what `tests/python/REQUIREMENTS` names.
 pub(crate) fn script_command(script: &str, requirements: &str) -> Result<Command> {
     let directory = workspace::root().join("tests/python");

@@ -1,0 +1,92 @@
+//! `comic-actor clips check`.
+
+use clap::Args;
+use comic_clips::check::{
+    AIRBORNE, Checked, JOINT_EXCESS, JOINT_SPEED, LONGEST_FLIGHT, PENETRATION, ROOT_SPEED, ROOT_TURN, check,
+};
+use comic_experiment::ClipSource;
+
+use super::{print, print_json, table::table};
+use crate::Error;
+
+/// Finds every defect of every clip, all at once; exits with 1 when there is any.
+///
+/// Floor and joint limits are those of the CMU humanoid V2020; clips of another body are searched for the rest.
+#[derive(Args, Clone, Debug)]
+#[command(after_long_help = help())]
+pub(super) struct Check {
+    /// The file, or FILE.h5#CLIP,CLIP or FILE.h5#SUBSET.
+    #[arg(value_name = "FILE")]
+    file: String,
+    /// JSON instead of a table; see below.
+    #[arg(long)]
+    json: bool,
+}
+
+fn help() -> String {
+    format!(
+        "\
+Defects, by limits of this project's choice:
+  unreadable       a dataset or attribute is missing, mis-shaped or damaged
+  not_finite       NaN or infinity
+  quaternion_norm  a quaternion's norm is off 1 by 0.01 or more
+  joint_limit      a joint is over {JOINT_EXCESS} rad outside its range
+  penetration      a geom is over {PENETRATION} m deep in the floor, z = 0
+  floating         the whole body is over {AIRBORNE} m above the floor for over {LONGEST_FLIGHT} s
+  jump             from one frame to the next faster than {ROOT_SPEED} m/s or {ROOT_TURN} rad/s (root), {JOINT_SPEED} rad/s (joint)
+
+With --json one array goes to standard output, an object for each clip:
+  clip, frames   name and number of frames
+  body_checked   whether joints and floor were checked
+  lowest_point   [lowest, highest] of the heights of the body's lowest point, m, or null
+  defects        objects: kind (as above), item (dataset, joint, geom or root), frames (in how many), first_frame,
+                 worst (in m, rad, m/s, rad/s or a count, as the kind has it), detail (in words)"
+    )
+}
+
+impl Check {
+    pub(super) fn run(&self) -> Result<(), Error> {
+        let source = ClipSource::parse(&self.file);
+        let mut chosen = source.ids;
+        if let Some(subset) = &source.subset {
+            chosen.extend(comic_clips::subset(subset)?);
+        }
+        let checked = check(source.source.as_ref(), &chosen)?;
+        if self.json {
+            print_json(&checked)?;
+        } else {
+            print(&as_table(&checked))?;
+        }
+        match checked.iter().filter(|clip| !clip.defects.is_empty()).count() {
+            0 => Ok(()),
+            clips => Err(Error::Defects { clips, of: checked.len() }),
+        }
+    }
+}
+
+fn as_table(checked: &[Checked]) -> String {
+    let mut rows = Vec::new();
+    for clip in checked {
+        let millimetres = |height: f64| format!("{:.0}", 1000.0 * height);
+        let [low, high] = clip.lowest_point.map_or_else(|| ["-".into(), "-".into()], |bounds| bounds.map(millimetres));
+        let row = |defect: String, item: String, frames: String, first: String, detail: String| {
+            [clip.clip.clone(), clip.frames.to_string(), low.clone(), high.clone(), defect, item, frames, first, detail]
+        };
+        if clip.defects.is_empty() {
+            let said = if clip.body_checked { "sound" } else { "sound, as far as its body is known" };
+            rows.push(row("-".into(), String::new(), String::new(), String::new(), said.into()));
+        }
+        for defect in &clip.defects {
+            // As JSON names it.
+            let kind = serde_json::to_value(defect.kind).ok().and_then(|kind| kind.as_str().map(String::from));
+            rows.push(row(
+                kind.unwrap_or_default(),
+                defect.item.clone(),
+                defect.frames.to_string(),
+                defect.first_frame.to_string(),
+                defect.detail.clone(),
+            ));
+        }
+    }
+    table(["clip", "frames", "low mm", "high mm", "defect", "at", "in frames", "first", ""], &rows)
+}
