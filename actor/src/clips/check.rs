@@ -88,5 +88,5 @@ fn as_table(checked: &[Checked]) -> String {
             ));
         }
     }
-    table(["clip", "frames", "low mm", "high mm", "defect", "at", "in frames", "first", ""], &rows)
+    table(["clip", "frames", "low mm", "high mm", "defect", "at", "in frames", "first", "what"], &rows)
 }
