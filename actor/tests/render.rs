@@ -1,6 +1,8 @@
 //! `comic-actor render` and `evaluate --video`, as they are typed. Without OpenGL there is nothing to film, and the tests
 //! say so.
 
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
 use std::fs::File;
 use std::path::Path;
 use std::process::{Command, Output};

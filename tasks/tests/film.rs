@@ -1,5 +1,7 @@
 //! Films show what is there. Without OpenGL there is nothing to look at, and the tests say so.
 
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
 use std::sync::Arc;
 
 use comic_clips::Catalogue;
