@@ -5,10 +5,16 @@ use std::sync::Arc;
 use mujoco_rs::prelude::*;
 use mujoco_rs::viewer::{MjViewer, MjViewerError};
 
-use crate::Simulated;
 use crate::arenas::floor::TARGET;
 use crate::error::Error;
 use crate::ghost::{Ghost, Phantom};
+use crate::humanoid::PREFIX;
+use crate::{Simulated, Simulation};
+
+/// What the window shows at first: an extent of so many metres, seen from one and a half times as far, and how far the
+/// camera looks down (degrees).
+const EXTENT: f64 = 2.5;
+const ELEVATION: f32 = -14.0;
 
 /// The window, which belongs to the process's first thread.
 #[derive(Debug)]
@@ -32,8 +38,9 @@ impl Viewer {
         let model = environment.model();
         let phantom = ghost.map(|_| Phantom::new(&model));
         let parts = phantom.as_ref().map_or(0, Phantom::parts) as usize;
+        let settings = near_the_humanoid(&model, environment.simulation());
         let window =
-            MjViewer::builder().window_name("CoMic").max_user_geoms(parts).build_passive(&model).map_err(display)?;
+            MjViewer::builder().window_name("CoMic").max_user_geoms(parts).build_passive(&settings).map_err(display)?;
         Ok(Self { window, ghost, phantom, model })
     }
 
@@ -68,6 +75,23 @@ impl Viewer {
         self.window.render().map_err(display)?;
         Ok(self.window.running())
     }
+}
+
+/// The model with the settings that decide where the window's camera begins: by the humanoid, from the side. Left to
+/// themselves they would show all of a corridor of 100 m.
+fn near_the_humanoid(model: &MjModel, simulation: &Simulation) -> MjModel {
+    let mut settings = model.clone();
+    let root = model.name_to_id(MjtObjBase::mjOBJ_BODY, &format!("{PREFIX}root"));
+    if let Some(position) = root.and_then(|root| simulation.xpos().get(root)) {
+        settings.stat_mut().center = *position;
+    }
+    // Clipping planes are relative to the extent, and stay where they are.
+    let shrunk = (settings.stat().extent / EXTENT) as f32;
+    settings.stat_mut().extent = EXTENT;
+    let visual = settings.vis_mut();
+    (visual.map.znear, visual.map.zfar) = (visual.map.znear * shrunk, visual.map.zfar * shrunk);
+    visual.global.elevation = ELEVATION;
+    settings
 }
 
 fn display(error: MjViewerError) -> Error {
