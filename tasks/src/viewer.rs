@@ -1,9 +1,13 @@
 //! A window on an environment: MuJoCo's viewer, as mujoco-rs has it. Feature `viewer`.
+//!
+//! The window belongs to the process's first thread, and its OpenGL does not let that of the humanoid's sight into the
+//! same thread: environments are played in another one, and shown through a [`Screen`].
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use mujoco_rs::prelude::*;
-use mujoco_rs::viewer::{MjViewer, MjViewerError};
+use mujoco_rs::viewer::{MjViewer, MjViewerError, ViewerSharedState};
 
 use crate::arenas::floor::TARGET;
 use crate::error::Error;
@@ -15,11 +19,19 @@ use crate::{Simulated, Simulation};
 /// camera looks down (degrees).
 const EXTENT: f64 = 2.5;
 const ELEVATION: f32 = -14.0;
+/// The least between two pictures: 60 a second.
+const PICTURE_TIME: Duration = Duration::from_micros(16_667);
 
 /// The window, which belongs to the process's first thread.
 #[derive(Debug)]
 pub struct Viewer {
     window: MjViewer,
+}
+
+/// Where an environment is shown, from any thread.
+#[derive(Debug)]
+pub struct Screen {
+    state: Arc<Mutex<ViewerSharedState>>,
     ghost: Option<Ghost>,
     phantom: Option<Phantom>,
     model: Arc<MjModel>,
@@ -30,8 +42,8 @@ impl Viewer {
     ///
     /// # Errors
     /// [`Error::Display`] when there is no display, or no OpenGL on it.
-    pub fn open(environment: &dyn Simulated, ghost: Option<Ghost>) -> Result<Self, Error> {
-        // Asked first, since the window's library ends in a panic of its own for some displays that are not there.
+    pub fn open(environment: &dyn Simulated, ghost: Option<Ghost>) -> Result<(Self, Screen), Error> {
+        // Asked first, for an answer that names the variables.
         if ["DISPLAY", "WAYLAND_DISPLAY"].iter().all(|name| std::env::var_os(name).is_none_or(|name| name.is_empty())) {
             return Err(Error::Display { reason: "neither DISPLAY nor WAYLAND_DISPLAY is set".into() });
         }
@@ -41,15 +53,26 @@ impl Viewer {
         let settings = near_the_humanoid(&model, environment.simulation());
         let window =
             MjViewer::builder().window_name("CoMic").max_user_geoms(parts).build_passive(&settings).map_err(display)?;
-        Ok(Self { window, ghost, phantom, model })
+        let screen = Screen { state: Arc::clone(window.state()), ghost, phantom, model };
+        Ok((Self { window }, screen))
     }
 
-    /// Shows the environment as it stands; `false` when the window has been closed. The model is shown as it was when
-    /// the window was opened until one of another layout comes. A push with the mouse pushes the humanoid.
+    /// Draws what is shown until the window is closed, or `goes_on` says no.
     ///
     /// # Errors
     /// [`Error::Display`] when OpenGL fails.
-    pub fn show(&mut self, environment: &mut dyn Simulated) -> Result<bool, Error> {
+    pub fn run(&mut self, goes_on: impl Fn() -> bool) -> Result<(), Error> {
+        while self.window.running() && goes_on() {
+            self.window.render().map_err(display)?;
+            std::thread::sleep(PICTURE_TIME);
+        }
+        Ok(())
+    }
+}
+
+impl Screen {
+    /// Shows the environment as it stands. A push with the mouse pushes the humanoid.
+    pub fn show(&mut self, environment: &mut dyn Simulated) {
         let (model, scenery) = (environment.model(), environment.scenery());
         if !self.model.is_compatible_with_model(&model) {
             self.phantom = self.ghost.map(|_| Phantom::new(&model));
@@ -57,23 +80,13 @@ impl Viewer {
         let target = model.name_to_id(MjtObjBase::mjOBJ_SITE, TARGET);
         scenery.mark_target(target, environment.simulation_mut());
         self.model = model;
-        let phantom = match (&mut self.phantom, self.ghost, &scenery.reference) {
-            (Some(phantom), Some(ghost), Some(reference)) => {
-                phantom.stand(reference, ghost, 0.0);
-                Some(phantom)
-            }
-            _ => None,
-        };
-        let shown = self.window.with_state_lock(|mut state| {
-            state.sync_data(environment.simulation_mut());
-            if let Some(phantom) = phantom {
-                phantom.appear(state.user_scene_mut(), &MjvOption::default());
-            }
-        });
-        // A lock that another thread left broken: there is no other thread.
-        drop(shown);
-        self.window.render().map_err(display)?;
-        Ok(self.window.running())
+        // A window that panicked shows nothing any more.
+        let Ok(mut state) = self.state.lock() else { return };
+        state.sync_data(environment.simulation_mut());
+        if let (Some(phantom), Some(ghost), Some(reference)) = (&mut self.phantom, self.ghost, &scenery.reference) {
+            phantom.stand(reference, ghost, 0.0);
+            phantom.appear(state.user_scene_mut(), &MjvOption::default());
+        }
     }
 }
 

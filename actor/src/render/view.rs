@@ -36,10 +36,12 @@ impl View {
 #[cfg(feature = "viewer")]
 mod window {
     use std::ops::ControlFlow;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering};
     use std::time::{Duration, Instant};
 
-    use comic_tasks::viewer::Viewer;
-    use comic_tasks::{Ghost, Simulated};
+    use comic_tasks::Simulated;
+    use comic_tasks::viewer::{Screen, Viewer};
 
     use super::View;
     use crate::Error;
@@ -56,33 +58,37 @@ mod window {
         pub fn run(&self) -> Result<(), Error> {
             let mut cast = self.scene.cast()?;
             let step = Duration::from_secs_f64(cast.task.control_timestep());
-            let mut window = Window { viewer: None, ghost: self.ghost, step, due: Instant::now() };
-            cast.play(EPISODES, &mut window).map(drop)
+            // Only its layout counts: the episodes are played in environments of their own.
+            let environment = Arc::clone(&cast.task).environment(0)?;
+            let (mut viewer, screen) = Viewer::open(environment.as_ref(), self.ghost)?;
+            let open = AtomicBool::new(true);
+            let mut shown = Shown { screen, open: &open, step, due: Instant::now() };
+            std::thread::scope(|scope| {
+                let player = scope.spawn(move || cast.play(EPISODES, &mut shown).map(drop));
+                let closed = viewer.run(|| !player.is_finished());
+                open.store(false, Ordering::Relaxed);
+                player.join().map_err(|_| Error::WorkerPanicked)??;
+                Ok(closed?)
+            })
         }
     }
 
-    /// Shows every step at its time.
-    struct Window {
-        /// Opened at the first episode.
-        viewer: Option<Viewer>,
-        ghost: Option<Ghost>,
+    /// Shows every step at its time, until the window is closed.
+    struct Shown<'a> {
+        screen: Screen,
+        open: &'a AtomicBool,
         step: Duration,
         due: Instant,
     }
 
-    impl Audience<Box<dyn Simulated>> for Window {
+    impl Audience<Box<dyn Simulated>> for Shown<'_> {
         fn watch(&mut self, _: usize, environment: &mut Box<dyn Simulated>) -> Result<ControlFlow<()>, Error> {
-            let viewer = match &mut self.viewer {
-                Some(viewer) => viewer,
-                None => self.viewer.insert(Viewer::open(environment.as_ref(), self.ghost)?),
-            };
-            if !viewer.show(environment.as_mut())? {
-                return Ok(ControlFlow::Break(()));
-            }
+            self.screen.show(environment.as_mut());
             // Time that was lost is not caught up with.
             self.due = (self.due + self.step).max(Instant::now());
             std::thread::sleep(self.due - Instant::now());
-            Ok(ControlFlow::Continue(()))
+            let open = self.open.load(Ordering::Relaxed);
+            Ok(if open { ControlFlow::Continue(()) } else { ControlFlow::Break(()) })
         }
 
         fn count(&mut self, _: usize, _: usize) {}
