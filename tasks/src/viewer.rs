@@ -19,6 +19,8 @@ use crate::{Simulated, Simulation};
 /// camera looks down (degrees).
 const EXTENT: f64 = 2.5;
 const ELEVATION: f32 = -14.0;
+/// Where the window's camera looks at first (rad, from +x): MuJoCo's default.
+const AZIMUTH: f64 = std::f64::consts::FRAC_PI_2;
 /// The least between two pictures: 60 a second.
 const PICTURE_TIME: Duration = Duration::from_micros(16_667);
 
@@ -84,7 +86,7 @@ impl Screen {
         let Ok(mut state) = self.state.lock() else { return };
         state.sync_data(environment.simulation_mut());
         if let (Some(phantom), Some(ghost), Some(reference)) = (&mut self.phantom, self.ghost, &scenery.reference) {
-            phantom.stand(reference, ghost, 0.0);
+            phantom.stand(reference, ghost, AZIMUTH);
             phantom.appear(state.user_scene_mut(), &MjvOption::default());
         }
     }
