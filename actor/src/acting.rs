@@ -1,5 +1,7 @@
 //! What one batched forward pass reads and writes, and who can make one.
 
+use comic_experiment::{Experiment, TaskSpec};
+use comic_proto::UnrollShape;
 use rand::Rng;
 use rand_distr::{Distribution as _, StandardNormal};
 
@@ -18,6 +20,30 @@ pub struct ActingSizes {
     pub action: usize,
     /// I, bytes; 0 when the task is blind.
     pub image: usize,
+    /// K, Gaussians that the action is drawn from.
+    pub components: usize,
+    /// S, numbers that the policy remembers.
+    pub state: usize,
+}
+
+impl ActingSizes {
+    /// The widths of an experiment's acting arrays.
+    pub fn new(spec: &TaskSpec, experiment: &Experiment) -> Self {
+        Self::from(&UnrollShape::new(spec, experiment))
+    }
+
+    /// The weights' width: one component needs none.
+    fn weights(&self) -> usize {
+        if self.components > 1 { self.components } else { 0 }
+    }
+}
+
+impl From<&UnrollShape> for ActingSizes {
+    fn from(shape: &UnrollShape) -> Self {
+        let UnrollShape { length: _, proprioception, task, action, latent, reward_terms: _, image, components, state } =
+            *shape;
+        Self { proprioception, task, latent, action, image, components, state }
+    }
 }
 
 /// The observations of E environments, and what the behaviour policy makes of them: row-major f32 arrays.
@@ -37,10 +63,14 @@ pub struct ActingBatch {
     pub latent_noise: Vec<f32>,
     /// z_t `[E, Z]`: written by the forward pass.
     pub latent: Vec<f32>,
-    /// Mean of the action `[E, A]`: written by the forward pass.
+    /// Mean of each component `[E, K·A]`: written by the forward pass.
     pub mean: Vec<f32>,
-    /// Standard deviation of the action `[E, A]`: written by the forward pass.
+    /// Standard deviation of each component `[E, K·A]`: written by the forward pass.
     pub std: Vec<f32>,
+    /// ln of the components' weights `[E, K]`, empty where K is 1: written by the forward pass.
+    pub log_weights: Vec<f32>,
+    /// What the policy remembers `[E, S]`; zero at an episode's first step: read and written by the forward pass.
+    pub state: Vec<f32>,
 }
 
 /// One environment's row of an [`ActingBatch`].
@@ -58,10 +88,67 @@ pub struct ActingRow<'a> {
     pub latent_noise: &'a mut [f32],
     /// `[Z]`.
     pub latent: &'a mut [f32],
-    /// `[A]`.
+    /// `[K·A]`.
     pub mean: &'a mut [f32],
-    /// `[A]`.
+    /// `[K·A]`.
     pub std: &'a mut [f32],
+    /// `[K]`, or empty.
+    pub log_weights: &'a mut [f32],
+    /// `[S]`.
+    pub state: &'a mut [f32],
+}
+
+impl ActingRow<'_> {
+    /// A mind without memory: an episode's beginning.
+    pub fn forget(&mut self) {
+        self.previous_latent.fill(0.0);
+        self.state.fill(0.0);
+    }
+
+    /// Draws an action, unclipped: clipped actions must never be scored. Of a mixture first the component is drawn.
+    pub fn sample(&self, action: &mut [f32], rng: &mut impl Rng) {
+        let component = if self.log_weights.is_empty() { 0 } else { draw(self.log_weights, rng.random()) };
+        let place = component * action.len()..(component + 1) * action.len();
+        fill_normal(action, rng);
+        for ((action, mean), std) in action.iter_mut().zip(&self.mean[place.clone()]).zip(&self.std[place]) {
+            *action = mean + std * *action;
+        }
+    }
+
+    /// The action without noise, `[A]`: the mean of the likeliest component.
+    pub fn mode(&self) -> &[f32] {
+        let components = self.log_weights.len().max(1);
+        let actions = self.mean.len() / components;
+        let likelier = |best: usize, other: usize| {
+            if self.log_weights[other] > self.log_weights[best] { other } else { best }
+        };
+        let component = (1..components).fold(0, likelier);
+        &self.mean[component * actions..(component + 1) * actions]
+    }
+
+    /// Decides for one action, whatever the policy's form: every component is N(mean, std²), and they weigh the same.
+    /// `mean` is `[A]`.
+    pub fn decide(&mut self, mean: impl Fn(&mut [f32]), std: f32) {
+        let components = self.log_weights.len().max(1);
+        for component in self.mean.chunks_exact_mut((self.mean.len() / components).max(1)) {
+            mean(component);
+        }
+        self.std.fill(std);
+        self.log_weights.fill(-(components as f32).ln());
+    }
+}
+
+/// The component at `uniform` in [0, 1) of the weights' sum.
+fn draw(log_weights: &[f32], uniform: f32) -> usize {
+    let mut left = uniform;
+    for (component, log_weight) in log_weights.iter().enumerate() {
+        left -= log_weight.exp();
+        if left < 0.0 {
+            return component;
+        }
+    }
+    // Rounding may leave a little over.
+    log_weights.len() - 1
 }
 
 impl ActingBatch {
@@ -77,8 +164,10 @@ impl ActingBatch {
             previous_latent: zeros(sizes.latent),
             latent_noise: zeros(sizes.latent),
             latent: zeros(sizes.latent),
-            mean: zeros(sizes.action),
-            std: zeros(sizes.action),
+            mean: zeros(sizes.components * sizes.action),
+            std: zeros(sizes.components * sizes.action),
+            log_weights: zeros(sizes.weights()),
+            state: zeros(sizes.state),
         }
     }
 
@@ -97,7 +186,8 @@ impl ActingBatch {
         fn part<T>(array: &mut [T], environment: usize, width: usize) -> &mut [T] {
             &mut array[environment * width..(environment + 1) * width]
         }
-        let ActingSizes { proprioception, task, latent, action, image } = self.sizes;
+        let ActingSizes { proprioception, task, latent, action, image, components, state } = self.sizes;
+        let weights = self.sizes.weights();
         ActingRow {
             proprioception: part(&mut self.proprioception, environment, proprioception),
             task: part(&mut self.task, environment, task),
@@ -105,8 +195,10 @@ impl ActingBatch {
             previous_latent: part(&mut self.previous_latent, environment, latent),
             latent_noise: part(&mut self.latent_noise, environment, latent),
             latent: part(&mut self.latent, environment, latent),
-            mean: part(&mut self.mean, environment, action),
-            std: part(&mut self.std, environment, action),
+            mean: part(&mut self.mean, environment, components * action),
+            std: part(&mut self.std, environment, components * action),
+            log_weights: part(&mut self.log_weights, environment, weights),
+            state: part(&mut self.state, environment, state),
         }
     }
 
@@ -120,14 +212,6 @@ impl ActingBatch {
 fn fill_normal(values: &mut [f32], rng: &mut impl Rng) {
     for value in values {
         *value = StandardNormal.sample(rng);
-    }
-}
-
-/// Makes a sampled action `mean + std · N(0, 1)`, unclipped: clipped actions must never be scored.
-pub fn sample_action(mean: &[f32], std: &[f32], action: &mut [f32], rng: &mut impl Rng) {
-    fill_normal(action, rng);
-    for ((action, mean), std) in action.iter_mut().zip(mean).zip(std) {
-        *action = mean + std * *action;
     }
 }
 
@@ -148,7 +232,8 @@ pub trait ForwardPass {
     /// When they do not fit; the ones before stay in force.
     fn load(&mut self, parameters: &[u8]) -> Result<(), Error>;
 
-    /// Reads observations, previous latents and latent noise; writes `latent`, `mean` and `std`.
+    /// Reads observations, previous latents, latent noise and state; writes `latent`, `mean`, `std`, `log_weights` and
+    /// the state after.
     ///
     /// # Errors
     /// When the library beneath fails.

@@ -42,19 +42,19 @@ impl Default for Options {
     }
 }
 
-/// Evaluates over the starts of the clips of `task`; `latent` is Z.
+/// Evaluates over the starts of the clips of `task`; `sizes` are its experiment's.
 ///
 /// # Errors
 /// A failing forward pass, a start that the task does not have, or what the audience returns.
 pub fn evaluate<F: ForwardPass>(
     evaluated: &mut Evaluated<'_, F>,
     task: &Arc<dyn Task>,
-    latent: usize,
+    sizes: ActingSizes,
     options: &Options,
     audience: &mut dyn Audience<Box<dyn Simulated>>,
 ) -> Result<Report, Error> {
     let starts = chosen(task.starts(), options);
-    let finished = roll_out(evaluated, task, latent, &starts, options, audience)?;
+    let finished = roll_out(evaluated, task, sizes, &starts, options, audience)?;
     Ok(Report::new(task.spec(), &finished, options))
 }
 
@@ -65,22 +65,14 @@ pub fn evaluate<F: ForwardPass>(
 pub fn roll_out<F: ForwardPass>(
     evaluated: &mut Evaluated<'_, F>,
     task: &Arc<dyn Task>,
-    latent: usize,
+    sizes: ActingSizes,
     starts: &[Start],
     options: &Options,
     audience: &mut dyn Audience<Box<dyn Simulated>>,
 ) -> Result<Vec<Finished>, Error> {
-    let spec = task.spec();
     let environments = (0..options.environments.min(starts.len()).max(1) as u64)
         .map(|index| Arc::clone(task).environment(derive(options.seed, index)))
         .collect::<Result<Vec<Box<dyn Simulated>>, _>>()?;
-    let sizes = ActingSizes {
-        proprioception: spec.proprioception,
-        task: spec.task,
-        latent,
-        action: spec.action,
-        image: spec.image,
-    };
     rollout::run(evaluated, environments, sizes, starts, options, audience)
 }
 

@@ -1,12 +1,12 @@
 //! The forward pass through libtorch.
 
 use comic_experiment::{Experiment, InitialPose, TaskSpec};
-use comic_networks::Policy;
+use comic_networks::{Memory, Policy};
 use tch::nn::VarStore;
 use tch::{Device, Tensor};
 
 use crate::Error;
-use crate::acting::{ActingBatch, ActingSizes, ForwardPass};
+use crate::acting::{ActingBatch, ForwardPass};
 
 /// The behaviour policy: its networks and their parameters, on the CPU.
 #[derive(Debug)]
@@ -19,17 +19,6 @@ pub struct TorchPolicy {
 pub fn use_one_torch_thread() {
     tch::set_num_interop_threads(1);
     tch::set_num_threads(1);
-}
-
-/// The widths of an experiment's acting arrays.
-pub fn acting_sizes(spec: &TaskSpec, experiment: &Experiment) -> ActingSizes {
-    ActingSizes {
-        proprioception: spec.proprioception,
-        task: spec.task,
-        latent: experiment.network.latent.size,
-        action: spec.action,
-        image: spec.image,
-    }
 }
 
 impl TorchPolicy {
@@ -93,17 +82,29 @@ impl ForwardPass for TorchPolicy {
             let image = (sizes.image > 0)
                 .then(|| Tensor::f_from_slice(&batch.image)?.f_view([environments, sizes.image as i64]))
                 .transpose()?;
-            let acting = self.policy.act(
+            let observation = self.policy.normalise(
                 &matrix(&batch.proprioception, sizes.proprioception)?,
                 &matrix(&batch.task, sizes.task)?,
                 image.as_ref(),
+            );
+            let acting = self.policy.act(
+                &observation,
                 &matrix(&batch.previous_latent, sizes.latent)?,
                 &matrix(&batch.latent_noise, sizes.latent)?,
+                Memory { state: &matrix(&batch.state, sizes.state)?, first: None },
             );
-            let read = |tensor: &Tensor, values: &mut [f32]| tensor.f_copy_data(values, values.len());
+            let (mean, std, log_weights) = acting.action.to_rows();
+            let read = |tensor: &Tensor, values: &mut [f32]| match values {
+                [] => Ok(()),
+                values => tensor.f_copy_data(values, values.len()),
+            };
             read(&acting.latent, &mut batch.latent)?;
-            read(&acting.action.mean, &mut batch.mean)?;
-            read(&acting.action.std, &mut batch.std)?;
+            read(&mean, &mut batch.mean)?;
+            read(&std, &mut batch.std)?;
+            read(&acting.state, &mut batch.state)?;
+            if let Some(log_weights) = log_weights {
+                read(&log_weights, &mut batch.log_weights)?;
+            }
             Ok(())
         })
     }

@@ -82,15 +82,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         demonstration_noise: f32,
         seed: u64,
     ) -> Self {
-        let shape = layout.shape();
-        let sizes = ActingSizes {
-            proprioception: shape.proprioception,
-            task: shape.task,
-            latent: shape.latent,
-            action: shape.action,
-            image: shape.image,
-        };
-        let mut batch = ActingBatch::new(environments.len(), sizes);
+        let mut batch = ActingBatch::new(environments.len(), ActingSizes::from(layout.shape()));
         let lanes = environments
             .into_iter()
             .enumerate()
@@ -217,14 +209,13 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         self.directive.as_ref().is_some_and(|directive| directive.conduct == Conduct::Demonstrate)
     }
 
-    /// The servo action as the mean. It has no latent: z stays 0, so z_{t−1} is 0 throughout.
+    /// The servo action as the mean. It has neither latent nor memory: z stays 0, so z_{t−1} is 0 throughout.
     fn demonstrate(&mut self) {
         for (index, lane) in self.lanes.iter().enumerate() {
-            let row = self.batch.row(index);
-            lane.servo_action(row.mean);
-            row.std.fill(self.demonstration_noise);
+            let mut row = self.batch.row(index);
+            row.decide(|mean| lane.servo_action(mean), self.demonstration_noise);
             row.latent.fill(0.0);
-            row.previous_latent.fill(0.0);
+            row.forget();
         }
     }
 }

@@ -5,9 +5,9 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use comic_actor::acting::{ActingBatch, ForwardPass as _};
+use comic_actor::acting::{ActingBatch, ActingSizes, ForwardPass as _};
 use comic_actor::mailbox::{Conduct, Directive};
-use comic_actor::policy::{TorchPolicy, acting_sizes};
+use comic_actor::policy::TorchPolicy;
 use comic_actor::worker::{FinishedUnroll, Progress, Worker};
 use comic_clips::Catalogue;
 use comic_experiment::{Experiment, resolve};
@@ -70,7 +70,7 @@ fn the_behaviour_policy_follows_from_what_is_recorded() {
     for round in record(&setup, Conduct::Policy) {
         let mut unrolls: Vec<_> =
             round.iter().map(|unroll| UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap()).collect();
-        let mut batch = ActingBatch::new(ENVIRONMENTS, acting_sizes(setup.task.spec(), &setup.experiment));
+        let mut batch = ActingBatch::new(ENVIRONMENTS, ActingSizes::new(setup.task.spec(), &setup.experiment));
         for t in 0..setup.layout.shape().length {
             for (index, unroll) in unrolls.iter().enumerate() {
                 let row = batch.row(index);

@@ -3,8 +3,9 @@
 use std::fmt::{Debug, Display};
 
 use crate::{
-    Actor, BallCatch, Budget, ClipSource, Corridor, Experiment, Gaps, GetUp, GoToTarget, Learner, Network, Optimiser,
-    Prior, SUBSETS, TRACKING_OBSERVATIONS, Tracking, Unroll, Vmpo, Walls, WarmStart, tracking_observation_size,
+    Actor, BallCatch, Budget, ClipSource, Corridor, Experiment, Gaps, GetUp, GoToTarget, Learner, LowLevelName,
+    Network, Optimiser, Prior, SUBSETS, TRACKING_OBSERVATIONS, Tracking, Unroll, Vmpo, Walls, WarmStart,
+    tracking_observation_size,
 };
 
 /// A field whose value is outside its meaning.
@@ -32,7 +33,7 @@ pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
     get_up(&experiment.get_up)?;
     ball_catch(&experiment.ball_catch)?;
     network(&experiment.network)?;
-    vmpo(&experiment.vmpo, experiment.unroll.batch)?;
+    vmpo(&experiment.vmpo, &experiment.unroll)?;
     optimiser(&experiment.optimiser)?;
     unroll(&experiment.unroll)?;
     actor(&experiment.actor)?;
@@ -185,14 +186,22 @@ fn ball_catch(task: &BallCatch) -> Result<(), Fault> {
 }
 
 fn network(network: &Network) -> Result<(), Fault> {
-    for (field, sizes) in [
-        ("network.encoder", &network.encoder),
-        ("network.low_level", &network.low_level),
-        ("network.value", &network.value),
+    let primitives = &network.primitives;
+    for (field, sizes, may_be_empty) in [
+        ("network.encoder", &network.encoder, false),
+        ("network.mlp.hidden", &network.mlp.hidden, false),
+        ("network.lstm.units", &network.lstm.units, false),
+        ("network.primitives.torso", &primitives.torso, false),
+        ("network.primitives.gate", &primitives.gate, false),
+        ("network.value", &network.value, false),
+        ("network.value_lstm", &network.value_lstm, true),
     ] {
-        let holds = !sizes.is_empty() && sizes.iter().all(|size| (1..=16384).contains(size));
-        ensure(field, sizes, holds, "must be one or more layers of 1 to 16384 units")?;
+        let holds = (may_be_empty || !sizes.is_empty()) && sizes.iter().all(|size| (1..=16384).contains(size));
+        ensure(field, sizes, holds && sizes.len() <= 64, "must be one or more layers of 1 to 16384 units")?;
     }
+    let (count, hidden) = (primitives.count, primitives.hidden);
+    ensure("network.primitives.count", count, (2..=64).contains(&count), "must be 2 to 64")?;
+    ensure("network.primitives.hidden", hidden, (1..=16384).contains(&hidden), "must be 1 to 16384 units")?;
     let Network { clip_embedding, initial_std, min_std, policy_head_scale, latent, .. } = network;
     ensure("network.clip_embedding", clip_embedding, (1..=4096).contains(clip_embedding), "must be 1 to 4096")?;
     let features = network.image_features;
@@ -201,7 +210,9 @@ fn network(network: &Network) -> Result<(), Fault> {
     let holds = positive(*initial_std) && initial_std > min_std;
     ensure("network.initial_std", initial_std, holds, "must exceed network.min_std")?;
     ensure("network.policy_head_scale", policy_head_scale, not_negative(*policy_head_scale), NOT_NEGATIVE)?;
-    ensure("network.latent.size", latent.size, (1..=4096).contains(&latent.size), "must be 1 to 4096")?;
+    let gated = matches!(network.low_level, LowLevelName::Mixture | LowLevelName::Product);
+    let (least, remedy) = if gated { (0, "must be at most 4096") } else { (1, "must be 1 to 4096") };
+    ensure("network.latent.size", latent.size, (least..=4096).contains(&latent.size), remedy)?;
     ensure("network.latent.beta", latent.beta, not_negative(latent.beta), NOT_NEGATIVE)?;
     ensure("network.latent.min_std", latent.min_std, positive(latent.min_std), POSITIVE)?;
     let holds = positive(latent.initial_std) && latent.initial_std > latent.min_std;
@@ -214,15 +225,17 @@ fn network(network: &Network) -> Result<(), Fault> {
     }
 }
 
-fn vmpo(vmpo: &Vmpo, batch: usize) -> Result<(), Fault> {
+fn vmpo(vmpo: &Vmpo, unroll: &Unroll) -> Result<(), Fault> {
     ensure("vmpo.discount", vmpo.discount, (0.0..1.0).contains(&vmpo.discount), "must be in [0, 1)")?;
     for (field, number) in [
         ("vmpo.epsilon_eta", vmpo.epsilon_eta),
         ("vmpo.epsilon_mean", vmpo.epsilon_mean),
         ("vmpo.epsilon_std", vmpo.epsilon_std),
+        ("vmpo.epsilon_discrete", vmpo.epsilon_discrete),
         ("vmpo.initial_temperature", vmpo.initial_temperature),
         ("vmpo.initial_alpha_mean", vmpo.initial_alpha_mean),
         ("vmpo.initial_alpha_std", vmpo.initial_alpha_std),
+        ("vmpo.initial_alpha_discrete", vmpo.initial_alpha_discrete),
     ] {
         ensure(field, number, positive(number), POSITIVE)?;
     }
@@ -230,11 +243,14 @@ fn vmpo(vmpo: &Vmpo, batch: usize) -> Result<(), Fault> {
     ensure("vmpo.top_fraction", vmpo.top_fraction, holds, "must be in (0, 1]")?;
     ensure("vmpo.target_period", vmpo.target_period, vmpo.target_period > 0, AT_LEAST_ONE)?;
     ensure("vmpo.gradient_steps", vmpo.gradient_steps, vmpo.gradient_steps > 0, AT_LEAST_ONE)?;
+    let batch = unroll.batch;
     let holds = vmpo.minibatch_unrolls > 0 && batch.is_multiple_of(vmpo.minibatch_unrolls);
     ensure("vmpo.minibatch_unrolls", vmpo.minibatch_unrolls, holds, format!("must divide unroll.batch, {batch}"))?;
     ensure("vmpo.lambda", vmpo.lambda, (0.0..=1.0).contains(&vmpo.lambda), "must be in [0, 1]")?;
     ensure("vmpo.entropy", vmpo.entropy, not_negative(vmpo.entropy), NOT_NEGATIVE)?;
-    ensure("vmpo.value_weight", vmpo.value_weight, not_negative(vmpo.value_weight), NOT_NEGATIVE)
+    ensure("vmpo.value_weight", vmpo.value_weight, not_negative(vmpo.value_weight), NOT_NEGATIVE)?;
+    let burn_in = vmpo.value_burn_in;
+    ensure("vmpo.value_burn_in", burn_in, burn_in == 0 || burn_in < unroll.length, "must be less than unroll.length")
 }
 
 fn optimiser(optimiser: &Optimiser) -> Result<(), Fault> {

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{BallCatch, Gaps, GetUp, GoToTarget, TaskName, Tracking, Walls};
+use crate::{BallCatch, Gaps, GetUp, GoToTarget, Network, TaskName, Tracking, Walls};
 
 /// A whole experiment, resolved: what is learnt, from which motion, how, and for how long.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -97,100 +97,6 @@ impl ClipSource {
 /// dm_control's named subsets of the CMU clips (`cmu_subsets.py`).
 pub const SUBSETS: [&str; 5] = ["walk_tiny", "run_jump_tiny", "get_up", "locomotion_small", "all"];
 
-/// Sizes and initial values of every network.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Network {
-    /// Hidden sizes of the reference encoder (S: 2×1024).
-    pub encoder: Vec<usize>,
-    /// A linear path from the encoder's input to its output (S: with the MLP low level).
-    pub encoder_linear_path: bool,
-    /// Hidden sizes of the MLP low level (S: 2×1024).
-    pub low_level: Vec<usize>,
-    /// Hidden sizes of the value function (S: 3×1024).
-    pub value: Vec<usize>,
-    /// Width of the learned clip embedding the value function sees (S: 30).
-    pub clip_embedding: usize,
-    /// What is left of an image, in tasks that see (D).
-    pub image_features: usize,
-    /// The latent between encoder and low level.
-    pub latent: Latent,
-    /// The policy's standard deviation before learning (D; softplus at 0 is ln 2).
-    pub initial_std: f64,
-    /// Floor of the policy's standard deviation (D).
-    pub min_std: f64,
-    /// Scale of the policy head's initial weights, relative to the other layers' (D).
-    pub policy_head_scale: f64,
-    /// Where the policy's mean starts: the middle of every joint's range, or the clips' mean pose as an action (D).
-    pub initial_pose: InitialPose,
-    /// Observations are normalised by the mean and standard deviation of the first so many steps; 0 leaves them raw (D).
-    pub normaliser_steps: u64,
-}
-
-impl Default for Network {
-    fn default() -> Self {
-        Self {
-            encoder: vec![1024, 1024],
-            encoder_linear_path: true,
-            low_level: vec![1024, 1024],
-            value: vec![1024, 1024, 1024],
-            clip_embedding: 30,
-            image_features: 64,
-            latent: Latent::default(),
-            initial_std: std::f64::consts::LN_2,
-            min_std: 1e-3,
-            policy_head_scale: 1.0,
-            initial_pose: InitialPose::MidRange,
-            normaliser_steps: 0,
-        }
-    }
-}
-
-/// Where the policy's mean starts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum InitialPose {
-    /// Action 0: the middle of every joint's range.
-    MidRange,
-    /// The mean pose of the reference clips, as an action.
-    ReferenceMean,
-}
-
-/// The stochastic latent z.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Latent {
-    /// Dimensions of z (S: 60).
-    pub size: usize,
-    /// β: strength of the KL to the prior (S: 5e-4).
-    pub beta: f64,
-    /// Floor of the encoder's standard deviation (D).
-    pub min_std: f64,
-    /// The encoder's standard deviation before learning (D).
-    pub initial_std: f64,
-    /// p(z_t | z_{t−1}).
-    pub prior: Prior,
-}
-
-impl Default for Latent {
-    fn default() -> Self {
-        Self { size: 60, beta: 5e-4, min_std: 1e-3, initial_std: std::f64::consts::LN_2, prior: Prior::Standard }
-    }
-}
-
-/// The latent's prior.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case", deny_unknown_fields)]
-pub enum Prior {
-    /// N(0, I).
-    Standard,
-    /// N(α z_{t−1}, (1 − α²) I), N(0, I) at an episode's first step (NPMP: α = 0.95).
-    Ar1 {
-        /// α.
-        alpha: f64,
-    },
-}
-
 /// V-MPO.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -201,14 +107,18 @@ pub struct Vmpo {
     pub epsilon_eta: f64,
     /// ε_μ: limit on the mean (S).
     pub epsilon_mean: f64,
-    /// ε_Σ: limit on the covariance (S: MLP, LSTM).
+    /// ε_Σ: limit on the covariance (S: MLP and LSTM; 1e-3 for mixture and product).
     pub epsilon_std: f64,
+    /// ε_discrete: limit on a mixture's weights (S).
+    pub epsilon_discrete: f64,
     /// η, α_μ, α_Σ at the start (S).
     pub initial_temperature: f64,
     /// α_μ at the start (S).
     pub initial_alpha_mean: f64,
     /// α_Σ at the start (S).
     pub initial_alpha_std: f64,
+    /// α_discrete at the start (S).
+    pub initial_alpha_discrete: f64,
     /// Share of the valid steps the E-step imitates (S: the top half).
     pub top_fraction: f64,
     /// The target network, with which actors act, is copied every so many learner steps (V).
@@ -223,6 +133,8 @@ pub struct Vmpo {
     pub entropy: f64,
     /// Weight of the value loss (D).
     pub value_weight: f64,
+    /// The first so many rows of an unroll only wake a recurrent value function and are left out of every loss (D).
+    pub value_burn_in: usize,
 }
 
 impl Default for Vmpo {
@@ -232,9 +144,11 @@ impl Default for Vmpo {
             epsilon_eta: 0.1,
             epsilon_mean: 0.1,
             epsilon_std: 1e-5,
+            epsilon_discrete: 1e-3,
             initial_temperature: 1.0,
             initial_alpha_mean: 1.0,
             initial_alpha_std: 1.0,
+            initial_alpha_discrete: 1.0,
             top_fraction: 0.5,
             target_period: 100,
             gradient_steps: 1,
@@ -242,6 +156,7 @@ impl Default for Vmpo {
             lambda: 1.0,
             entropy: 0.0,
             value_weight: 1.0,
+            value_burn_in: 0,
         }
     }
 }

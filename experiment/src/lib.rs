@@ -15,12 +15,14 @@
 mod check;
 mod document;
 mod lines;
+mod network;
 pub mod presets;
 mod resolve;
 mod spec;
 mod tasks;
 
 pub use document::*;
+pub use network::*;
 pub use resolve::{Error, resolve};
 pub use spec::*;
 pub use tasks::*;

@@ -2,7 +2,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
 
 use comic_experiment::{
-    ClipSource, Error, Experiment, InitialPose, Prior, TRACKING_OBSERVATIONS, TerminationError, presets, resolve,
+    ClipSource, Error, Experiment, InitialPose, LowLevelName, Prior, TRACKING_OBSERVATIONS, TerminationError, presets,
+    resolve,
 };
 use proptest::prelude::*;
 
@@ -43,7 +44,11 @@ fn defaults_are_the_papers() {
     assert_eq!((vmpo.initial_temperature, vmpo.initial_alpha_mean, vmpo.initial_alpha_std), (1.0, 1.0, 1.0));
     assert_eq!(vmpo.top_fraction, 0.5);
     assert_eq!((network.encoder, network.encoder_linear_path), (vec![1024, 1024], true));
-    assert_eq!((network.low_level, network.value), (vec![1024, 1024], vec![1024, 1024, 1024]));
+    assert_eq!((network.mlp.hidden, network.value), (vec![1024, 1024], vec![1024, 1024, 1024]));
+    assert_eq!((network.low_level, network.value_lstm), (LowLevelName::Mlp, vec![]));
+    assert_eq!(network.lstm.units, [384, 256]);
+    assert_eq!((network.primitives.torso, network.primitives.hidden), (vec![512, 512], 256));
+    assert_eq!((network.primitives.count, network.primitives.gate), (5, vec![400, 400]));
     assert_eq!((network.clip_embedding, network.latent.size, network.latent.beta), (30, 60, 5e-4));
     assert_eq!((tracking.reference_steps, tracking.termination_threshold), (vec![1, 2, 3, 4, 5], 0.3));
     // V-MPO: one gradient step on the whole batch, no entropy bonus, no clipping; a target network.
@@ -59,6 +64,19 @@ fn defaults_are_the_papers() {
 #[test]
 fn the_paper_preset_is_the_defaults() {
     assert_eq!(resolve("tracking-mlp", &[]).unwrap(), Experiment::default());
+}
+
+#[test]
+fn the_other_low_levels_presets_are_the_papers() {
+    let of = |preset: &str| {
+        let Experiment { vmpo, network, .. } = resolve(preset, &[]).unwrap();
+        let bottleneck = (network.latent.size, network.latent.beta, network.primitives.biases);
+        (network.low_level, vmpo.epsilon_eta, vmpo.epsilon_mean, vmpo.epsilon_std, vmpo.epsilon_discrete, bottleneck)
+    };
+    // CoMic supplement, tables 1 to 4; ε_discrete is the mixture's alone.
+    assert_eq!(of("tracking-lstm"), (LowLevelName::Lstm, 0.1, 0.1, 1e-5, 1e-3, (60, 5e-4, false)));
+    assert_eq!(of("tracking-mixture"), (LowLevelName::Mixture, 0.1, 0.1, 1e-3, 1e-3, (0, 5e-4, true)));
+    assert_eq!(of("tracking-product"), (LowLevelName::Product, 0.1, 0.1, 1e-3, 1e-3, (60, 5e-4, false)));
 }
 
 #[test]
@@ -84,7 +102,8 @@ fn neither_preset_nor_file_lists_the_presets() {
     assert!(message.starts_with("no preset or file `trackin-mlp` ("), "{message}");
     assert!(
         message.ends_with(
-            "presets are quickstart, quickstart-from-zero, tracking-mlp, go-to-target, gaps, walls, get-up, ball-catch"
+            "presets are quickstart, quickstart-from-zero, tracking-mlp, tracking-lstm, tracking-mixture, \
+             tracking-product, go-to-target, gaps, walls, get-up, ball-catch"
         ),
         "{message}"
     );

@@ -4,6 +4,7 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 use comic_experiment::{Experiment, TaskSpec};
+use comic_proto::UnrollShape;
 use serde_json::json;
 use tch::{Device, Kind, Tensor};
 
@@ -85,7 +86,7 @@ fn products(spec: &TaskSpec, experiment: &Experiment) -> Vec<Product> {
         products.push(Product::new(rows, width, output, true));
     };
     layers(steps, sensed + latent, &network.encoder, 2 * latent, false);
-    layers(steps, latent + spec.proprioception as i64, &network.low_level, 2 * spec.action as i64, true);
+    layers(steps, latent + spec.proprioception as i64, &network.mlp.hidden, 2 * spec.action as i64, true);
     let embedding = network.clip_embedding as i64;
     layers(observations, sensed + embedding, &network.value, spec.reward_terms.len() as i64, true);
     if network.encoder_linear_path {
@@ -95,17 +96,10 @@ fn products(spec: &TaskSpec, experiment: &Experiment) -> Vec<Product> {
 }
 
 fn random_minibatch(spec: &TaskSpec, experiment: &Experiment) -> Result<MinibatchTensors> {
-    let shape = MinibatchShape {
-        unrolls: experiment.unroll.batch,
-        length: experiment.unroll.length,
-        proprioception: spec.proprioception,
-        task: spec.task,
-        action: spec.action,
-        latent: experiment.network.latent.size,
-        reward_terms: spec.reward_terms.len(),
-        image: 0,
-    };
-    let (rows, observations) = (shape.unrolls * shape.length, shape.unrolls * (shape.length + 1));
+    let shape = UnrollShape::new(spec, experiment);
+    let unrolls = experiment.unroll.batch;
+    let (rows, observations) = (unrolls * shape.length, unrolls * (shape.length + 1));
+    let (components, weights) = (shape.components, if shape.components > 1 { shape.components } else { 0 });
     let random = |count: usize| {
         Vec::<f32>::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu))).context("random numbers")
     };
@@ -115,15 +109,18 @@ fn random_minibatch(spec: &TaskSpec, experiment: &Experiment) -> Result<Minibatc
         previous_latent: &random(rows * shape.latent)?,
         latent_noise: &random(rows * shape.latent)?,
         action: &random(rows * shape.action)?,
-        mean: &random(rows * shape.action)?,
-        std: &vec![0.7; rows * shape.action],
+        mean: &random(rows * components * shape.action)?,
+        std: &vec![0.7; rows * components * shape.action],
+        log_weights: &vec![-(components as f32).ln(); rows * weights],
         reward: &random(rows * shape.reward_terms)?,
         discount: &vec![1.0; rows],
         valid: &vec![1.0; rows],
         first: &vec![0.0; observations],
+        state: &vec![0.0; unrolls * shape.state],
         clip: &vec![0; observations],
         image: &[],
     };
+    let shape = MinibatchShape { unrolls, unroll: shape };
     Ok(MinibatchTensors::new(&source, &shape, Device::Cpu)?)
 }
 

@@ -8,8 +8,8 @@ use anyhow::{Context as _, Result, bail};
 use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_networks::{NormaliserStatistics, to_safetensors};
+use comic_proto::Field;
 use comic_proto::v1::Behaviour;
-use comic_proto::{Field, UnrollShape};
 use comic_replay::{Batch, Batcher, Next, Phase, Reason};
 use rand::SeedableRng as _;
 use rand::seq::SliceRandom as _;
@@ -241,9 +241,7 @@ impl Trainer {
 
     /// The batch on the device, `[B, T(+1), …]`.
     pub(crate) fn tensors(&self, batch: &Batch) -> Result<MinibatchTensors> {
-        let UnrollShape { length, proprioception, task, action, latent, reward_terms, image } = *batch.layout.shape();
-        let unrolls = batch.unrolls;
-        let shape = MinibatchShape { unrolls, length, proprioception, task, action, latent, reward_terms, image };
+        let shape = MinibatchShape { unrolls: batch.unrolls, unroll: *batch.layout.shape() };
         let source = MinibatchSource {
             proprioception: batch.f32(Field::Proprioception),
             task: batch.f32(Field::Task),
@@ -252,10 +250,12 @@ impl Trainer {
             action: batch.f32(Field::Action),
             mean: batch.f32(Field::Mean),
             std: batch.f32(Field::Std),
+            log_weights: batch.f32(Field::LogWeights),
             reward: batch.f32(Field::Reward),
             discount: batch.f32(Field::Discount),
             valid: batch.f32(Field::Valid),
             first: batch.f32(Field::First),
+            state: batch.f32(Field::State),
             clip: batch.clip(),
             image: batch.image(),
         };

@@ -23,7 +23,7 @@ const UPDATES: u64 = 6;
 fn experiment(updates: u64) -> Experiment {
     let mut overrides: Vec<String> = [
         "network.encoder=[16]",
-        "network.low_level=[16]",
+        "network.mlp.hidden=[16]",
         "network.value=[16]",
         "network.latent.size=4",
         "network.normaliser_steps=100",

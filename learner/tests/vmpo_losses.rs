@@ -6,7 +6,8 @@ use comic_learner::vmpo::{Evidence, Improvement, Limits, Multipliers, masked_mea
 use proptest::prelude::*;
 use tch::{Device, Kind, Tensor};
 
-const LIMITS: Limits = Limits { epsilon_eta: 0.1, epsilon_mean: 0.2, epsilon_std: 0.3, top_fraction: 0.5 };
+const LIMITS: Limits =
+    Limits { epsilon_eta: 0.1, epsilon_mean: 0.2, epsilon_std: 0.3, epsilon_discrete: 0.4, top_fraction: 0.5 };
 
 /// Four steps, all valid unless said otherwise, whose every tensor can be differentiated.
 struct Case {
@@ -29,7 +30,7 @@ impl Case {
             kl_mean: learnt(&numbers * 0.1),
             kl_std: learnt(&numbers * 0.2),
             valid: Tensor::ones([steps], (Kind::Float, Device::Cpu)),
-            multipliers: Multipliers::new(1.0, 2.0, 3.0, Device::Cpu),
+            multipliers: Multipliers::new(&[1.0, 2.0, 3.0], Device::Cpu),
         }
     }
 
@@ -44,6 +45,7 @@ impl Case {
             advantage: &self.advantage,
             kl_mean: &self.kl_mean,
             kl_std: &self.kl_std,
+            kl_weights: None,
             valid: &self.valid,
         };
         policy_improvement(&evidence, &self.multipliers, &LIMITS)
@@ -148,7 +150,7 @@ fn masked_steps_may_hold_anything() {
 #[test]
 fn large_advantages_and_tiny_temperatures_do_not_overflow() {
     let mut case = Case::new(&[2000.0, 1999.0, -2000.0, -1e4]);
-    case.multipliers = Multipliers::new(1e-8, 1.0, 1.0, Device::Cpu);
+    case.multipliers = Multipliers::new(&[1e-8, 1.0, 1.0], Device::Cpu);
     let losses = case.losses();
     assert!(number(&losses.total()).is_finite());
     assert!(case.gradient(&losses.total(), case.multipliers.parameter()).iter().all(|value| value.is_finite()));

@@ -1,5 +1,6 @@
 //! The building blocks that encoder, low level and value share.
 
+use comic_experiment::Network;
 use tch::{Tensor, nn};
 
 use crate::DiagonalGaussian;
@@ -18,8 +19,10 @@ pub(crate) fn linear(path: &nn::Path, input: i64, output: i64, scale: f64) -> nn
 
 /// `[.., D]` as rows `[N, D]`.
 pub(crate) fn rows(tensor: &Tensor) -> Tensor {
-    let width = tensor.size().last().copied().unwrap_or(1);
-    tensor.reshape([-1, width])
+    let size = tensor.size();
+    let Some((width, leading)) = size.split_last() else { return tensor.reshape([1, 1]) };
+    // Not −1, which cannot be told where the width is 0.
+    tensor.reshape([leading.iter().product(), *width])
 }
 
 /// Hidden layers: Linear → LayerNorm → tanh first, then Linear → ELU.
@@ -82,6 +85,19 @@ pub(crate) struct GaussianHeadConfig<'a> {
     pub(crate) linear_path: Option<i64>,
 }
 
+impl<'a> GaussianHeadConfig<'a> {
+    /// For actions whose mean starts at `pose`.
+    pub(crate) fn of_actions(pose: &'a [f32], network: &Network) -> Self {
+        Self {
+            mean: pose,
+            initial_std: network.initial_std,
+            min_std: network.min_std,
+            scale: network.policy_head_scale,
+            linear_path: None,
+        }
+    }
+}
+
 /// One linear layer whose outputs are the mean and the raw standard deviation, side by side:
 /// σ = min_std + softplus(raw). The raw half's bias starts at the c for which σ = initial_std.
 #[derive(Debug)]
@@ -120,7 +136,7 @@ impl GaussianHead {
 }
 
 /// softplus⁻¹ for positive `y`: y + ln(1 − e^{−y}).
-fn inverse_softplus(y: f64) -> f64 {
+pub(crate) fn inverse_softplus(y: f64) -> f64 {
     y + (-(-y).exp_m1()).ln()
 }
 
@@ -129,7 +145,7 @@ mod tests {
     use super::inverse_softplus;
 
     #[test]
-    fn inverse_softplus_undoes_softplus_from_tiny_to_large() {
+    pub(crate) fn inverse_softplus_undoes_softplus_from_tiny_to_large() {
         for y in [1e-6, 0.05, std::f64::consts::LN_2, 3.0, 50.0, 1000.0] {
             let raw = inverse_softplus(y);
             let softplus = if raw > 30.0 { raw } else { raw.exp().ln_1p() };

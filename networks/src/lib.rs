@@ -1,10 +1,12 @@
 //! The networks: what acts and what learns are the same functions, inside `tch::no_grad` or with gradient.
 //!
 //! # Layout
-//! - [`Policy`] is everything acting needs: normaliser, reference encoder, MLP low level. Its parameters travel.
+//! - [`Policy`] is everything acting needs: normaliser, reference encoder, low level. Its parameters travel.
+//! - The low level is one of several, a file each (`low_level`): MLP, LSTM, mixture and product of primitives.
 //! - An image, where the task has one, becomes a few numbers beside the task observation, for policy and value alike.
 //! - [`Value`] is what only the learner needs. It lives in a parameter store of its own.
-//! - [`DiagonalGaussian`] is the one distribution: actions and latents.
+//! - [`ActionDistribution`] is what a policy acts by, one Gaussian or a mixture; [`DiagonalGaussian`] is what it and the
+//!   latent are made of.
 //! - [`to_safetensors`] and [`from_safetensors`] carry a parameter store over a wire or onto a disk.
 //!
 //! Every network takes rows: `[N, ·]` float32 tensors, where a learner's N is unrolls × steps.
@@ -14,17 +16,23 @@
 //! Initial weights are uniform in ±1/√fan_in (variance scaling with scale ⅓) and biases 0 unless said otherwise.
 //! They come from libtorch's generator: call `tch::manual_seed` first to make them reproducible.
 
+mod action;
+mod encoder;
 mod error;
 mod gaussian;
 mod layers;
+mod low_level;
+mod lstm;
 mod normaliser;
 mod parameters;
 mod policy;
 mod sight;
 mod value;
 
+pub use action::ActionDistribution;
 pub use error::Error;
 pub use gaussian::DiagonalGaussian;
+pub use lstm::Memory;
 pub use normaliser::{NORMALISED_LIMIT, NORMALISER_MIN_STD, NormalisedObservation, NormaliserStatistics};
 pub use parameters::{from_safetensors, to_safetensors};
 pub use policy::{Acting, Policy};

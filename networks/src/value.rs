@@ -1,18 +1,21 @@
 //! The value function.
 
 use comic_experiment::{Network, TaskSpec};
-use tch::{Tensor, nn};
+use tch::{Kind, Tensor, nn};
 
 use crate::NormalisedObservation;
 use crate::layers::{Torso, linear, rows};
+use crate::lstm::{LstmStack, Memory};
 
-/// V(x_t, s_t, clip): `[x, s, clip embedding]` → torso → one output per reward term (CoMic supplement).
+/// V(x_t, s_t, clip): `[x, s, clip embedding]` → torso → one output per reward term (CoMic supplement). A recurrent one
+/// has LSTM layers after the torso, which begin empty at an unroll's first row and are emptied where an episode begins.
 ///
 /// The clip embedding is learned; its entries start as N(0, 1/width), so a row's length is about 1.
 #[derive(Debug)]
 pub struct Value {
     embedding: Tensor,
     torso: Torso,
+    lstm: Option<LstmStack>,
     head: nn::Linear,
 }
 
@@ -25,16 +28,25 @@ impl Value {
         let seen = if spec.image > 0 { config.image_features } else { 0 };
         let input = (spec.task + seen + spec.proprioception) as i64 + width;
         let torso = Torso::new(store, input, &config.value);
-        let head = linear(&(store / "head"), torso.output(), spec.reward_terms.len() as i64, 1.0);
+        let lstm = (!config.value_lstm.is_empty()).then(|| LstmStack::new(store, torso.output(), &config.value_lstm));
+        let hidden = lstm.as_ref().map_or(torso.output(), LstmStack::output);
+        let head = linear(&(store / "head"), hidden, spec.reward_terms.len() as i64, 1.0);
         let embedding = store.var("clip_embedding", &[clips, width], nn::Init::Randn { mean: 0.0, stdev });
-        Self { embedding, torso, head }
+        Self { embedding, torso, lstm, head }
     }
 
-    /// Observations `[.., P]`, `[.., X]` and the clips' indices, `[..]` int64 below the number of clips; one row each
-    /// out, `[N, R]`.
-    pub fn forward(&self, observation: &NormalisedObservation, clip: &Tensor) -> Tensor {
-        let clip = Tensor::embedding(&self.embedding, clip, -1, false, false);
-        let input = rows(&Tensor::cat(&[&observation.task, &observation.proprioception, &clip], -1));
-        self.torso.forward(&input).apply(&self.head)
+    /// Observations `[B, T, P]`, `[B, T, X]`, the clips' indices, `[B, T]` int64 below the number of clips, and where
+    /// episodes begin, `[B, T]`; `[B, T, R]` out.
+    pub fn forward(&self, observation: &NormalisedObservation, clip: &Tensor, first: &Tensor) -> Tensor {
+        let embedded = Tensor::embedding(&self.embedding, clip, -1, false, false);
+        let input = rows(&Tensor::cat(&[&observation.task, &observation.proprioception, &embedded], -1));
+        let (unrolls, steps) = (clip.size()[0], clip.size()[1]);
+        let mut hidden = self.torso.forward(&input);
+        if let Some(lstm) = &self.lstm {
+            let state = Tensor::zeros([unrolls, lstm.state_size()], (Kind::Float, hidden.device()));
+            let memory = Memory { state: &state, first: Some(first) };
+            hidden = lstm.forward(&hidden.reshape([unrolls, steps, -1]), memory).0.flatten(0, 1);
+        }
+        hidden.apply(&self.head).reshape([unrolls, steps, -1])
     }
 }

@@ -4,7 +4,7 @@
 
 use std::collections::HashMap;
 
-use comic_experiment::{Network, TaskSpec};
+use comic_experiment::{Mlp, Network, TaskSpec};
 use comic_networks::{Error, Policy, from_safetensors, to_safetensors};
 use proptest::prelude::*;
 use safetensors::tensor::{Dtype, TensorView};
@@ -20,7 +20,8 @@ fn store() -> nn::VarStore {
         image: 0,
         clips: vec!["x".into()],
     };
-    let mut network = Network { encoder: vec![8], low_level: vec![8], normaliser_steps: 1, ..Network::default() };
+    let mut network =
+        Network { encoder: vec![8], mlp: Mlp { hidden: vec![8] }, normaliser_steps: 1, ..Network::default() };
     network.latent.size = 2;
     let store = nn::VarStore::new(Device::Cpu);
     Policy::new(&store.root(), &spec, &network, &[0.0; 2]).unwrap();

@@ -2,8 +2,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
-use comic_experiment::{Network, TaskSpec};
-use comic_networks::{Error, NORMALISED_LIMIT, NormaliserStatistics, Policy, Value};
+use comic_experiment::{Mlp, Network, TaskSpec};
+use comic_networks::{
+    DiagonalGaussian, Error, Memory, NORMALISED_LIMIT, NormalisedObservation, NormaliserStatistics, Policy, Value,
+};
 use tch::{Device, Kind, Tensor, nn};
 
 const ROWS: i64 = 24;
@@ -21,7 +23,8 @@ fn spec() -> TaskSpec {
 }
 
 fn network() -> Network {
-    let mut network = Network { encoder: vec![16, 16], low_level: vec![16], value: vec![16, 16], ..Network::default() };
+    let mut network =
+        Network { encoder: vec![16, 16], mlp: Mlp { hidden: vec![16] }, value: vec![16, 16], ..Network::default() };
     network.latent.size = 5;
     network
 }
@@ -44,9 +47,25 @@ fn inputs() -> [Tensor; 4] {
     })
 }
 
-fn act(policy: &Policy) -> comic_networks::Acting {
+/// Acts without memory; `B` rows, or unrolls of rows.
+fn pass(policy: &Policy, observation: &NormalisedObservation, previous: &Tensor, noise: &Tensor) -> Pass {
+    let state = Tensor::zeros([previous.size()[0], 0], (Kind::Float, Device::Cpu));
+    let acting = policy.act(observation, previous, noise, Memory { state: &state, first: None });
+    let (mean, std, log_weights) = acting.action.to_rows();
+    assert!(log_weights.is_none());
+    Pass { latent: acting.latent, posterior: acting.latent_posterior.unwrap(), action: DiagonalGaussian { mean, std } }
+}
+
+/// What the MLP gives: one Gaussian, and a latent.
+struct Pass {
+    latent: Tensor,
+    posterior: DiagonalGaussian,
+    action: DiagonalGaussian,
+}
+
+fn act(policy: &Policy) -> Pass {
     let [proprioception, task, previous, noise] = inputs();
-    policy.act(&proprioception, &task, None, &previous, &noise)
+    pass(policy, &policy.normalise(&proprioception, &task, None), &previous, &noise)
 }
 
 #[test]
@@ -66,7 +85,7 @@ fn rows_of_an_unroll_are_the_same_rows() {
     let [proprioception, task, previous, noise] = inputs();
     let unrolled = |tensor: &Tensor| tensor.reshape([4, 6, -1]);
     let observation = policy.normalise(&unrolled(&proprioception), &unrolled(&task), None);
-    let acting = policy.act_normalised(&observation, &unrolled(&previous), &unrolled(&noise));
+    let acting = pass(&policy, &observation, &unrolled(&previous), &unrolled(&noise));
     assert_eq!(acting.action.mean, act(&policy).action.mean);
 }
 
@@ -75,7 +94,7 @@ fn the_latent_is_its_mean_plus_its_deviation_times_the_noise() {
     let (_store, policy) = policy(&network(), 1, &[0.0; 3]);
     let acting = act(&policy);
     let [.., noise] = inputs();
-    let expected = &acting.latent_posterior.mean + &acting.latent_posterior.std * noise;
+    let expected = &acting.posterior.mean + &acting.posterior.std * noise;
     assert!(acting.latent.allclose(&expected, 1e-6, 1e-6, false));
 }
 
@@ -102,7 +121,7 @@ fn the_mean_starts_at_the_pose_and_both_deviations_at_their_initial_values() {
     // The encoder's head is not scaled down; without its weights the latent's deviation is the initial one too.
     let mut weights = store.variables().remove("encoder.head.weight").unwrap();
     let _ = tch::no_grad(|| weights.zero_());
-    assert!((act(&policy).latent_posterior.std - 0.3).abs().max().double_value(&[]) < 1e-6);
+    assert!((act(&policy).posterior.std - 0.3).abs().max().double_value(&[]) < 1e-6);
     store.freeze();
 }
 
@@ -150,7 +169,7 @@ fn the_normaliser_travels_is_not_trained_and_clamps() {
     let [_, task, previous, noise] = inputs();
     let far = |value: f64| {
         let proprioception = Tensor::full([ROWS, 7], value, (Kind::Float, Device::Cpu));
-        policy.act(&proprioception, &task, None, &previous, &noise).action.mean
+        pass(&policy, &policy.normalise(&proprioception, &task, None), &previous, &noise).action.mean
     };
     const { assert!(NORMALISED_LIMIT < 1e3) };
     assert_eq!(far(1e3), far(1e6));
@@ -181,9 +200,13 @@ fn the_value_has_one_output_per_reward_term_and_sees_the_clip() {
     let store = nn::VarStore::new(Device::Cpu);
     let value = Value::new(&store.root(), &spec(), &network());
     let [proprioception, task, ..] = inputs();
-    let observation = policy.normalise(&proprioception, &task, None);
-    let of = |clip: i64| value.forward(&observation, &Tensor::full([ROWS], clip, (Kind::Int64, Device::Cpu)));
-    assert_eq!(of(0).size(), [ROWS, 2]);
+    let unrolled = |tensor: &Tensor| tensor.reshape([4, 6, -1]);
+    let observation = policy.normalise(&unrolled(&proprioception), &unrolled(&task), None);
+    let of = |clip: i64| {
+        let clip = Tensor::full([4, 6], clip, (Kind::Int64, Device::Cpu));
+        value.forward(&observation, &clip, &clip.zeros_like().to_kind(Kind::Float))
+    };
+    assert_eq!(of(0).size(), [4, 6, 2]);
     assert_ne!(of(0), of(2));
 }
 
@@ -202,7 +225,7 @@ fn what_is_seen_changes_what_is_done_and_is_learnt_from() {
     let image = |grey: i64| Tensor::full([rows, 64 * 64 * 3], grey, (Kind::Uint8, Device::Cpu));
     let latent = |grey| {
         let image = image(grey);
-        policy.act(&zeros(7), &zeros(11), Some(&image), &zeros(5), &zeros(5)).latent_posterior.mean
+        pass(&policy, &policy.normalise(&zeros(7), &zeros(11), Some(&image)), &zeros(5), &zeros(5)).posterior.mean
     };
     let (dark, bright) = (latent(0), latent(255));
     assert!((&dark - &bright).abs().max().double_value(&[]) > 1e-3);
@@ -229,7 +252,7 @@ fn an_image_is_seen_alike_in_a_batch_of_unrolls_and_as_a_row() {
         let zeros = |width: i64| Tensor::zeros(shape(width), (Kind::Float, Device::Cpu));
         let image = image.reshape(shape(64 * 64 * 3));
         let observation = policy.normalise(&zeros(7), &zeros(11), Some(&image));
-        policy.act_normalised(&observation, &zeros(5), &zeros(5)).latent_posterior.mean
+        pass(&policy, &observation, &zeros(5), &zeros(5)).posterior.mean
     };
     assert_eq!(acted(&[1]), acted(&[1, 1]));
 }

@@ -14,7 +14,8 @@ pub struct UnrollBuffer {
 }
 
 impl UnrollBuffer {
-    /// An unroll of zeros, except that standard deviations are 1, so that a row nobody acts in is valid as it stands.
+    /// An unroll of zeros, except that standard deviations are 1 and components weigh the same, so that a row nobody acts
+    /// in is valid as it stands.
     pub fn new(layout: &UnrollLayout) -> Self {
         let mut buffer = Self { layout: layout.clone(), words: vec![0; layout.size() / size_of::<u32>()] };
         buffer.clear();
@@ -26,6 +27,9 @@ impl UnrollBuffer {
         self.words.fill(0);
         let std = self.words(Field::Std);
         self.words[std].fill(1.0f32.to_bits());
+        let weights = self.words(Field::LogWeights);
+        let even = -(self.layout.shape().components as f32).ln();
+        self.words[weights].fill(even.to_bits());
     }
 
     /// The layout it follows.

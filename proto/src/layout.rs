@@ -30,6 +30,10 @@ pub struct UnrollShape {
     pub reward_terms: usize,
     /// I: bytes of an image, a multiple of 4; 0 when the humanoid is blind.
     pub image: usize,
+    /// K: Gaussians that the behaviour policy's distribution is a mixture of.
+    pub components: usize,
+    /// S: numbers that the policy remembers from step to step; 0 when it remembers nothing.
+    pub state: usize,
 }
 
 impl UnrollShape {
@@ -44,6 +48,8 @@ impl UnrollShape {
             reward_terms: spec.reward_terms.len(),
             // Whole words keep every row aligned.
             image: spec.image.next_multiple_of(ELEMENT),
+            components: experiment.network.components(),
+            state: experiment.network.state_size(),
         }
     }
 }
@@ -61,10 +67,12 @@ pub enum Field {
     LatentNoise,
     /// `[T, A]` f32: the action as sampled, not clipped.
     Action,
-    /// `[T, A]` f32: mean of the behaviour policy.
+    /// `[T, K·A]` f32: mean of each component of the behaviour policy.
     Mean,
-    /// `[T, A]` f32, positive: standard deviation of the behaviour policy.
+    /// `[T, K·A]` f32, positive: standard deviation of each component of the behaviour policy.
     Std,
+    /// `[T, K]` f32: ln of the components' weights, which add up to 1; absent where there is one component.
+    LogWeights,
     /// `[T, R]` f32: one column for each reward term.
     Reward,
     /// `[T]` f32 in [0, 1]: 0 where the step terminated the episode, 1 elsewhere.
@@ -73,6 +81,8 @@ pub enum Field {
     Valid,
     /// `[T+1]` f32, 1 or 0: whether the row is an episode's first observation.
     First,
+    /// `[1, S]` f32: what the policy remembers when it meets the first observation.
+    State,
     /// `[T+1]` u32: the clip's index.
     Clip,
     /// `[T+1, I]` u8: what the humanoid sees, rows from the top, red, green, blue.
@@ -81,7 +91,7 @@ pub enum Field {
 
 impl Field {
     /// Every field, in payload order.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 15] = [
         Self::Proprioception,
         Self::Task,
         Self::PreviousLatent,
@@ -89,10 +99,12 @@ impl Field {
         Self::Action,
         Self::Mean,
         Self::Std,
+        Self::LogWeights,
         Self::Reward,
         Self::Discount,
         Self::Valid,
         Self::First,
+        Self::State,
         Self::Clip,
         Self::Image,
     ];
@@ -107,10 +119,12 @@ impl Field {
             Self::Action => "action",
             Self::Mean => "mean",
             Self::Std => "std",
+            Self::LogWeights => "log_weights",
             Self::Reward => "reward",
             Self::Discount => "discount",
             Self::Valid => "valid",
             Self::First => "first",
+            Self::State => "state",
             Self::Clip => "clip",
             Self::Image => "image",
         }
@@ -119,6 +133,7 @@ impl Field {
     fn rows(self, length: usize) -> usize {
         match self {
             Self::Proprioception | Self::Task | Self::First | Self::Clip | Self::Image => length.saturating_add(1),
+            Self::State => 1,
             _ => length,
         }
     }
@@ -128,7 +143,11 @@ impl Field {
             Self::Proprioception => shape.proprioception,
             Self::Task => shape.task,
             Self::PreviousLatent | Self::LatentNoise => shape.latent,
-            Self::Action | Self::Mean | Self::Std => shape.action,
+            Self::Action => shape.action,
+            Self::Mean | Self::Std => shape.components.saturating_mul(shape.action),
+            Self::LogWeights if shape.components > 1 => shape.components,
+            Self::LogWeights => 0,
+            Self::State => shape.state,
             Self::Reward => shape.reward_terms,
             Self::Discount | Self::Valid | Self::First | Self::Clip => 1,
             Self::Image => shape.image,
@@ -167,7 +186,7 @@ impl UnrollLayout {
     /// The layout of unrolls of this shape.
     pub fn new(shape: UnrollShape) -> Self {
         let mut ranges = [(0, 0); Field::ALL.len()];
-        let mut description = format!("comic unroll layout 2, little-endian, T={}\n", shape.length);
+        let mut description = format!("comic unroll layout 3, little-endian, T={}\n", shape.length);
         let mut start = 0usize;
         for (range, field) in ranges.iter_mut().zip(Field::ALL) {
             let (rows, width) = (field.rows(shape.length), field.width(&shape));
@@ -206,7 +225,7 @@ impl UnrollLayout {
         field.width(&self.shape)
     }
 
-    /// Rows: T or T + 1.
+    /// Rows: T, T + 1 or 1.
     pub fn rows(&self, field: Field) -> usize {
         field.rows(self.shape.length)
     }

@@ -83,6 +83,14 @@ pub enum Invalid {
         /// What is allowed.
         expected: &'static str,
     },
+    /// A mixture's weights that do not add up to 1.
+    #[error("the weights of row {row} add up to {sum}, expected 1")]
+    Weights {
+        /// The row.
+        row: usize,
+        /// Their sum.
+        sum: f32,
+    },
     /// An episode's end and the next one's beginning do not match.
     #[error("valid[{row}] and first[{next}] contradict each other: an episode begins exactly after a row without a transition", next = row + 1)]
     Boundary {
@@ -119,6 +127,8 @@ pub enum Invalid {
 const LARGEST_OBSERVATION: f32 = 1e10;
 /// No squared ratio of two of these overflows a float32 where the deviation is at least [`SMALLEST_STD`].
 const LARGEST_NUMBER: f32 = 1e6;
+/// Float32 sums of a softmax are this close to 1, and closer.
+const WEIGHTS_TOLERANCE: f32 = 1e-3;
 /// The least standard deviation an experiment may ask for.
 const SMALLEST_STD: f32 = 1e-6;
 
@@ -146,7 +156,9 @@ pub fn validate(
         (Field::LatentNoise, LARGEST_NUMBER, "within ±1e6"),
         (Field::Action, LARGEST_NUMBER, "within ±1e6"),
         (Field::Mean, LARGEST_NUMBER, "within ±1e6"),
+        (Field::LogWeights, LARGEST_NUMBER, "within ±1e6"),
         (Field::Reward, LARGEST_NUMBER, "within ±1e6"),
+        (Field::State, LARGEST_NUMBER, "within ±1e6"),
     ] {
         check_range(layout, payload, field, expected, |value| value.abs() <= limit)?;
     }
@@ -154,6 +166,7 @@ pub fn validate(
     check_range(layout, payload, Field::Discount, "0 to 1", |value| (0.0..=1.0).contains(&value))?;
     check_range(layout, payload, Field::Valid, "0 or 1", |value| value == 0.0 || value == 1.0)?;
     check_range(layout, payload, Field::First, "0 or 1", |value| value == 0.0 || value == 1.0)?;
+    check_weights(layout, payload)?;
     check_boundaries(layout, payload)?;
     check_clips(layout, payload, expected.clips)
 }
@@ -232,6 +245,18 @@ fn check_range(
         let value = f32::from_bits(word);
         if !allowed(value) {
             return Err(Invalid::Range { field: name, row: place / layout.width(name).max(1), value, expected });
+        }
+    }
+    Ok(())
+}
+
+fn check_weights(layout: &UnrollLayout, payload: &[u8]) -> Result<(), Invalid> {
+    let components = layout.width(Field::LogWeights);
+    let logarithms: Vec<f32> = field(layout, payload, Field::LogWeights).map(f32::from_bits).collect();
+    for (row, weights) in logarithms.chunks_exact(components.max(1)).enumerate() {
+        let sum: f32 = weights.iter().map(|weight| weight.exp()).sum();
+        if (sum - 1.0).abs() > WEIGHTS_TOLERANCE {
+            return Err(Invalid::Weights { row, sum });
         }
     }
     Ok(())

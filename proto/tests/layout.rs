@@ -2,13 +2,13 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use comic_experiment::{Experiment, TaskSpec, Tracking};
+use comic_experiment::{Experiment, LowLevelName, TaskSpec, Tracking};
 use comic_proto::{Field, UnrollLayout, UnrollShape};
 use proptest::prelude::*;
 
 fn shape() -> impl Strategy<Value = UnrollShape> {
-    (1usize..40, 1usize..300, 1usize..1200, 1usize..60, 1usize..70, 1usize..8).prop_map(
-        |(length, proprioception, task, action, latent, reward_terms)| UnrollShape {
+    (1usize..40, 1usize..300, 1usize..1200, 1usize..60, 0usize..70, 1usize..8, 1usize..7, 0usize..90).prop_map(
+        |(length, proprioception, task, action, latent, reward_terms, components, state)| UnrollShape {
             length,
             proprioception,
             task,
@@ -16,6 +16,8 @@ fn shape() -> impl Strategy<Value = UnrollShape> {
             latent,
             reward_terms,
             image: 0,
+            components,
+            state,
         },
     )
 }
@@ -31,6 +33,7 @@ fn the_paper_s_unroll_has_the_shapes_of_experiment_and_task() {
     assert_eq!(dimensions(Field::PreviousLatent), (32, 60));
     assert_eq!(dimensions(Field::LatentNoise), (32, 60));
     assert_eq!([Field::Action, Field::Mean, Field::Std].map(dimensions), [(32, 56); 3]);
+    assert_eq!([Field::LogWeights, Field::State].map(|field| layout.elements(field)), [0, 0]);
     assert_eq!(dimensions(Field::Reward), (32, 5));
     assert_eq!([Field::Discount, Field::Valid].map(dimensions), [(32, 1); 2]);
     assert_eq!([Field::First, Field::Clip].map(dimensions), [(33, 1); 2]);
@@ -38,9 +41,34 @@ fn the_paper_s_unroll_has_the_shapes_of_experiment_and_task() {
 
 #[test]
 fn the_hash_is_the_same_on_every_machine_and_in_every_build() {
-    let shape = UnrollShape { length: 2, proprioception: 3, task: 4, action: 5, latent: 6, reward_terms: 7, image: 0 };
+    let shape = UnrollShape {
+        length: 2,
+        proprioception: 3,
+        task: 4,
+        action: 5,
+        latent: 6,
+        reward_terms: 7,
+        image: 0,
+        components: 3,
+        state: 9,
+    };
     let hash: String = UnrollLayout::new(shape).hash().iter().map(|byte| format!("{byte:02x}")).collect();
-    assert_eq!(hash, "09de3cc8f84ee5039192252b3ba87ee548ea7c2c7066183d33344c4ed6f0ed4a");
+    assert_eq!(hash, "f75490a1d054879dc7fd0d707c74c54b18eb452a9e839e0c4c36c5f3e07090b0");
+}
+
+#[test]
+fn a_mixture_carries_its_components_and_an_lstm_its_memory() {
+    let spec = TaskSpec { action: 56, ..TaskSpec::default() };
+    let mut experiment = Experiment::default();
+    experiment.network.low_level = LowLevelName::Mixture;
+    let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
+    assert_eq!([Field::Mean, Field::Std].map(|field| layout.width(field)), [5 * 56; 2]);
+    assert_eq!([Field::Action, Field::LogWeights, Field::State].map(|field| layout.width(field)), [56, 5, 0]);
+    experiment.network.low_level = LowLevelName::Lstm;
+    let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
+    // A hidden and a cell state of 384 and 256 units.
+    assert_eq!((layout.rows(Field::State), layout.width(Field::State)), (1, 2 * (384 + 256)));
+    assert_eq!([Field::Mean, Field::LogWeights].map(|field| layout.width(field)), [56, 0]);
 }
 
 proptest! {
@@ -60,7 +88,7 @@ proptest! {
     }
 
     #[test]
-    fn the_hash_changes_with_any_dimension(shape in shape(), which in 0usize..6, more in 1usize..50) {
+    fn the_hash_changes_with_any_dimension(shape in shape(), which in 0usize..8, more in 1usize..50) {
         let mut other = shape;
         *[
             &mut other.length,
@@ -69,6 +97,8 @@ proptest! {
             &mut other.action,
             &mut other.latent,
             &mut other.reward_terms,
+            &mut other.components,
+            &mut other.state,
         ].into_iter().nth(which).unwrap() += more;
         prop_assert_ne!(UnrollLayout::new(shape).hash(), UnrollLayout::new(other).hash());
         prop_assert_eq!(UnrollLayout::new(shape).hash(), UnrollLayout::new(shape).hash());
@@ -77,7 +107,8 @@ proptest! {
     #[test]
     fn dimensions_beyond_any_memory_do_not_overflow(length in any::<usize>(), width in any::<usize>()) {
         let shape = UnrollShape {
-            length, proprioception: width, task: width, action: width, latent: width, reward_terms: width, image: 0,
+            length, proprioception: width, task: width, action: width, latent: width, reward_terms: width, image: 0, components: width,
+            state: width,
         };
         let layout = UnrollLayout::new(shape);
         prop_assert!(layout.message_limit() >= layout.size());

@@ -14,6 +14,8 @@ fn layout() -> UnrollLayout {
         latent: 4,
         reward_terms: 3,
         image: 0,
+        components: 2,
+        state: 3,
     })
 }
 
@@ -59,7 +61,8 @@ fn a_cleared_buffer_is_a_new_one() {
     unroll.set_clip(2, 9);
     unroll.clear();
     assert_eq!(unroll.to_bytes(), UnrollBuffer::new(&layout).to_bytes());
-    assert_eq!(unroll.row(Field::Std, 2), [1.0, 1.0]);
+    assert_eq!(unroll.row(Field::Std, 2), [1.0; 4]);
+    assert_eq!(unroll.row(Field::LogWeights, 2), [-(2f32.ln()); 2]);
 }
 
 proptest! {

@@ -18,6 +18,8 @@ fn layout() -> UnrollLayout {
         latent: 2,
         reward_terms: 2,
         image: 0,
+        components: 3,
+        state: 2,
     })
 }
 
@@ -151,6 +153,20 @@ fn each_field_keeps_to_its_range() {
         );
         assert!(expected, "{name} = {number}: {refused:?}");
     }
+}
+
+#[test]
+fn the_weights_of_a_mixture_add_up_to_one() {
+    let weights = |weights: [f32; 3]| {
+        payload_refusal(|unroll| unroll.row_mut(Field::LogWeights, 2).copy_from_slice(&weights.map(f32::ln)))
+    };
+    assert_eq!(weights([0.2, 0.3, 0.5]), None);
+    assert!(matches!(weights([0.2, 0.3, 0.6]), Some(Invalid::Weights { row: 2, .. })));
+    // A weight of zero has no finite logarithm; one that float32 rounds to zero has.
+    assert_eq!(
+        payload_refusal(|unroll| unroll.row_mut(Field::LogWeights, 0).copy_from_slice(&[0.0, -200.0, -1e5])),
+        None
+    );
 }
 
 #[test]

@@ -25,7 +25,7 @@ const SMALL: [&str; 32] = [
     "--set",
     "network.encoder=[32]",
     "--set",
-    "network.low_level=[32]",
+    "network.mlp.hidden=[32]",
     "--set",
     "network.value=[32]",
     "--set",

@@ -13,6 +13,7 @@ use comic_tasks::{Simulated, Task};
 use super::delivery::deliver;
 use super::{Audience, Evaluated, Options, Report, evaluate};
 use crate::Error;
+use crate::acting::ActingSizes;
 use crate::checkpoint::{self, Checkpoint, Position};
 use crate::policy::TorchPolicy;
 use crate::render::encode::Format;
@@ -122,13 +123,13 @@ impl Evaluate {
             seed: self.seed,
             ..Options::default()
         };
-        let latent = experiment.network.latent.size;
+        let sizes = ActingSizes::new(task.spec(), &experiment);
         let mut policy = self.policy(&experiment, task.as_ref(), own.as_ref(), parameters.as_deref())?;
         let mut evaluated = policy.as_mut().map_or(Evaluated::Servo, Evaluated::Policy);
         let recorder =
             self.video.as_ref().map(|out| Recorder::new(&self.look, out, task.control_timestep())).transpose()?;
         let mut follower = Follower { recorder };
-        let report = evaluate(&mut evaluated, &task, latent, &options, &mut follower)?;
+        let report = evaluate(&mut evaluated, &task, sizes, &options, &mut follower)?;
         follower.recorder.map(Recorder::finish).transpose()?;
         Ok(report)
     }

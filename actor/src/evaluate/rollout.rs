@@ -8,7 +8,7 @@ use rand_pcg::Pcg64;
 
 use super::{Finished, Options};
 use crate::Error;
-use crate::acting::{ActingBatch, ActingSizes, ForwardPass, clip_action, sample_action};
+use crate::acting::{ActingBatch, ActingSizes, ForwardPass, clip_action};
 
 /// Whose actions are evaluated.
 #[derive(Debug)]
@@ -123,15 +123,14 @@ fn act<E: Environment, F: ForwardPass>(
         Evaluated::Policy(forward) => forward.forward(batch),
         Evaluated::Servo => {
             for (index, lane) in lanes.iter().enumerate().filter(|(_, lane)| lane.episode.is_some()) {
-                let row = batch.row(index);
-                lane.environment.servo_action(row.mean);
-                row.std.fill(0.0);
+                batch.row(index).decide(|mean| lane.environment.servo_action(mean), 0.0);
             }
             Ok(())
         }
         Evaluated::Zero => {
-            batch.mean.fill(0.0);
-            batch.std.fill(0.0);
+            for index in 0..lanes.len() {
+                batch.row(index).decide(|mean| mean.fill(0.0), 0.0);
+            }
             Ok(())
         }
     }
@@ -149,9 +148,9 @@ impl<E: Environment> Lane<E> {
         let Some((number, start)) = start else { return Ok(ControlFlow::Continue(())) };
         self.number = number;
         self.environment.reset_to(start.clip, start.start)?;
-        let row = batch.row(index);
+        let mut row = batch.row(index);
         self.environment.observe(row.proprioception, row.task);
-        row.previous_latent.fill(0.0);
+        row.forget();
         let steps_left = self.environment.episode().steps_left;
         self.episode = Some(Finished {
             clip: start.clip,
@@ -175,9 +174,9 @@ impl<E: Environment> Lane<E> {
         let episode = self.episode.as_mut()?;
         let row = batch.row(index);
         if options.deterministic {
-            sampled.copy_from_slice(row.mean);
+            sampled.copy_from_slice(row.mode());
         } else {
-            sample_action(row.mean, row.std, sampled, rng);
+            row.sample(sampled, rng);
         }
         clip_action(sampled, clipped);
         let step = self.environment.step(clipped);
@@ -261,7 +260,7 @@ mod tests {
         let environments = (0..environments).map(|_| Fixed { start: 0, step: 0 }).collect();
         let starts: Vec<Start> = (0..7).map(|start| Start { clip: 0, start }).collect();
         let options = Options { deterministic: true, ..Options::default() };
-        let sizes = ActingSizes { proprioception: 1, task: 0, latent: 1, action: 2, image: 0 };
+        let sizes = ActingSizes { proprioception: 1, task: 0, latent: 1, action: 2, image: 0, components: 1, state: 0 };
         let finished = run(evaluated, environments, sizes, &starts, &options, &mut |_: usize, _: usize| ()).unwrap();
         let mut found: Vec<_> = finished.iter().map(|e| (e.steps, e.steps_left, e.returns[0])).collect();
         found.sort_by(|a, b| a.partial_cmp(b).unwrap());
@@ -297,7 +296,7 @@ mod tests {
     #[test]
     fn the_audience_sees_every_state_of_every_episode_and_may_leave_at_any() {
         let starts = [1, 3, 2].map(|start| Start { clip: 0, start });
-        let sizes = ActingSizes { proprioception: 1, task: 0, latent: 1, action: 2, image: 0 };
+        let sizes = ActingSizes { proprioception: 1, task: 0, latent: 1, action: 2, image: 0, components: 1, state: 0 };
         let steps = |number, last| (0..=last).map(move |step| (number, step));
         let all: Vec<_> = steps(0, 3).chain(steps(1, 3)).chain(steps(2, 10)).collect();
         for (patience, episodes) in [(1, 0), (3, 0), (4, 1), (5, 1), (8, 2), (100, 3)] {

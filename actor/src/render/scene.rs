@@ -9,6 +9,7 @@ use comic_experiment::{ClipSource, Experiment, TaskName};
 use comic_tasks::{Simulated, Task};
 
 use crate::Error;
+use crate::acting::ActingSizes;
 use crate::checkpoint::{self, Checkpoint};
 use crate::evaluate::{Audience, Evaluated, Finished, Options, Start, roll_out};
 use crate::policy::TorchPolicy;
@@ -51,7 +52,7 @@ pub(super) struct Scene {
 pub(super) struct Cast {
     pub(super) task: Arc<dyn Task>,
     policy: Option<TorchPolicy>,
-    latent: usize,
+    sizes: ActingSizes,
     name: TaskName,
     starts: Vec<Start>,
     options: Options,
@@ -74,7 +75,8 @@ impl Scene {
         let starts = self.starts(task.as_ref())?;
         let options =
             Options { deterministic: self.deterministic, seed: self.seed, environments: 1, ..Options::default() };
-        Ok(Cast { task, policy, latent: experiment.network.latent.size, name: experiment.task, starts, options })
+        let sizes = ActingSizes::new(task.spec(), &experiment);
+        Ok(Cast { task, policy, sizes, name: experiment.task, starts, options })
     }
 
     /// The experiment, and the parameters when there is a checkpoint.
@@ -130,6 +132,6 @@ impl Cast {
             None if self.name == TaskName::Tracking => Evaluated::Servo,
             None => Evaluated::Zero,
         };
-        roll_out(&mut evaluated, &self.task, self.latent, &starts, &self.options, audience)
+        roll_out(&mut evaluated, &self.task, self.sizes, &starts, &self.options, audience)
     }
 }

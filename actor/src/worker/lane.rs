@@ -7,7 +7,7 @@ use comic_tasks::{Environment, Episode, MAX_REWARD_TERMS, Outcome};
 use rand::Rng;
 
 use crate::Error;
-use crate::acting::{ActingRow, clip_action, sample_action};
+use crate::acting::{ActingRow, clip_action};
 
 #[derive(Debug)]
 pub(super) struct Lane<E> {
@@ -59,6 +59,9 @@ impl<E: Environment> Lane<E> {
         self.unroll.row_mut(Field::Task, t).copy_from_slice(row.task);
         self.unroll.row_mut(Field::First, t)[0] = f32::from(u8::from(self.first));
         self.unroll.set_clip(t, self.episode.clip as u32);
+        if t == 0 {
+            self.unroll.row_mut(Field::State, 0).copy_from_slice(row.state);
+        }
         Ok(())
     }
 
@@ -66,7 +69,7 @@ impl<E: Environment> Lane<E> {
     pub(super) fn step(&mut self, t: usize, row: &mut ActingRow<'_>, rng: &mut impl Rng) {
         self.write_decision(t, row);
         let action = self.unroll.row_mut(Field::Action, t);
-        sample_action(row.mean, row.std, action, rng);
+        row.sample(action, rng);
         clip_action(action, &mut self.clipped);
         let step = self.environment.step(&self.clipped);
         let reward = self.unroll.row_mut(Field::Reward, t);
@@ -90,7 +93,7 @@ impl<E: Environment> Lane<E> {
     /// mask. The decision stands there all the same, since a distribution without a deviation is none.
     pub(super) fn pass(&mut self, t: usize, row: &ActingRow<'_>) {
         self.write_decision(t, row);
-        self.unroll.row_mut(Field::Action, t).copy_from_slice(row.mean);
+        self.unroll.row_mut(Field::Action, t).copy_from_slice(row.mode());
         self.unroll.row_mut(Field::Reward, t).fill(0.0);
         self.unroll.row_mut(Field::Discount, t)[0] = 0.0;
         self.unroll.row_mut(Field::Valid, t)[0] = 0.0;
@@ -104,7 +107,7 @@ impl<E: Environment> Lane<E> {
         self.ended = false;
         self.steps = 0;
         self.returns = [0.0; MAX_REWARD_TERMS];
-        row.previous_latent.fill(0.0);
+        row.forget();
         self.observe(row);
     }
 
@@ -132,6 +135,7 @@ impl<E: Environment> Lane<E> {
         self.unroll.row_mut(Field::LatentNoise, t).copy_from_slice(row.latent_noise);
         self.unroll.row_mut(Field::Mean, t).copy_from_slice(row.mean);
         self.unroll.row_mut(Field::Std, t).copy_from_slice(row.std);
+        self.unroll.row_mut(Field::LogWeights, t).copy_from_slice(row.log_weights);
     }
 
     /// Keeps the episode's statistics if it is over.

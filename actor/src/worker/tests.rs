@@ -95,6 +95,8 @@ fn layout(length: usize) -> Arc<UnrollLayout> {
         latent: 2,
         reward_terms: 2,
         image: 0,
+        components: 1,
+        state: 0,
     }))
 }
 

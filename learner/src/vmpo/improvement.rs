@@ -16,6 +16,8 @@ pub struct Evidence<'a> {
     pub kl_mean: &'a Tensor,
     /// KL_Σ to the behaviour policy, summed over dimensions.
     pub kl_std: &'a Tensor,
+    /// KL of a mixture's weights to the behaviour policy's.
+    pub kl_weights: Option<&'a Tensor>,
     /// 1 where the step is a transition; a step with 0 has no influence, whatever its other numbers are.
     pub valid: &'a Tensor,
 }
@@ -29,6 +31,8 @@ pub struct Limits {
     pub epsilon_mean: f64,
     /// ε_Σ.
     pub epsilon_std: f64,
+    /// ε_discrete.
+    pub epsilon_discrete: f64,
     /// Share of the valid steps in D̃.
     pub top_fraction: f64,
 }
@@ -39,6 +43,7 @@ impl From<&Vmpo> for Limits {
             epsilon_eta: config.epsilon_eta,
             epsilon_mean: config.epsilon_mean,
             epsilon_std: config.epsilon_std,
+            epsilon_discrete: config.epsilon_discrete,
             top_fraction: config.top_fraction,
         }
     }
@@ -51,12 +56,14 @@ pub struct Improvement {
     pub policy: Tensor,
     /// L_η.
     pub temperature: Tensor,
-    /// L_α, both constraints: the multipliers' own loss and the penalty on the policy.
+    /// L_α, every constraint: the multipliers' own loss and the penalty on the policy.
     pub alpha: Tensor,
     /// Mean KL_μ over the valid steps, without gradient.
     pub kl_mean: Tensor,
     /// Mean KL_Σ over the valid steps, without gradient.
     pub kl_std: Tensor,
+    /// Mean KL of a mixture's weights over the valid steps, without gradient.
+    pub kl_weights: Option<Tensor>,
 }
 
 impl Improvement {
@@ -78,9 +85,20 @@ pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits
     let (policy, temperature) = expectation_step(evidence, &mask, &multipliers.temperature(), limits);
     let kl_mean = masked_mean(evidence.kl_mean, evidence.valid);
     let kl_std = masked_mean(evidence.kl_std, evidence.valid);
-    let alpha = constraint(&kl_mean, &multipliers.alpha_mean(), limits.epsilon_mean)
+    let mut alpha = constraint(&kl_mean, &multipliers.alpha_mean(), limits.epsilon_mean)
         + constraint(&kl_std, &multipliers.alpha_std(), limits.epsilon_std);
-    Improvement { policy, temperature, alpha, kl_mean: kl_mean.detach(), kl_std: kl_std.detach() }
+    let kl_weights = evidence.kl_weights.map(|kl| masked_mean(kl, evidence.valid));
+    if let (Some(kl), Some(multiplier)) = (&kl_weights, multipliers.alpha_discrete()) {
+        alpha = alpha + constraint(kl, &multiplier, limits.epsilon_discrete);
+    }
+    Improvement {
+        policy,
+        temperature,
+        alpha,
+        kl_mean: kl_mean.detach(),
+        kl_std: kl_std.detach(),
+        kl_weights: kl_weights.map(|kl| kl.detach()),
+    }
 }
 
 fn expectation_step(evidence: &Evidence, mask: &Tensor, eta: &Tensor, limits: &Limits) -> (Tensor, Tensor) {

@@ -1,7 +1,8 @@
 //! Networks, multipliers and optimiser, stepped together.
 
 use comic_experiment::{Experiment, Network, Optimiser, Prior, TaskSpec, Vmpo};
-use comic_networks::{Acting, DiagonalGaussian, NormaliserStatistics, Policy, Value};
+use comic_networks::{Acting, ActionDistribution, Memory, NormaliserStatistics, Policy, Value};
+use comic_proto::UnrollShape;
 use tch::{Device, Kind, Tensor, nn};
 
 use super::{
@@ -71,13 +72,13 @@ pub struct VmpoLearner {
 /// One forward pass over a minibatch; N = B·T rows.
 struct Pass {
     acting: Acting,
-    /// N(stored mean, stored std), over `[N, A]`.
-    behaviour: DiagonalGaussian,
+    /// As stored, over N rows.
+    behaviour: ActionDistribution,
     /// V(s_t), `[N, R]`, with gradient.
     values: Tensor,
     /// G_t, `[N, R]`.
     targets: Tensor,
-    /// `[N]`.
+    /// Steps that are learnt from, `[N]`.
     valid: Tensor,
     /// ½ mean (V − G)², summed over the reward terms.
     value_loss: Tensor,
@@ -97,7 +98,7 @@ impl VmpoLearner {
         let value_store = nn::VarStore::new(device);
         let policy = Policy::new(&policy_store.root(), spec, network, pose)?;
         let value = Value::new(&value_store.root(), spec, network);
-        let multipliers = Multipliers::initial(vmpo, device);
+        let multipliers = Multipliers::initial(vmpo, network.components(), device);
         let mut adam = Adam::new(optimiser);
         let mut parameters = trainable("policy", &policy_store);
         parameters.extend(trainable("value", &value_store));
@@ -168,12 +169,14 @@ impl VmpoLearner {
         self.check(minibatch)?;
         let pass = self.forward(minibatch);
         let advantage = (&pass.targets - pass.values.detach()).sum_dim_intlist(-1i64, false, Kind::Float);
-        let action = rows(&minibatch.action);
+        let policy = &pass.acting.action;
+        let kl_weights = policy.kl_weights(&pass.behaviour);
         let evidence = Evidence {
-            log_prob: &pass.acting.action.log_prob(&action),
+            log_prob: &policy.log_prob(&rows(&minibatch.action)),
             advantage: &advantage,
-            kl_mean: &pass.acting.action.kl_mean(&pass.behaviour),
-            kl_std: &pass.acting.action.kl_std(&pass.behaviour),
+            kl_mean: &policy.kl_mean(&pass.behaviour),
+            kl_std: &policy.kl_std(&pass.behaviour),
+            kl_weights: kl_weights.as_ref(),
             valid: &pass.valid,
         };
         let improvement = policy_improvement(&evidence, &self.multipliers, &self.limits);
@@ -182,7 +185,7 @@ impl VmpoLearner {
             + &pass.latent_kl * self.network.latent.beta;
         if self.vmpo.entropy != 0.0 {
             // A new tensor: an in-place sum would write over what the graph holds.
-            let bonus = masked_mean(&pass.acting.action.entropy(), &pass.valid) * self.vmpo.entropy;
+            let bonus = masked_mean(&policy.entropy(), &pass.valid) * self.vmpo.entropy;
             total = &total - &bonus;
         }
         let networks = self.adam.parameters(self.networks_group);
@@ -206,7 +209,7 @@ impl VmpoLearner {
     pub fn regress(&mut self, minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error> {
         self.check(minibatch)?;
         let pass = self.forward(minibatch);
-        let deviation = (&pass.acting.action.mean - &pass.behaviour.mean) / self.network.initial_std;
+        let deviation = (pass.acting.action.mean() - pass.behaviour.mean()) / self.network.initial_std;
         let squares = deviation.square().sum_dim_intlist(-1i64, false, Kind::Float) * 0.5;
         let regression = masked_mean(&squares, &pass.valid);
         let total =
@@ -214,7 +217,8 @@ impl VmpoLearner {
         let gradients = Tensor::f_run_backward(&[&total], self.adam.parameters(self.networks_group), false, false)?;
         let norm = self.descend(gradients);
         let shape = minibatch.shape();
-        let latents = pass.acting.latent.detach().reshape([shape.unrolls as i64, shape.length as i64, -1]);
+        let sizes = [shape.unrolls, shape.unroll.length, shape.unroll.latent].map(|size| size as i64);
+        let latents = pass.acting.latent.detach().reshape(sizes);
         let losses = self.report(&total, &pass, None, Some(&regression), &norm);
         Ok((losses, latents))
     }
@@ -243,16 +247,18 @@ impl VmpoLearner {
 
     fn check(&self, minibatch: &MinibatchTensors) -> Result<(), Error> {
         let found = minibatch.shape();
-        let expected = MinibatchShape {
-            unrolls: found.unrolls,
-            length: found.length,
+        let unroll = UnrollShape {
+            length: found.unroll.length,
             proprioception: self.spec.proprioception,
             task: self.spec.task,
             action: self.spec.action,
             latent: self.network.latent.size,
             reward_terms: self.spec.reward_terms.len(),
             image: self.spec.image,
+            components: self.network.components(),
+            state: self.network.state_size(),
         };
+        let expected = MinibatchShape { unrolls: found.unrolls, unroll };
         let known = self.spec.clips.len();
         if found == expected && minibatch.clips <= known {
             return Ok(());
@@ -261,25 +267,32 @@ impl VmpoLearner {
     }
 
     fn forward(&self, minibatch: &MinibatchTensors) -> Pass {
-        let shape = minibatch.shape();
-        let (unrolls, length) = (shape.unrolls as i64, shape.length as i64);
+        let length = minibatch.shape().unroll.length as i64;
         let observation = self.policy.normalise(&minibatch.proprioception, &minibatch.task, minibatch.image.as_ref());
-        let values = self.value.forward(&observation, &minibatch.clip).reshape([unrolls, length + 1, -1]);
-        let acting = self.policy.act_normalised(
+        let MinibatchTensors { reward, discount, valid, first, .. } = minibatch;
+        let values = self.value.forward(&observation, &minibatch.clip, first);
+        let first = first.narrow(1, 0, length);
+        let acting = self.policy.act(
             &observation.first_steps(length),
             &minibatch.previous_latent,
             &minibatch.latent_noise,
+            Memory { state: &minibatch.state, first: Some(&first) },
         );
-        let MinibatchTensors { reward, discount, valid, first, .. } = minibatch;
         let targets = returns(reward, discount, valid, &values, self.vmpo.discount, self.vmpo.lambda);
         let (targets, values) = (rows(&targets), rows(&values.narrow(1, 0, length)));
-        let valid = valid.reshape([-1]);
+        let valid = self.learnt_from(valid).reshape([-1]);
         let errors = (&values - &targets).square().sum_dim_intlist(-1i64, false, Kind::Float) * 0.5;
-        let first = first.narrow(1, 0, length).reshape([-1]);
         let prior: &Prior = &self.network.latent.prior;
-        let latent_kl = acting.latent_posterior.kl_to_prior(prior, &rows(&minibatch.previous_latent), &first);
+        let latent_kl = match &acting.latent_posterior {
+            Some(posterior) => posterior.kl_to_prior(prior, &rows(&minibatch.previous_latent), &first.reshape([-1])),
+            None => valid.zeros_like(),
+        };
         Pass {
-            behaviour: DiagonalGaussian { mean: rows(&minibatch.mean), std: rows(&minibatch.std) },
+            behaviour: ActionDistribution::from_rows(
+                &rows(&minibatch.mean),
+                &rows(&minibatch.std),
+                &rows(&minibatch.log_weights),
+            ),
             value_loss: masked_mean(&errors, &valid),
             latent_kl: masked_mean(&latent_kl, &valid),
             acting,
@@ -287,6 +300,17 @@ impl VmpoLearner {
             targets,
             valid,
         }
+    }
+
+    /// `valid` without the rows that only wake a recurrent value function.
+    fn learnt_from(&self, valid: &Tensor) -> Tensor {
+        let burnt = self.vmpo.value_burn_in as i64;
+        if burnt == 0 {
+            return valid.shallow_clone();
+        }
+        let valid = valid.copy();
+        let _ = valid.narrow(1, 0, burnt).zero_();
+        valid
     }
 
     /// Clips where asked to, steps the networks and returns the gradient's norm before clipping.
@@ -319,7 +343,9 @@ impl VmpoLearner {
             let of = |entry: fn(&Improvement) -> &Tensor| improvement.map_or(&zero, entry);
             let [temperature, alpha_mean, alpha_std] =
                 [self.multipliers.temperature(), self.multipliers.alpha_mean(), self.multipliers.alpha_std()];
-            let std = pass.acting.action.std.mean_dim(-1i64, false, Kind::Float);
+            let alpha_discrete = self.multipliers.alpha_discrete();
+            let kl_weights = improvement.and_then(|improvement| improvement.kl_weights.as_ref());
+            let std = pass.acting.action.std().mean_dim(-1i64, false, Kind::Float);
             Losses::pack([
                 total,
                 of(|improvement| &improvement.policy),
@@ -330,9 +356,11 @@ impl VmpoLearner {
                 &pass.latent_kl,
                 of(|improvement| &improvement.kl_mean),
                 of(|improvement| &improvement.kl_std),
+                kl_weights.unwrap_or(&zero),
                 &temperature,
                 &alpha_mean,
                 &alpha_std,
+                alpha_discrete.as_ref().unwrap_or(&zero),
                 &masked_mean(&std, &pass.valid),
                 norm,
                 &variance_explained(pass),

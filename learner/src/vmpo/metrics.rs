@@ -3,7 +3,7 @@
 use tch::{Device, Kind, Tensor};
 
 /// Entries of the packed tensor.
-const COUNT: usize = 16;
+const COUNT: usize = 18;
 
 /// One gradient step's report, still on the device: nothing waits for it until [`Losses::to_metrics`].
 #[derive(Debug)]
@@ -42,9 +42,11 @@ impl Losses {
             latent_kl,
             kl_mean,
             kl_std,
+            kl_weights,
             temperature,
             alpha_mean,
             alpha_std,
+            alpha_discrete,
             policy_std,
             gradient_norm,
             variance_explained,
@@ -60,9 +62,11 @@ impl Losses {
             latent_kl,
             kl_mean,
             kl_std,
+            kl_weights,
             temperature,
             alpha_mean,
             alpha_std,
+            alpha_discrete,
             policy_std,
             gradient_norm,
             variance_explained,
@@ -92,12 +96,16 @@ pub struct Metrics {
     pub kl_mean: f32,
     /// Mean KL_Σ to the behaviour policy, nats a step.
     pub kl_std: f32,
+    /// Mean KL of a mixture's weights to the behaviour policy's, nats a step; 0 for one Gaussian.
+    pub kl_weights: f32,
     /// η after the step.
     pub temperature: f32,
     /// α_μ after the step.
     pub alpha_mean: f32,
     /// α_Σ after the step.
     pub alpha_std: f32,
+    /// α_discrete after the step; 0 for one Gaussian.
+    pub alpha_discrete: f32,
     /// Mean standard deviation of the policy over valid steps and action dimensions.
     pub policy_std: f32,
     /// Global norm of the networks' gradients, before any clipping.
@@ -121,9 +129,11 @@ impl Metrics {
             ("latent_kl", self.latent_kl),
             ("kl_mean", self.kl_mean),
             ("kl_std", self.kl_std),
+            ("kl_weights", self.kl_weights),
             ("temperature", self.temperature),
             ("alpha_mean", self.alpha_mean),
             ("alpha_std", self.alpha_std),
+            ("alpha_discrete", self.alpha_discrete),
             ("policy_std", self.policy_std),
             ("gradient_norm", self.gradient_norm),
             ("variance_explained", self.variance_explained),

@@ -1,5 +1,6 @@
 //! Unrolls as tensors.
 
+use comic_proto::UnrollShape;
 use tch::{Device, Tensor};
 
 use super::Error;
@@ -9,20 +10,8 @@ use super::Error;
 pub struct MinibatchShape {
     /// B, unrolls.
     pub unrolls: usize,
-    /// T, transitions an unroll; observations are T + 1.
-    pub length: usize,
-    /// P, entries of proprioception.
-    pub proprioception: usize,
-    /// X, entries of the task observation.
-    pub task: usize,
-    /// A, entries of the action.
-    pub action: usize,
-    /// Z, entries of the latent.
-    pub latent: usize,
-    /// R, reward terms.
-    pub reward_terms: usize,
-    /// I, bytes of an image; 0 when the task is blind.
-    pub image: usize,
+    /// The sizes of each.
+    pub unroll: UnrollShape,
 }
 
 /// The fields of a batch as contiguous slices, `[B, rows, width]` each, in the wire's own element types.
@@ -38,10 +27,12 @@ pub struct MinibatchSource<'a> {
     pub latent_noise: &'a [f32],
     /// The sampled action, unclipped, `[B, T, A]`.
     pub action: &'a [f32],
-    /// The behaviour policy's mean, `[B, T, A]`.
+    /// The behaviour policy's means, `[B, T, K·A]`.
     pub mean: &'a [f32],
-    /// The behaviour policy's standard deviation, `[B, T, A]`.
+    /// The behaviour policy's standard deviations, `[B, T, K·A]`.
     pub std: &'a [f32],
+    /// ln of the behaviour policy's weights, `[B, T, K]`; empty where K is 1.
+    pub log_weights: &'a [f32],
     /// Reward terms, `[B, T, R]`.
     pub reward: &'a [f32],
     /// 0 where the episode terminated, `[B, T]`.
@@ -50,6 +41,8 @@ pub struct MinibatchSource<'a> {
     pub valid: &'a [f32],
     /// 1 at an episode's first observation, `[B, T+1]`.
     pub first: &'a [f32],
+    /// What the policy remembered at the first row, `[B, S]`.
+    pub state: &'a [f32],
     /// The clip's index, `[B, T+1]`.
     pub clip: &'a [u32],
     /// What the humanoid sees, `[B, T+1, I]`; empty when the task is blind.
@@ -69,10 +62,12 @@ pub struct MinibatchTensors {
     pub(super) action: Tensor,
     pub(super) mean: Tensor,
     pub(super) std: Tensor,
+    pub(super) log_weights: Tensor,
     pub(super) reward: Tensor,
     pub(super) discount: Tensor,
     pub(super) valid: Tensor,
     pub(super) first: Tensor,
+    pub(super) state: Tensor,
     pub(super) clip: Tensor,
     /// uint8; none when the task is blind.
     pub(super) image: Option<Tensor>,
@@ -86,40 +81,45 @@ impl MinibatchTensors {
     /// # Errors
     /// [`Error::Length`] when a slice is not as long as `shape` says.
     pub fn new(source: &MinibatchSource, shape: &MinibatchShape, device: Device) -> Result<Self, Error> {
-        let rows = [shape.length, shape.length + 1];
-        let tensor = |name, values: &[f32], row: usize, width: usize| {
-            let size = [shape.unrolls, rows[row], width];
+        let MinibatchShape { unrolls, unroll } = *shape;
+        let (steps, observations) = (unroll.length, unroll.length + 1);
+        let tensor = |name, values: &[f32], rows: usize, width: usize| {
+            let size = [unrolls, rows, width];
             check(name, values.len(), &size)?;
             let tensor = Tensor::from_slice(values).f_reshape(size.map(|size| size as i64))?;
             Ok::<Tensor, Error>(tensor.f_to_device(device)?)
         };
-        let flag = |name, values, row| Ok::<Tensor, Error>(tensor(name, values, row, 1)?.f_squeeze_dim(-1)?);
-        let valid = flag("valid", source.valid, 0)?;
+        let flag = |name, values, rows| Ok::<Tensor, Error>(tensor(name, values, rows, 1)?.f_squeeze_dim(-1)?);
+        let valid = flag("valid", source.valid, steps)?;
         let mask = valid.gt(0.5).unsqueeze(-1);
         let blanked = |name, values, width, blank: f64| {
-            Ok::<Tensor, Error>(tensor(name, values, 0, width)?.f_where_scalarother(&mask, blank)?)
+            Ok::<Tensor, Error>(tensor(name, values, steps, width)?.f_where_scalarother(&mask, blank)?)
         };
-        check("clip", source.clip.len(), &[shape.unrolls, rows[1]])?;
-        let size = [shape.unrolls, rows[1], shape.image];
+        check("clip", source.clip.len(), &[unrolls, observations])?;
+        let size = [unrolls, observations, unroll.image];
         check("image", source.image.len(), &size)?;
-        let image = if shape.image == 0 {
+        let image = if unroll.image == 0 {
             None
         } else {
             Some(Tensor::from_slice(source.image).f_reshape(size.map(|size| size as i64))?.f_to_device(device)?)
         };
+        let components = unroll.components;
+        let (weights, even) = (if components > 1 { components } else { 0 }, -(components as f64).ln());
         let clip: Vec<i64> = source.clip.iter().map(|clip| i64::from(*clip)).collect();
         Ok(Self {
-            proprioception: tensor("proprioception", source.proprioception, 1, shape.proprioception)?,
-            task: tensor("task", source.task, 1, shape.task)?,
-            previous_latent: blanked("previous_latent", source.previous_latent, shape.latent, 0.0)?,
-            latent_noise: blanked("latent_noise", source.latent_noise, shape.latent, 0.0)?,
-            action: blanked("action", source.action, shape.action, 0.0)?,
-            mean: blanked("mean", source.mean, shape.action, 0.0)?,
-            std: blanked("std", source.std, shape.action, 1.0)?,
-            reward: blanked("reward", source.reward, shape.reward_terms, 0.0)?,
-            discount: flag("discount", source.discount, 0)? * &valid,
-            first: flag("first", source.first, 1)?,
-            clip: Tensor::from_slice(&clip).f_reshape([shape.unrolls as i64, rows[1] as i64])?.f_to_device(device)?,
+            proprioception: tensor("proprioception", source.proprioception, observations, unroll.proprioception)?,
+            task: tensor("task", source.task, observations, unroll.task)?,
+            previous_latent: blanked("previous_latent", source.previous_latent, unroll.latent, 0.0)?,
+            latent_noise: blanked("latent_noise", source.latent_noise, unroll.latent, 0.0)?,
+            action: blanked("action", source.action, unroll.action, 0.0)?,
+            mean: blanked("mean", source.mean, components * unroll.action, 0.0)?,
+            std: blanked("std", source.std, components * unroll.action, 1.0)?,
+            log_weights: blanked("log_weights", source.log_weights, weights, even)?,
+            reward: blanked("reward", source.reward, unroll.reward_terms, 0.0)?,
+            discount: flag("discount", source.discount, steps)? * &valid,
+            first: flag("first", source.first, observations)?,
+            state: tensor("state", source.state, 1, unroll.state)?.f_squeeze_dim(1)?,
+            clip: Tensor::from_slice(&clip).f_reshape([unrolls as i64, observations as i64])?.f_to_device(device)?,
             image,
             clips: source.clip.iter().max().map_or(0, |clip| *clip as usize + 1),
             valid,
@@ -131,13 +131,17 @@ impl MinibatchTensors {
         let width = |tensor: &Tensor, dimension: i64| tensor.size()[dimension as usize] as usize;
         MinibatchShape {
             unrolls: width(&self.valid, 0),
-            length: width(&self.valid, 1),
-            proprioception: width(&self.proprioception, 2),
-            task: width(&self.task, 2),
-            action: width(&self.action, 2),
-            latent: width(&self.latent_noise, 2),
-            reward_terms: width(&self.reward, 2),
-            image: self.image.as_ref().map_or(0, |image| width(image, 2)),
+            unroll: UnrollShape {
+                length: width(&self.valid, 1),
+                proprioception: width(&self.proprioception, 2),
+                task: width(&self.task, 2),
+                action: width(&self.action, 2),
+                latent: width(&self.latent_noise, 2),
+                reward_terms: width(&self.reward, 2),
+                image: self.image.as_ref().map_or(0, |image| width(image, 2)),
+                components: width(&self.log_weights, 2).max(1),
+                state: width(&self.state, 1),
+            },
         }
     }
 
@@ -157,10 +161,12 @@ impl MinibatchTensors {
             action: take(&self.action),
             mean: take(&self.mean),
             std: take(&self.std),
+            log_weights: take(&self.log_weights),
             reward: take(&self.reward),
             discount: take(&self.discount),
             valid: take(&self.valid),
             first: take(&self.first),
+            state: take(&self.state),
             clip: take(&self.clip),
             image: self.image.as_ref().map(take),
             clips: self.clips,

@@ -6,27 +6,27 @@ use tch::{Device, Tensor};
 /// Multipliers are projected to at least this after each step (V).
 pub const MULTIPLIER_FLOOR: f64 = 1e-8;
 
-/// η, α_μ and α_Σ: positive numbers that are learned as they are, one parameter of shape `[3]`.
+/// η, α_μ, α_Σ and, for a mixture, α_discrete: positive numbers that are learned as they are, one parameter.
 #[derive(Debug)]
 pub struct Multipliers {
     parameter: Tensor,
 }
 
 impl Multipliers {
-    /// From a temperature η, α_μ and α_Σ; each at least [`MULTIPLIER_FLOOR`].
-    pub fn new(temperature: f32, alpha_mean: f32, alpha_std: f32, device: Device) -> Self {
-        let values = [temperature, alpha_mean, alpha_std].map(|value| value.max(MULTIPLIER_FLOOR as f32));
+    /// From η, α_μ, α_Σ and perhaps α_discrete; each at least [`MULTIPLIER_FLOOR`].
+    pub fn new(values: &[f32], device: Device) -> Self {
+        let values: Vec<f32> = values.iter().map(|value| value.max(MULTIPLIER_FLOOR as f32)).collect();
         Self { parameter: Tensor::from_slice(&values).to_device(device).set_requires_grad(true) }
     }
 
     /// The experiment's starting values (S: 1 each).
-    pub fn initial(config: &Vmpo, device: Device) -> Self {
-        Self::new(
-            config.initial_temperature as f32,
-            config.initial_alpha_mean as f32,
-            config.initial_alpha_std as f32,
-            device,
-        )
+    pub fn initial(config: &Vmpo, components: usize, device: Device) -> Self {
+        let mut values = vec![config.initial_temperature, config.initial_alpha_mean, config.initial_alpha_std];
+        if components > 1 {
+            values.push(config.initial_alpha_discrete);
+        }
+        let values: Vec<f32> = values.into_iter().map(|value| value as f32).collect();
+        Self::new(&values, device)
     }
 
     /// η, a scalar that carries gradient.
@@ -44,7 +44,12 @@ impl Multipliers {
         self.parameter.select(0, 2)
     }
 
-    /// The parameter itself, `[3]`: η, α_μ, α_Σ.
+    /// α_discrete, a scalar that carries gradient; only mixtures have one.
+    pub fn alpha_discrete(&self) -> Option<Tensor> {
+        (self.parameter.numel() > 3).then(|| self.parameter.select(0, 3))
+    }
+
+    /// The parameter itself: η, α_μ, α_Σ and perhaps α_discrete, `[3]` or `[4]`.
     pub fn parameter(&self) -> &Tensor {
         &self.parameter
     }

@@ -3,6 +3,8 @@
 
 use comic_experiment::{Experiment, TaskSpec};
 use comic_learner::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
+use comic_networks::Memory;
+use comic_proto::UnrollShape;
 use tch::{Device, Tensor};
 
 pub(crate) const UNROLLS: usize = 6;
@@ -34,7 +36,7 @@ pub(crate) fn spec() -> TaskSpec {
 pub(crate) fn experiment() -> Experiment {
     let mut experiment = Experiment::default();
     experiment.network.encoder = vec![16, 16];
-    experiment.network.low_level = vec![16, 16];
+    experiment.network.mlp.hidden = vec![16, 16];
     experiment.network.value = vec![16, 16];
     experiment.network.latent.size = WIDTHS.latent;
     experiment.optimiser.epsilon = 10.0;
@@ -68,7 +70,9 @@ pub(crate) struct Unrolls {
     pub(crate) reward: Vec<f32>,
     pub(crate) discount: Vec<f32>,
     pub(crate) valid: Vec<f32>,
+    pub(crate) log_weights: Vec<f32>,
     pub(crate) first: Vec<f32>,
+    pub(crate) state: Vec<f32>,
     pub(crate) clip: Vec<u32>,
 }
 
@@ -108,7 +112,9 @@ impl Unrolls {
             reward: numbers.take(rows * WIDTHS.reward_terms),
             discount: vec![1.0; rows],
             valid: vec![1.0; rows],
+            log_weights: Vec::new(),
             first: vec![0.0; observations],
+            state: Vec::new(),
             clip: (0..observations).map(|row| (row / (LENGTH + 1) % 3) as u32).collect(),
         }
     }
@@ -122,16 +128,18 @@ impl Unrolls {
     }
 
     pub(crate) fn shape(&self) -> MinibatchShape {
-        MinibatchShape {
-            unrolls: self.count,
+        let unroll = UnrollShape {
             length: LENGTH,
             proprioception: WIDTHS.proprioception,
             task: WIDTHS.task,
             action: WIDTHS.action,
-            latent: WIDTHS.latent,
+            latent: self.latent_noise.len() / (self.count * LENGTH),
             reward_terms: WIDTHS.reward_terms,
             image: 0,
-        }
+            components: self.mean.len() / self.action.len(),
+            state: self.state.len() / self.count,
+        };
+        MinibatchShape { unrolls: self.count, unroll }
     }
 
     pub(crate) fn source(&self) -> MinibatchSource<'_> {
@@ -143,10 +151,12 @@ impl Unrolls {
             action: &self.action,
             mean: &self.mean,
             std: &self.std,
+            log_weights: &self.log_weights,
             reward: &self.reward,
             discount: &self.discount,
             valid: &self.valid,
             first: &self.first,
+            state: &self.state,
             clip: &self.clip,
             image: &[],
         }
@@ -173,9 +183,13 @@ impl Unrolls {
         for start in (0..total).step_by(rows) {
             let length = rows.min(total - start) as i64;
             let [s, x, z, noise] = inputs.each_ref().map(|input| input.narrow(0, start as i64, length));
-            let acting = tch::no_grad(|| learner.policy().act(&s, &x, None, &z, &noise));
-            means.extend(values(&acting.action.mean));
-            stds.extend(values(&acting.action.std));
+            let acting = tch::no_grad(|| {
+                let state = s.narrow(1, 0, 0);
+                let observation = learner.policy().normalise(&s, &x, None);
+                learner.policy().act(&observation, &z, &noise, Memory { state: &state, first: None })
+            });
+            means.extend(values(&acting.action.mean()));
+            stds.extend(values(&acting.action.std()));
         }
         let noise = Numbers::new(77).take(means.len());
         self.action = means.iter().zip(&stds).zip(noise).map(|((mean, std), noise)| mean + std * 1.7 * noise).collect();

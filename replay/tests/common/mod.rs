@@ -16,7 +16,17 @@ pub(crate) const CONFIG: Config = Config { unrolls: 3, max_staleness: 4, ahead: 
 pub(crate) const SLOTS: usize = 2 * CONFIG.unrolls;
 
 pub(crate) fn layout() -> Arc<UnrollLayout> {
-    let shape = UnrollShape { length: 2, proprioception: 3, task: 4, action: 2, latent: 1, reward_terms: 2, image: 0 };
+    let shape = UnrollShape {
+        length: 2,
+        proprioception: 3,
+        task: 4,
+        action: 2,
+        latent: 1,
+        reward_terms: 2,
+        image: 0,
+        components: 1,
+        state: 0,
+    };
     Arc::new(UnrollLayout::new(shape))
 }
 

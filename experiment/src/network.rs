@@ -1,0 +1,186 @@
+//! Sizes and initial values of the networks.
+
+use serde::{Deserialize, Serialize};
+
+/// Sizes and initial values of every network.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Network {
+    /// Hidden sizes of the reference encoder (S: 2×1024).
+    pub encoder: Vec<usize>,
+    /// A linear path from the encoder's input to its output (S: with the MLP low level).
+    pub encoder_linear_path: bool,
+    /// What turns latent and proprioception into an action; the section of its name holds its sizes.
+    pub low_level: LowLevelName,
+    /// The MLP low level.
+    pub mlp: Mlp,
+    /// The LSTM low level.
+    pub lstm: Lstm,
+    /// The primitives of the mixture and of the product.
+    pub primitives: Primitives,
+    /// Hidden sizes of the value function (S: 3×1024).
+    pub value: Vec<usize>,
+    /// LSTM layers of the value function after its hidden ones; none is feed-forward (S: recurrent beside the LSTM low
+    /// level, whose sizes are taken (D)).
+    pub value_lstm: Vec<usize>,
+    /// Width of the learned clip embedding the value function sees (S: 30).
+    pub clip_embedding: usize,
+    /// What is left of an image, in tasks that see (D).
+    pub image_features: usize,
+    /// The latent between encoder and low level.
+    pub latent: Latent,
+    /// The policy's standard deviation before learning (D; softplus at 0 is ln 2).
+    pub initial_std: f64,
+    /// Floor of the policy's standard deviation (D).
+    pub min_std: f64,
+    /// Scale of the policy head's initial weights, relative to the other layers' (D).
+    pub policy_head_scale: f64,
+    /// Where the policy's mean starts: the middle of every joint's range, or the clips' mean pose as an action (D).
+    pub initial_pose: InitialPose,
+    /// Observations are normalised by the mean and standard deviation of the first so many steps; 0 leaves them raw (D).
+    pub normaliser_steps: u64,
+}
+
+impl Default for Network {
+    fn default() -> Self {
+        Self {
+            encoder: vec![1024, 1024],
+            encoder_linear_path: true,
+            low_level: LowLevelName::Mlp,
+            mlp: Mlp::default(),
+            lstm: Lstm::default(),
+            primitives: Primitives::default(),
+            value: vec![1024, 1024, 1024],
+            value_lstm: Vec::new(),
+            clip_embedding: 30,
+            image_features: 64,
+            latent: Latent::default(),
+            initial_std: std::f64::consts::LN_2,
+            min_std: 1e-3,
+            policy_head_scale: 1.0,
+            initial_pose: InitialPose::MidRange,
+            normaliser_steps: 0,
+        }
+    }
+}
+
+/// The low levels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LowLevelName {
+    /// Feed-forward.
+    Mlp,
+    /// Recurrent.
+    Lstm,
+    /// A mixture of primitives.
+    Mixture,
+    /// A product of primitives.
+    Product,
+}
+
+/// The MLP low level.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Mlp {
+    /// Hidden sizes (S: 2×1024).
+    pub hidden: Vec<usize>,
+}
+
+impl Default for Mlp {
+    fn default() -> Self {
+        Self { hidden: vec![1024, 1024] }
+    }
+}
+
+/// The LSTM low level.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Lstm {
+    /// Units of the stacked layers (S: 384 and 256).
+    pub units: Vec<usize>,
+}
+
+impl Default for Lstm {
+    fn default() -> Self {
+        Self { units: vec![384, 256] }
+    }
+}
+
+/// Primitives: Gaussians of proprioception alone, combined by weights that a gate makes of the latent.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Primitives {
+    /// K (S: 5).
+    pub count: usize,
+    /// Hidden sizes of the torso they share (S: 2×512).
+    pub torso: Vec<usize>,
+    /// Units of the layer each has for itself (S: 256).
+    pub hidden: usize,
+    /// Hidden sizes between latent and weights (S: 2×400); unused without a bottleneck.
+    pub gate: Vec<usize>,
+    /// A fixed bias on each primitive's mean, evenly from −0.66 to 0.66 (S).
+    pub biases: bool,
+}
+
+impl Default for Primitives {
+    fn default() -> Self {
+        Self { count: 5, torso: vec![512, 512], hidden: 256, gate: vec![400, 400], biases: false }
+    }
+}
+
+impl Network {
+    /// Gaussians that the action's distribution is made of: K for a mixture, else 1.
+    pub fn components(&self) -> usize {
+        if self.low_level == LowLevelName::Mixture { self.primitives.count } else { 1 }
+    }
+
+    /// Numbers that the low level remembers from step to step: a hidden and a cell state for each unit of an LSTM.
+    pub fn state_size(&self) -> usize {
+        if self.low_level == LowLevelName::Lstm { 2 * self.lstm.units.iter().sum::<usize>() } else { 0 }
+    }
+}
+
+/// Where the policy's mean starts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum InitialPose {
+    /// Action 0: the middle of every joint's range.
+    MidRange,
+    /// The mean pose of the reference clips, as an action.
+    ReferenceMean,
+}
+
+/// The stochastic latent z.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Latent {
+    /// Dimensions of z (S: 60). 0 is no bottleneck, for mixture and product: the encoder gives their weights itself.
+    pub size: usize,
+    /// β: strength of the KL to the prior (S: 5e-4).
+    pub beta: f64,
+    /// Floor of the encoder's standard deviation (D).
+    pub min_std: f64,
+    /// The encoder's standard deviation before learning (D).
+    pub initial_std: f64,
+    /// p(z_t | z_{t−1}).
+    pub prior: Prior,
+}
+
+impl Default for Latent {
+    fn default() -> Self {
+        Self { size: 60, beta: 5e-4, min_std: 1e-3, initial_std: std::f64::consts::LN_2, prior: Prior::Standard }
+    }
+}
+
+/// The latent's prior.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Prior {
+    /// N(0, I).
+    Standard,
+    /// N(α z_{t−1}, (1 − α²) I), N(0, I) at an episode's first step (NPMP: α = 0.95).
+    Ar1 {
+        /// α.
+        alpha: f64,
+    },
+}

@@ -1,0 +1,230 @@
+//! Every low level, through the same learner: acting step by step is learning on the whole unroll, and what V-MPO may not
+//! depend on it does not depend on.
+
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
+mod vmpo_support;
+
+use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives};
+use comic_learner::vmpo::{MinibatchTensors, VmpoLearner};
+use comic_networks::Memory;
+use tch::{Device, Kind, Tensor};
+use vmpo_support::{LENGTH, Numbers, Unrolls, difference, experiment, learner};
+
+/// Every low level, the gated ones with a bottleneck and without.
+fn every_low_level() -> Vec<(&'static str, Experiment)> {
+    let of = |name: LowLevelName, bottleneck: bool| {
+        let mut experiment = experiment();
+        let network = &mut experiment.network;
+        network.low_level = name;
+        network.lstm = Lstm { units: vec![6, 5] };
+        network.primitives = Primitives { count: 3, torso: vec![8], hidden: 6, gate: vec![7], biases: true };
+        if name == LowLevelName::Lstm {
+            network.value_lstm = vec![6];
+        }
+        if !bottleneck {
+            network.latent.size = 0;
+        }
+        experiment
+    };
+    vec![
+        ("mlp", of(LowLevelName::Mlp, true)),
+        ("lstm", of(LowLevelName::Lstm, true)),
+        ("mixture", of(LowLevelName::Mixture, true)),
+        ("mixture without a bottleneck", of(LowLevelName::Mixture, false)),
+        ("product", of(LowLevelName::Product, true)),
+        ("product without a bottleneck", of(LowLevelName::Product, false)),
+    ]
+}
+
+/// Unrolls as this learner's own policy makes them, acting step by step, one episode ending and another beginning inside
+/// the first, and every unroll in the middle of an episode at its start.
+fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls {
+    let count = 3;
+    let mut unrolls = Unrolls::random(seed, count).end_episode(0, 3, true).end_episode(1, 5, false);
+    let (latent, state) = (experiment.network.latent.size, experiment.network.state_size());
+    let mut numbers = Numbers::new(seed + 100);
+    unrolls.latent_noise = numbers.take(count * LENGTH * latent);
+    unrolls.state = numbers.take(count * state);
+    let mut remembered = Tensor::from_slice(&unrolls.state).reshape([count as i64, state as i64]);
+    let mut previous = Tensor::from_slice(&numbers.take(count * latent)).reshape([count as i64, latent as i64]);
+    let rows = |values: &[f32], length: usize, t: usize| {
+        let width = values.len() / (count * length);
+        let tensor = Tensor::from_slice(values).reshape([count, length, width].map(|size| size as i64));
+        tensor.select(1, t as i64)
+    };
+    // Per step, [count, ·]; put in unroll order at the end.
+    let (mut means, mut stds, mut weights, mut latents) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    for t in 0..LENGTH {
+        let begins = rows(&unrolls.first, LENGTH + 1, t);
+        previous = previous * (1.0 - &begins);
+        remembered = remembered * (1.0 - &begins);
+        latents.push(previous.copy());
+        let acting = tch::no_grad(|| {
+            let observation = learner.policy().normalise(
+                &rows(&unrolls.proprioception, LENGTH + 1, t),
+                &rows(&unrolls.task, LENGTH + 1, t),
+                None,
+            );
+            let memory = Memory { state: &remembered, first: None };
+            learner.policy().act(&observation, &previous, &rows(&unrolls.latent_noise, LENGTH, t), memory)
+        });
+        let (mean, std, log_weights) = acting.action.to_rows();
+        (previous, remembered) = (acting.latent, acting.state);
+        means.push(mean);
+        stds.push(std);
+        weights.extend(log_weights);
+    }
+    let unrolled = |steps: &[Tensor]| match steps {
+        [] => Vec::new(),
+        steps => Vec::<f32>::try_from(Tensor::stack(steps, 1).flatten(0, -1).contiguous()).unwrap(),
+    };
+    (unrolls.mean, unrolls.std) = (unrolled(&means), unrolled(&stds));
+    (unrolls.log_weights, unrolls.previous_latent) = (unrolled(&weights), unrolled(&latents));
+    unrolls
+}
+
+fn minibatch(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> MinibatchTensors {
+    unrolls(learner, experiment, seed).minibatch()
+}
+
+#[test]
+fn acting_step_by_step_is_learning_on_the_whole_unroll() {
+    for (name, experiment) in every_low_level() {
+        let mut learner = learner(&experiment, 1);
+        let metrics = learner.step(&minibatch(&learner, &experiment, 2)).unwrap().to_metrics();
+        // Nothing has changed since the policy acted: a limit of 0 on every part of its distribution.
+        for kl in [metrics.kl_mean, metrics.kl_std, metrics.kl_weights] {
+            assert!(kl.abs() < 1e-5, "{name}: {metrics:?}");
+        }
+    }
+}
+
+#[test]
+fn a_wrong_memory_is_noticed() {
+    let (_, experiment) = every_low_level().remove(1);
+    let mut learner = learner(&experiment, 1);
+    let mut unrolls = unrolls(&learner, &experiment, 2);
+    unrolls.state.iter_mut().for_each(|number| *number = -*number);
+    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_metrics();
+    assert!(metrics.kl_mean > 1e-5, "{metrics:?}");
+}
+
+#[test]
+fn a_changed_policy_has_a_kl_in_every_part_and_multipliers_that_move() {
+    for (name, experiment) in every_low_level() {
+        let mut learner = learner(&experiment, 1);
+        let minibatch = minibatch(&learner, &experiment, 2);
+        let before = learner.multipliers().parameter().copy();
+        learner.step(&minibatch).unwrap();
+        let metrics = learner.step(&minibatch).unwrap().to_metrics();
+        assert!(metrics.kl_mean > 0.0 && metrics.kl_std > 0.0, "{name}: {metrics:?}");
+        let mixture = name.starts_with("mixture");
+        assert_eq!(metrics.kl_weights > 0.0, mixture, "{name}: {metrics:?}");
+        let moved = (learner.multipliers().parameter() - before).abs().min().double_value(&[]);
+        assert_eq!(learner.multipliers().parameter().size(), [if mixture { 4 } else { 3 }]);
+        assert!(moved > 0.0, "{name}");
+    }
+}
+
+/// Steps two learners, one on each minibatch, and gives the difference of everything they hold.
+fn compare(experiment: &Experiment, left: &MinibatchTensors, right: &MinibatchTensors) -> f64 {
+    let (mut one, mut other) = (learner(experiment, 1), learner(experiment, 1));
+    one.step(left).unwrap();
+    other.step(right).unwrap();
+    difference(&one, &other)
+}
+
+#[test]
+fn permuting_the_batch_changes_nothing() {
+    for (name, experiment) in every_low_level() {
+        let base = minibatch(&learner(&experiment, 1), &experiment, 3);
+        let permuted = base.select(&Tensor::from_slice(&[2i64, 0, 1]));
+        assert!(compare(&experiment, &base, &permuted) < 1e-5, "{name}");
+    }
+}
+
+#[test]
+fn what_stands_in_a_row_that_is_no_transition_changes_nothing() {
+    for (name, experiment) in every_low_level() {
+        let base = unrolls(&learner(&experiment, 1), &experiment, 3);
+        let mut other = base.clone();
+        for row in base.valid.iter().enumerate().filter(|(_, valid)| **valid == 0.0).map(|(row, _)| row) {
+            let rows = base.valid.len();
+            for field in [&mut other.mean, &mut other.log_weights, &mut other.latent_noise, &mut other.action] {
+                let width = field.len() / rows;
+                field[row * width..(row + 1) * width].fill(1e30);
+            }
+            let width = other.std.len() / rows;
+            other.std[row * width..(row + 1) * width].fill(0.0);
+        }
+        assert_eq!(compare(&experiment, &base.minibatch(), &other.minibatch()), 0.0, "{name}");
+    }
+}
+
+#[test]
+fn a_policy_never_looks_across_an_episodes_beginning() {
+    for (name, experiment) in every_low_level() {
+        let learner = learner(&experiment, 1);
+        let base = unrolls(&learner, &experiment, 4);
+        let mut other = base.clone();
+        // Unroll 0 ends an episode in row 3: what was before has no influence on rows 4 and later.
+        other.proprioception[..3 * 5].fill(0.9);
+        other.task[..3 * 4].fill(-0.9);
+        let state = other.state.len() / other.count;
+        other.state[..state].fill(0.3);
+        let means = |unrolls: &Unrolls| {
+            let count = unrolls.count as i64;
+            let tensor = |values: &[f32], length: usize| {
+                Tensor::from_slice(values).reshape([
+                    count,
+                    length as i64,
+                    (values.len() / unrolls.count / length) as i64,
+                ])
+            };
+            let observation = learner.policy().normalise(
+                &tensor(&unrolls.proprioception, LENGTH + 1).narrow(1, 0, LENGTH as i64),
+                &tensor(&unrolls.task, LENGTH + 1).narrow(1, 0, LENGTH as i64),
+                None,
+            );
+            let state = Tensor::from_slice(&unrolls.state).reshape([count, state as i64]);
+            let first = tensor(&unrolls.first, LENGTH + 1).squeeze_dim(-1).narrow(1, 0, LENGTH as i64);
+            let previous = tensor(&unrolls.previous_latent, LENGTH);
+            let noise = tensor(&unrolls.latent_noise, LENGTH);
+            let memory = Memory { state: &state, first: Some(&first) };
+            learner.policy().act(&observation, &previous, &noise, memory).action.mean()
+        };
+        let change = (means(&base) - means(&other)).abs().amax([-1], false);
+        let largest = |from: i64, rows: i64| change.narrow(0, from, rows).max().double_value(&[]);
+        assert!(largest(0, 3) > 1e-4, "{name}: the rows that were changed");
+        assert_eq!(largest(4, LENGTH as i64 - 4), 0.0, "{name}");
+    }
+}
+
+#[test]
+fn primitives_never_see_the_reference() {
+    for (name, experiment) in every_low_level().into_iter().skip(2) {
+        let learner = learner(&experiment, 1);
+        let influence = || {
+            let zeros = |width: i64| Tensor::zeros([2, width], (Kind::Float, Device::Cpu));
+            let reference = zeros(4).set_requires_grad(true);
+            let observation = learner.policy().normalise(&zeros(5), &reference, None);
+            let latent = experiment.network.latent.size as i64;
+            let memory = Memory { state: &zeros(0), first: None };
+            let acting = learner.policy().act(&observation, &zeros(latent), &zeros(latent), memory);
+            let total = acting.action.mean().square().sum(Kind::Float) + acting.action.std().sum(Kind::Float);
+            Tensor::run_backward(&[total], &[&reference], false, false)
+                .remove(0)
+                .abs()
+                .sum(Kind::Float)
+                .double_value(&[])
+        };
+        assert!(influence() > 0.0, "{name}: the reference reaches the action");
+        // Where the weights no longer hang on it, nothing does.
+        let gate =
+            if experiment.network.latent.size > 0 { "low_level.gate.head.weight" } else { "encoder.head.weight" };
+        let mut weights = learner.policy_store().variables().remove(gate).unwrap();
+        let _ = tch::no_grad(|| weights.zero_());
+        assert_eq!(influence(), 0.0, "{name}");
+    }
+}

@@ -1,0 +1,34 @@
+//! The recurrent low level.
+
+use tch::{Tensor, nn};
+
+use super::{Config, Input, LowLevel, Output};
+use crate::ActionDistribution;
+use crate::layers::{GaussianHead, GaussianHeadConfig};
+use crate::lstm::LstmStack;
+
+/// `[z, s]` → stacked LSTM layers (S: 384 and 256 units) → mean and σ.
+#[derive(Debug)]
+pub(crate) struct LstmLowLevel {
+    stack: LstmStack,
+    head: GaussianHead,
+}
+
+impl LstmLowLevel {
+    pub(crate) fn new(path: &nn::Path, config: &Config<'_>) -> Self {
+        let network = config.network;
+        let stack = LstmStack::new(path, config.latent + config.proprioception, &network.lstm.units);
+        let head = GaussianHead::new(path, stack.output(), &GaussianHeadConfig::of_actions(config.pose, network));
+        Self { stack, head }
+    }
+}
+
+impl LowLevel for LstmLowLevel {
+    fn act(&self, input: &Input<'_>) -> Output {
+        let joined = Tensor::cat(&[input.intent, input.proprioception], 1);
+        let unrolls = input.memory.state.size()[0];
+        let (hidden, state) = self.stack.forward(&joined.reshape([unrolls, -1, joined.size()[1]]), input.memory);
+        let hidden = hidden.flatten(0, 1);
+        Output { action: ActionDistribution::Gaussian(self.head.forward(&hidden, &joined)), state }
+    }
+}

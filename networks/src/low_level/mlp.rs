@@ -1,0 +1,32 @@
+//! The feed-forward low level.
+
+use tch::{Tensor, nn};
+
+use super::{Config, Input, LowLevel, Output};
+use crate::ActionDistribution;
+use crate::layers::{GaussianHead, GaussianHeadConfig, Torso};
+
+/// `[z, s]` → torso → mean and σ (S: 2×1024). The mean's bias starts at the pose, σ at `initial_std`; the head's weights
+/// are scaled by `policy_head_scale`.
+#[derive(Debug)]
+pub(crate) struct MlpLowLevel {
+    torso: Torso,
+    head: GaussianHead,
+}
+
+impl MlpLowLevel {
+    pub(crate) fn new(path: &nn::Path, config: &Config<'_>) -> Self {
+        let network = config.network;
+        let torso = Torso::new(path, config.latent + config.proprioception, &network.mlp.hidden);
+        let head = GaussianHead::new(path, torso.output(), &GaussianHeadConfig::of_actions(config.pose, network));
+        Self { torso, head }
+    }
+}
+
+impl LowLevel for MlpLowLevel {
+    fn act(&self, input: &Input<'_>) -> Output {
+        let joined = Tensor::cat(&[input.intent, input.proprioception], 1);
+        let action = self.head.forward(&self.torso.forward(&joined), &joined);
+        Output { action: ActionDistribution::Gaussian(action), state: input.memory.state.shallow_clone() }
+    }
+}

@@ -1,0 +1,100 @@
+//! What mixture and product are made of.
+
+use tch::{Tensor, nn};
+
+use super::{Config, Input};
+use crate::DiagonalGaussian;
+use crate::layers::{Torso, inverse_softplus, linear};
+
+/// The outermost fixed bias of a primitive's mean (S).
+const LARGEST_BIAS: f64 = 0.66;
+
+/// K Gaussians over actions, made of proprioception alone: a shared torso (S: 2×512), then a hidden layer (S: 256) and
+/// a head for each.
+///
+/// The heads start like [the MLP's](super::mlp), with σ at the `initial_std` given.
+#[derive(Debug)]
+pub(crate) struct Primitives {
+    torso: Torso,
+    /// Every primitive's hidden layer, side by side.
+    hidden: nn::Linear,
+    /// `[K, hidden, 2·A]`.
+    heads: Tensor,
+    /// `[K, 1, 2·A]`.
+    head_biases: Tensor,
+    /// What is added to every dimension of each primitive's mean, `[K, 1]`, and not trained.
+    fixed_biases: Option<Vec<f32>>,
+    count: i64,
+    min_std: f64,
+}
+
+impl Primitives {
+    pub(crate) fn new(path: &nn::Path, config: &Config<'_>, initial_std: f64) -> Self {
+        let (network, sizes) = (config.network, &config.network.primitives);
+        let (count, units, actions) = (sizes.count as i64, sizes.hidden as i64, config.pose.len() as i64);
+        let path = path / "primitives";
+        let torso = Torso::new(&path, config.proprioception, &sizes.torso);
+        let hidden = linear(&(&path / "hidden"), torso.output(), count * units, 1.0);
+        let bound = network.policy_head_scale / (units as f64).sqrt();
+        let weights = if bound > 0.0 { nn::Init::Uniform { lo: -bound, up: bound } } else { nn::Init::Const(0.0) };
+        let heads = path.var("heads", &[count, units, 2 * actions], weights);
+        let head_biases = path.var("head_biases", &[count, 1, 2 * actions], nn::Init::Const(0.0));
+        let raw = inverse_softplus(initial_std - network.min_std) as f32;
+        let bias: Vec<f32> = config.pose.iter().copied().chain(std::iter::repeat_n(raw, config.pose.len())).collect();
+        tch::no_grad(|| head_biases.shallow_clone().copy_(&Tensor::from_slice(&bias)));
+        let fixed_biases = sizes.biases.then(|| evenly(sizes.count));
+        Self { torso, hidden, heads, head_biases, fixed_biases, count, min_std: network.min_std }
+    }
+
+    /// `[N, P]` to Gaussians over `[N, K, A]`.
+    pub(crate) fn forward(&self, proprioception: &Tensor) -> DiagonalGaussian {
+        let hidden = self.torso.forward(proprioception).apply(&self.hidden).elu_();
+        // [K, N, units], so that each primitive's head is one product.
+        let hidden = hidden.unflatten(-1, [self.count, -1]).transpose(0, 1);
+        let output = self.head_biases.baddbmm(&hidden, &self.heads, 1.0, 1.0).transpose(0, 1);
+        let actions = output.size()[2] / 2;
+        let mut mean = output.narrow(2, 0, actions);
+        if let Some(biases) = &self.fixed_biases {
+            mean = mean + Tensor::from_slice(biases).to_device(output.device()).unsqueeze(-1);
+        }
+        let std = output.narrow(2, actions, actions).softplus() + self.min_std;
+        DiagonalGaussian { mean, std }
+    }
+}
+
+fn evenly(count: usize) -> Vec<f32> {
+    let step = 2.0 * LARGEST_BIAS / (count.max(2) - 1) as f64;
+    (0..count).map(|index| (index as f64 * step - LARGEST_BIAS) as f32).collect()
+}
+
+/// What weighs the primitives: K numbers a row, of any size.
+///
+/// With a bottleneck `[z, s]` → MLP (S: 2×400) → K; without one the encoder gives the K numbers itself.
+#[derive(Debug)]
+pub(crate) struct Gate {
+    bottleneck: Option<(Torso, nn::Linear)>,
+}
+
+impl Gate {
+    pub(crate) fn new(path: &nn::Path, config: &Config<'_>) -> Self {
+        let sizes = &config.network.primitives;
+        let bottleneck = (config.network.latent.size > 0).then(|| {
+            let path = path / "gate";
+            let torso = Torso::new(&path, config.latent + config.proprioception, &sizes.gate);
+            let head = linear(&(&path / "head"), torso.output(), sizes.count as i64, 1.0);
+            (torso, head)
+        });
+        Self { bottleneck }
+    }
+
+    /// `[N, K]`.
+    pub(crate) fn forward(&self, input: &Input<'_>) -> Tensor {
+        match &self.bottleneck {
+            Some((torso, head)) => {
+                let joined = Tensor::cat(&[input.intent, input.proprioception], 1);
+                torso.forward(&joined).apply(head)
+            }
+            None => input.intent.shallow_clone(),
+        }
+    }
+}
