@@ -57,8 +57,8 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
     let (mut means, mut stds, mut weights, mut latents) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for t in 0..LENGTH {
         let begins = rows(&unrolls.first, LENGTH + 1, t);
-        previous = previous * (1.0 - &begins);
-        remembered = remembered * (1.0 - &begins);
+        previous = (1.0 - &begins) * previous;
+        remembered = (1.0 - begins) * remembered;
         latents.push(previous.copy());
         let acting = tch::no_grad(|| {
             let observation = learner.policy().normalise(

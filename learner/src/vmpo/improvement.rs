@@ -85,12 +85,13 @@ pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits
     let (policy, temperature) = expectation_step(evidence, &mask, &multipliers.temperature(), limits);
     let kl_mean = masked_mean(evidence.kl_mean, evidence.valid);
     let kl_std = masked_mean(evidence.kl_std, evidence.valid);
-    let mut alpha = constraint(&kl_mean, &multipliers.alpha_mean(), limits.epsilon_mean)
+    let gaussian = constraint(&kl_mean, &multipliers.alpha_mean(), limits.epsilon_mean)
         + constraint(&kl_std, &multipliers.alpha_std(), limits.epsilon_std);
     let kl_weights = evidence.kl_weights.map(|kl| masked_mean(kl, evidence.valid));
-    if let (Some(kl), Some(multiplier)) = (&kl_weights, multipliers.alpha_discrete()) {
-        alpha = alpha + constraint(kl, &multiplier, limits.epsilon_discrete);
-    }
+    let alpha = match (&kl_weights, multipliers.alpha_discrete()) {
+        (Some(kl), Some(multiplier)) => gaussian + constraint(kl, &multiplier, limits.epsilon_discrete),
+        _ => gaussian,
+    };
     Improvement {
         policy,
         temperature,

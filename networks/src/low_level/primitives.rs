@@ -53,10 +53,11 @@ impl Primitives {
         let hidden = hidden.unflatten(-1, [self.count, -1]).transpose(0, 1);
         let output = self.head_biases.baddbmm(&hidden, &self.heads, 1.0, 1.0).transpose(0, 1);
         let actions = output.size()[2] / 2;
-        let mut mean = output.narrow(2, 0, actions);
-        if let Some(biases) = &self.fixed_biases {
-            mean = mean + Tensor::from_slice(biases).to_device(output.device()).unsqueeze(-1);
-        }
+        let mean = output.narrow(2, 0, actions);
+        let mean = match &self.fixed_biases {
+            Some(biases) => mean + Tensor::from_slice(biases).to_device(output.device()).unsqueeze(-1),
+            None => mean,
+        };
         let std = output.narrow(2, actions, actions).softplus() + self.min_std;
         DiagonalGaussian { mean, std }
     }
