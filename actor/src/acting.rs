@@ -239,3 +239,69 @@ pub trait ForwardPass {
     /// When the library beneath fails.
     fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error>;
 }
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng as _;
+    use rand_pcg::Pcg64;
+
+    use super::*;
+
+    const SIZES: ActingSizes =
+        ActingSizes { proprioception: 0, task: 0, latent: 0, action: 2, image: 0, components: 3, state: 4 };
+
+    /// Components that no noise can confuse, and their weights.
+    fn mixture(weights: [f32; 3]) -> ActingBatch {
+        let mut batch = ActingBatch::new(1, SIZES);
+        batch.mean = vec![-10.0, -20.0, 0.5, 0.25, 10.0, 20.0];
+        batch.std.fill(0.1);
+        batch.log_weights = weights.map(f32::ln).to_vec();
+        batch
+    }
+
+    #[test]
+    fn a_mixture_draws_its_components_by_their_weights_and_acts_by_one_of_them() {
+        let mut batch = mixture([0.2, 0.5, 0.3]);
+        let mut rng = Pcg64::seed_from_u64(1);
+        let mut counts = [0_u32; 3];
+        let mut action = [0.0; 2];
+        for _ in 0..10_000 {
+            batch.row(0).sample(&mut action, &mut rng);
+            let component = if action[0] < -5.0 { 0 } else { 1 + usize::from(action[0] > 5.0) };
+            let mean = &batch.mean[2 * component..2 * component + 2];
+            assert!(action.iter().zip(mean).all(|(action, mean)| (action - mean).abs() < 1.0), "{action:?}");
+            counts[component] += 1;
+        }
+        // Five standard deviations of a count are 250.
+        for (count, expected) in counts.into_iter().zip([2_000, 5_000, 3_000]) {
+            assert!(count.abs_diff(expected) < 250, "{counts:?}");
+        }
+    }
+
+    #[test]
+    fn without_noise_the_likeliest_component_acts() {
+        assert_eq!(mixture([0.2, 0.3, 0.5]).row(0).mode(), [10.0, 20.0]);
+        assert_eq!(mixture([0.2, 0.5, 0.3]).row(0).mode(), [0.5, 0.25]);
+        let mut one = ActingBatch::new(1, ActingSizes { components: 1, ..SIZES });
+        one.mean = vec![0.5, -0.5];
+        assert_eq!(one.row(0).mode(), [0.5, -0.5]);
+    }
+
+    #[test]
+    fn weights_that_rounding_leaves_short_of_one_still_draw_a_component() {
+        assert_eq!(draw(&[0.1_f32.ln(), 0.2_f32.ln()], 0.999), 1);
+        assert_eq!(draw(&[0.0, f32::NEG_INFINITY], 0.0), 0);
+    }
+
+    #[test]
+    fn a_decision_fills_every_component_and_forgetting_empties_the_mind() {
+        let mut batch = mixture([0.2, 0.3, 0.5]);
+        batch.state.fill(1.0);
+        let mut row = batch.row(0);
+        row.decide(|mean| mean.copy_from_slice(&[0.1, 0.2]), 0.3);
+        row.forget();
+        assert_eq!(batch.mean, [0.1, 0.2, 0.1, 0.2, 0.1, 0.2]);
+        assert_eq!((batch.std, batch.state), (vec![0.3; 6], vec![0.0; 4]));
+        assert!(batch.log_weights.iter().all(|weight| (weight.exp() - 1.0 / 3.0).abs() < 1e-6));
+    }
+}

@@ -5,6 +5,7 @@
 
 mod acting;
 mod figure;
+mod memory;
 mod physics;
 mod tape;
 mod vision;
@@ -15,7 +16,7 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use comic_clips::Catalogue;
-use comic_experiment::{Experiment, TaskName};
+use comic_experiment::{Experiment, LowLevelName, TaskName};
 use comic_tasks::{Simulated, Task};
 
 use crate::Error;
@@ -28,6 +29,7 @@ const ENVIRONMENTS: usize = 16;
 /// `ratio` is always value / floor. `actor.env`, `actor.policy`: steps/s, resets included, against the same controls
 /// through the physics alone. `actor.threads`: steps/s of two threads against one. `actor.reset`: ms. `actor.wire`: ms
 /// of one core that an update's worth of unrolls costs between a worker and a batch, against one second.
+/// `actor.vision`: ms an image. `actor.memory`: MiB held after 10,000 resets against those after 1,000.
 #[derive(Args, Clone, Debug)]
 pub struct Bench {
     /// Seconds for each figure.
@@ -36,6 +38,9 @@ pub struct Bench {
     /// The task: tracking, go-to-target, gaps, walls, get-up or ball-catch.
     #[arg(long, default_value_t = TaskName::Tracking)]
     task: TaskName,
+    /// The low level of what acts: mlp, lstm, mixture or product; another than the MLP adds its name to the figure's.
+    #[arg(long, default_value_t = LowLevelName::Mlp)]
+    low_level: LowLevelName,
     /// Only these figures.
     #[arg(value_enum)]
     figures: Vec<Name>,
@@ -50,6 +55,7 @@ enum Name {
     Reset,
     Wire,
     Vision,
+    Memory,
 }
 
 /// What all figures are measured on: the paper's networks, one built-in walk or another task.
@@ -73,13 +79,14 @@ impl Bench {
     pub fn run(&self) -> Result<(), Error> {
         let budget = Duration::try_from_secs_f64(self.seconds)
             .map_err(|error| Error::Usage(format!("--seconds {}: {error}", self.seconds)))?;
-        let experiment = Experiment { task: self.task, ..Experiment::default() };
+        let paper = comic_experiment::resolve(&format!("tracking-{}", self.low_level), &[])?;
+        let experiment = Experiment { task: self.task, ..paper };
         let catalogue = Catalogue::open(&experiment.clips)?;
         let task = comic_tasks::build(&experiment, &catalogue)?;
         let subject = Subject { experiment, task, budget };
-        // Images need OpenGL, which a machine that only counts steps may lack: they are measured when asked for.
+        // Images need OpenGL, which a machine that only counts steps may lack, and memory minutes: when asked for.
         let wanted = |name: &&Name| match self.figures.as_slice() {
-            [] => **name != Name::Vision,
+            [] => !matches!(name, Name::Vision | Name::Memory),
             figures => figures.contains(name),
         };
         for name in Name::value_variants().iter().filter(wanted) {
@@ -90,8 +97,9 @@ impl Bench {
                 Name::Reset => physics::reset(&subject)?,
                 Name::Wire => wire::wire(&subject)?,
                 Name::Vision => vision::vision(&subject)?,
+                Name::Memory => memory::memory(&subject)?,
             };
-            figure.print()?;
+            figure.of(self.low_level).print()?;
         }
         Ok(())
     }

@@ -78,6 +78,36 @@ pub enum LowLevelName {
     Product,
 }
 
+impl LowLevelName {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::Mlp, Self::Lstm, Self::Mixture, Self::Product];
+
+    /// As experiments and command lines write it; the paper's preset is `tracking-` and this.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Mlp => "mlp",
+            Self::Lstm => "lstm",
+            Self::Mixture => "mixture",
+            Self::Product => "product",
+        }
+    }
+}
+
+impl std::fmt::Display for LowLevelName {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.write_str(self.name())
+    }
+}
+
+impl std::str::FromStr for LowLevelName {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|low_level| low_level.name() == name);
+        found.ok_or_else(|| format!("no low level `{name}`; low levels are {}", Self::ALL.map(Self::name).join(", ")))
+    }
+}
+
 /// The MLP low level.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]

@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
-use comic_experiment::{Experiment, TaskSpec};
+use comic_experiment::{Experiment, LowLevelName, TaskSpec};
 use comic_proto::UnrollShape;
 use serde_json::json;
 use tch::{Device, Kind, Tensor};
@@ -34,25 +34,89 @@ impl Product {
     }
 }
 
+/// libtorch's own LSTM on the shapes of ours, forward and backward.
+struct FusedLstm {
+    /// `[T, B, inputs]`.
+    input: Tensor,
+    /// `[B, units]`, h and c.
+    state: [Tensor; 2],
+    /// Of the input, of the state, and both biases.
+    weights: Vec<Tensor>,
+}
+
+impl FusedLstm {
+    fn new(steps: i64, unrolls: i64, inputs: i64, units: i64) -> Self {
+        let random = |size: &[i64]| Tensor::randn(size, (Kind::Float, Device::Cpu));
+        let weights = [vec![4 * units, inputs], vec![4 * units, units], vec![4 * units], vec![4 * units]];
+        Self {
+            input: random(&[steps, unrolls, inputs]).set_requires_grad(true),
+            state: [(); 2].map(|()| random(&[1, unrolls, units])),
+            weights: weights.iter().map(|size| (random(size) * 0.05).set_requires_grad(true)).collect(),
+        }
+    }
+
+    fn run(&self) {
+        let (output, ..) = self.input.lstm(&self.state, &self.weights, true, 1, 0.0, true, false, false);
+        let inputs: Vec<&Tensor> = self.weights.iter().chain([&self.input]).collect();
+        let _ = Tensor::run_backward(&[output.sum(Kind::Float)], &inputs, false, false);
+    }
+}
+
+/// The least an update can cost: its products, and the LSTM layers of a library.
+#[derive(Default)]
+struct Floor {
+    products: Vec<Product>,
+    lstms: Vec<FusedLstm>,
+}
+
+impl Floor {
+    /// Hidden layers and an output over `rows`; `flows_on` says whether anything below them is learnt.
+    fn layers(&mut self, rows: i64, input: i64, hidden: &[usize], output: i64, flows_on: bool) {
+        let mut width = input;
+        for (index, size) in hidden.iter().enumerate() {
+            self.products.push(Product::new(rows, width, *size as i64, flows_on || index > 0));
+            width = *size as i64;
+        }
+        if output > 0 {
+            self.products.push(Product::new(rows, width, output, flows_on || !hidden.is_empty()));
+        }
+    }
+
+    /// Stacked LSTM layers over `rows` of `unrolls`; gives the width of the last.
+    fn lstm(&mut self, rows: i64, unrolls: i64, input: i64, units: &[usize]) -> i64 {
+        units.iter().fold(input, |width, units| {
+            self.lstms.push(FusedLstm::new(rows / unrolls, unrolls, width, *units as i64));
+            *units as i64
+        })
+    }
+
+    fn run(&self) {
+        self.products.iter().for_each(Product::run);
+        self.lstms.iter().for_each(FusedLstm::run);
+    }
+}
+
 /// Prints `learner.update` as one JSON line: milliseconds for a gradient step of paper size (128 unrolls of 32), floor
-/// the matrix products of the same shapes, forward and backward, on the same threads; medians of interleaved runs.
+/// the matrix products of the same shapes, forward and backward, on the same threads, and libtorch's own LSTM where there
+/// is one; medians of interleaved runs. Another low level than the MLP is the preset's of its name, and the figure's
+/// name says it.
 ///
 /// # Errors
 /// When libtorch refuses.
-pub fn run(threads: usize, repeats: usize) -> Result<()> {
+pub fn run(threads: usize, repeats: usize, low_level: LowLevelName) -> Result<()> {
     tch::set_num_threads(threads as i32);
     tch::manual_seed(1);
-    let experiment = Experiment::default();
+    let experiment = comic_experiment::resolve(&format!("tracking-{low_level}"), &[])?;
     let spec =
         TaskSpec::new(&experiment, vec!["clip".into()]).map_err(|name| anyhow::anyhow!("no observation `{name}`"))?;
     let mut learner = VmpoLearner::new(&spec, &experiment, &vec![0.0; spec.action], Device::Cpu)?;
     let minibatch = random_minibatch(&spec, &experiment)?;
-    let products = products(&spec, &experiment);
+    let least = floor(&spec, &experiment);
     let (mut updates, mut floors) = (Vec::new(), Vec::new());
     for repeat in 0..repeats + 2 {
         let update = milliseconds(|| learner.step(&minibatch).map(|losses| losses.to_metrics()))?;
         let floor = milliseconds(|| -> Result<(), crate::vmpo::Error> {
-            products.iter().for_each(Product::run);
+            least.run();
             Ok(())
         })?;
         // The first two warm up.
@@ -62,37 +126,60 @@ pub fn run(threads: usize, repeats: usize) -> Result<()> {
         }
     }
     let (value, floor) = (median(updates), median(floors));
+    let figure = match low_level {
+        LowLevelName::Mlp => "learner.update".to_string(),
+        other => format!("learner.update.{other}"),
+    };
     let line = json!({
-        "figure": "learner.update", "value": value, "unit": "ms", "floor": floor, "ratio": value / floor,
+        "figure": figure, "value": value, "unit": "ms", "floor": floor, "ratio": value / floor,
         "threads": threads, "repeats": repeats,
     });
     println!("{line}");
     Ok(())
 }
 
-fn products(spec: &TaskSpec, experiment: &Experiment) -> Vec<Product> {
+fn floor(spec: &TaskSpec, experiment: &Experiment) -> Floor {
     let network = &experiment.network;
-    let steps = (experiment.unroll.batch * experiment.unroll.length) as i64;
-    let observations = steps + experiment.unroll.batch as i64;
-    let latent = network.latent.size as i64;
-    let sensed = (spec.task + spec.proprioception) as i64;
-    let mut products = Vec::new();
-    let mut layers = |rows: i64, input: i64, hidden: &[usize], output: i64, flows_on: bool| {
-        let mut width = input;
-        for (index, size) in hidden.iter().enumerate() {
-            products.push(Product::new(rows, width, *size as i64, flows_on || index > 0));
-            width = *size as i64;
-        }
-        products.push(Product::new(rows, width, output, true));
-    };
-    layers(steps, sensed + latent, &network.encoder, 2 * latent, false);
-    layers(steps, latent + spec.proprioception as i64, &network.mlp.hidden, 2 * spec.action as i64, true);
-    let embedding = network.clip_embedding as i64;
-    layers(observations, sensed + embedding, &network.value, spec.reward_terms.len() as i64, true);
-    if network.encoder_linear_path {
-        products.push(Product::new(steps, sensed + latent, 2 * latent, false));
+    let (unrolls, length) = (experiment.unroll.batch as i64, experiment.unroll.length as i64);
+    let (steps, observations) = (unrolls * length, unrolls * (length + 1));
+    let (latent, actions) = (network.latent.size as i64, 2 * spec.action as i64);
+    let (proprioception, sensed) = (spec.proprioception as i64, (spec.task + spec.proprioception) as i64);
+    let primitives = &network.primitives;
+    let mut floor = Floor::default();
+    let encoded = if latent > 0 { 2 * latent } else { primitives.count as i64 };
+    floor.layers(steps, sensed + latent, &network.encoder, encoded, false);
+    if network.encoder_linear_path && latent > 0 {
+        floor.layers(steps, sensed + latent, &[], 2 * latent, false);
     }
-    products
+    match network.low_level {
+        LowLevelName::Mlp => floor.layers(steps, latent + proprioception, &network.mlp.hidden, actions, true),
+        LowLevelName::Lstm => {
+            let units = floor.lstm(steps, unrolls, latent + proprioception, &network.lstm.units);
+            floor.layers(steps, units, &[], actions, true);
+        }
+        LowLevelName::Mixture | LowLevelName::Product => {
+            floor.layers(steps, proprioception, &primitives.torso, 0, false);
+            let torso = primitives.torso.last().map_or(proprioception, |size| *size as i64);
+            floor.layers(steps, torso, &[], (primitives.count * primitives.hidden) as i64, true);
+            for _ in 0..primitives.count {
+                floor.layers(steps, primitives.hidden as i64, &[], actions, true);
+            }
+            if latent > 0 {
+                floor.layers(steps, latent + proprioception, &primitives.gate, primitives.count as i64, true);
+            }
+        }
+    }
+    let input = sensed + network.clip_embedding as i64;
+    let terms = spec.reward_terms.len() as i64;
+    if network.value_lstm.is_empty() {
+        floor.layers(observations, input, &network.value, terms, true);
+    } else {
+        floor.layers(observations, input, &network.value, 0, true);
+        let hidden = network.value.last().map_or(input, |size| *size as i64);
+        let units = floor.lstm(observations, unrolls, hidden, &network.value_lstm);
+        floor.layers(observations, units, &[], terms, true);
+    }
+    floor
 }
 
 fn random_minibatch(spec: &TaskSpec, experiment: &Experiment) -> Result<MinibatchTensors> {

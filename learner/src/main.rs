@@ -19,7 +19,9 @@ fn main() -> ExitCode {
         LogFormat::Json => log.json().init(),
     }
     let ended = match &options.command {
-        Some(Command::Bench { threads, repeats }) => comic_learner::bench::run(*threads, *repeats),
+        Some(Command::Bench { threads, repeats, low_level }) => {
+            comic_learner::bench::run(*threads, *repeats, *low_level)
+        }
         None => comic_learner::run::run(&options),
     };
     match ended {

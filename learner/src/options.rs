@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context as _, Result};
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use comic_experiment::{ClipSource, Experiment};
+use comic_experiment::{ClipSource, Experiment, LowLevelName};
 
 /// Learns reusable motor skills from the experience that comic-actor processes stream to it.
 #[derive(Debug, Parser)]
@@ -74,6 +74,9 @@ pub enum Command {
         /// Interleaved repeats, of which the median is taken.
         #[arg(long, default_value_t = 15)]
         repeats: usize,
+        /// The low level: mlp, lstm, mixture or product.
+        #[arg(long, default_value_t = LowLevelName::Mlp)]
+        low_level: LowLevelName,
     },
 }
 

@@ -1,7 +1,8 @@
 //! Numbers of other people's code: rlax's `vmpo_loss`, PyTorch's distributions, rlax's returns.
 //!
-//! Reads every `vmpo_*.npz`, `gaussian_*.npz` and `returns_*.npz` of the folder that COMIC_VMPO_FIXTURES names, of
-//! `tests/fixtures/vmpo` without it. `tests/python/make_vmpo_fixtures.py` makes them.
+//! Reads every `vmpo_*.npz`, `gaussian_*.npz`, `mixture_*.npz`, `product_*.npz` and `returns_*.npz` of the folder that
+//! COMIC_VMPO_FIXTURES names, of `tests/fixtures/vmpo` without it. `tests/python/make_vmpo_fixtures.py` and
+//! `make_distribution_fixtures.py` make them.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
@@ -9,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use comic_experiment::Prior;
 use comic_learner::vmpo::{Evidence, Limits, Multipliers, policy_improvement, returns};
-use comic_networks::DiagonalGaussian;
+use comic_networks::{ActionDistribution, DiagonalGaussian};
 use npyz::npz::NpzArchive;
 use tch::{Device, Kind, Tensor};
 
@@ -68,7 +69,9 @@ fn fixtures(kind: &str) -> Vec<Fixture> {
     files.retain(|path| path.extension().is_some_and(|extension| extension == "npz"));
     files.sort();
     let is = |path: &Path, kind: &str| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(kind));
-    let known = files.iter().any(|path| ["vmpo_", "gaussian_", "returns_"].iter().any(|kind| is(path, kind)));
+    let known = files
+        .iter()
+        .any(|path| ["vmpo_", "gaussian_", "returns_", "mixture_", "product_"].iter().any(|kind| is(path, kind)));
     assert!(known, "{} holds no fixture; tests/python/make_vmpo_fixtures.py makes them", folder.display());
     files.retain(|path| is(path, kind));
     if files.is_empty() {
@@ -137,5 +140,57 @@ fn returns_equal_rlax_on_each_episodes_piece() {
         let [reward, discount, valid, values] = &arrays;
         let gamma = fixture.scalar("gamma");
         fixture.compare("returns", &returns(reward, discount, valid, values, gamma, 1.0));
+    }
+}
+
+/// The arrays that gradients are taken of.
+const LEARNT: [&str; 3] = ["logits", "mean", "std"];
+
+fn log_softmax(logits: &Tensor) -> Tensor {
+    logits.log_softmax(-1, None::<Kind>)
+}
+
+fn compare_gradients(fixture: &mut Fixture, total: &Tensor, learnt: &[Tensor; 3]) {
+    let gradients = Tensor::run_backward(&[total], learnt, false, false);
+    for (name, gradient) in LEARNT.into_iter().zip(&gradients) {
+        fixture.compare(&format!("grad_{name}"), gradient);
+    }
+}
+
+#[test]
+fn mixtures_equal_pytorchs_distributions() {
+    for mut fixture in fixtures("mixture_") {
+        let learnt = LEARNT.map(|name| fixture.array(name).set_requires_grad(true));
+        let [logits, mean, std] = &learnt;
+        let components = DiagonalGaussian { mean: mean.shallow_clone(), std: std.shallow_clone() };
+        let policy = ActionDistribution::Mixture { log_weights: log_softmax(logits), components };
+        let components = DiagonalGaussian { mean: fixture.array("old_mean"), std: fixture.array("old_std") };
+        let behaviour =
+            ActionDistribution::Mixture { log_weights: log_softmax(&fixture.array("old_logits")), components };
+        let log_prob = policy.log_prob(&fixture.array("action"));
+        let (kl_mean, kl_std) = (policy.kl_mean(&behaviour), policy.kl_std(&behaviour));
+        let kl_weights = policy.kl_weights(&behaviour).unwrap();
+        fixture.compare("log_prob", &log_prob);
+        fixture.compare("kl_mean", &kl_mean);
+        fixture.compare("kl_std", &kl_std);
+        fixture.compare("kl_weights", &kl_weights);
+        fixture.compare("expectation", &policy.mean());
+        let total = (log_prob + kl_mean + kl_std + kl_weights).sum(Kind::Float);
+        compare_gradients(&mut fixture, &total, &learnt);
+    }
+}
+
+#[test]
+fn products_equal_gaussian_distributions_made_by_hand() {
+    for mut fixture in fixtures("product_") {
+        let learnt = LEARNT.map(|name| fixture.array(name).set_requires_grad(true));
+        let [logits, mean, std] = &learnt;
+        let primitives = DiagonalGaussian { mean: mean.shallow_clone(), std: std.shallow_clone() };
+        let product = primitives.product(&logits.sigmoid());
+        fixture.compare("product_mean", &product.mean);
+        fixture.compare("product_std", &product.std);
+        let log_prob = product.log_prob(&fixture.array("action"));
+        fixture.compare("log_prob", &log_prob);
+        compare_gradients(&mut fixture, &log_prob.sum(Kind::Float), &learnt);
     }
 }

@@ -68,8 +68,9 @@ impl ActionDistribution {
 
     /// KL_discrete = KL(w_old ‖ w), `[N]`; none where there is one component.
     ///
-    /// [`kl_mean`](Self::kl_mean), [`kl_std`](Self::kl_std) and this one bound the mixture's own KL from above as
-    /// KL(old ‖ new) does for each component: the chain rule over (component, action), of which the mixture is a marginal.
+    /// The three parts bound the mixture's own KL from above as they bound each component's, by the chain rule over
+    /// (component, action), of which the mixture is a marginal. They bound a Gaussian's where it grows no narrower, since
+    /// KL_μ is measured in the old deviation; beyond that V-MPO's limits are an approximation, as for one Gaussian.
     pub fn kl_weights(&self, behaviour: &Self) -> Option<Tensor> {
         match (self, behaviour) {
             (Self::Mixture { log_weights, .. }, Self::Mixture { log_weights: old, .. }) => {

@@ -58,6 +58,15 @@ impl DiagonalGaussian {
         sum_last(&terms)
     }
 
+    /// Π_k N_k^{w_k}, normalised: of K Gaussians over `[.., K, D]` and positive exponents `[.., K]` one over `[.., D]`, with
+    /// precision Σ w_k / σ_k² and the mean that the precisions weigh.
+    pub fn product(&self, exponents: &Tensor) -> Self {
+        let sum = |terms: &Tensor| terms.sum_dim_intlist(-2i64, false, None::<Kind>);
+        let precisions = exponents.unsqueeze(-1) / self.std.square();
+        let variance = sum(&precisions).reciprocal();
+        Self { mean: sum(&(&precisions * &self.mean)) * &variance, std: variance.sqrt() }
+    }
+
     /// KL(self ‖ N(0, I)).
     pub fn kl_to_standard_normal(&self) -> Tensor {
         let terms = (self.mean.square() + self.std.square() - 1.0) * 0.5 - self.std.log();

@@ -1,8 +1,10 @@
 //! One line of output, and the medians behind it.
 
+use std::borrow::Cow;
 use std::io::Write as _;
 use std::time::{Duration, Instant};
 
+use comic_experiment::LowLevelName;
 use serde::Serialize;
 
 use crate::Error;
@@ -12,7 +14,7 @@ const FEWEST_SEGMENTS: usize = 5;
 
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Figure {
-    figure: &'static str,
+    figure: Cow<'static, str>,
     value: f64,
     unit: &'static str,
     floor: f64,
@@ -28,7 +30,15 @@ impl Figure {
         Medians { value, floor }: Medians,
         note: &'static str,
     ) -> Self {
-        Self { figure, value, unit, floor, ratio: value / floor, note }
+        Self { figure: Cow::Borrowed(figure), value, unit, floor, ratio: value / floor, note }
+    }
+
+    /// Of a policy with this low level: the MLP's figures bear no name.
+    pub(super) fn of(mut self, low_level: LowLevelName) -> Self {
+        if low_level != LowLevelName::Mlp {
+            self.figure = format!("{}.{low_level}", self.figure).into();
+        }
+        self
     }
 
     pub(super) fn print(&self) -> Result<(), Error> {

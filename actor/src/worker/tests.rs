@@ -65,7 +65,8 @@ impl Environment for Counter {
     }
 }
 
-/// The mean is the parameters' first byte, the latent counts the episode's steps (z_t = z_{t−1} + 1).
+/// The mean is the parameters' first byte, the latent counts the episode's steps (z_t = z_{t−1} + 1), and so does
+/// what it remembers.
 #[derive(Debug, Default)]
 struct Plain {
     parameter: f32,
@@ -80,6 +81,7 @@ impl ForwardPass for Plain {
         for (latent, previous) in batch.latent.iter_mut().zip(&batch.previous_latent) {
             *latent = previous + 1.0;
         }
+        batch.state.iter_mut().for_each(|steps| *steps += 1.0);
         batch.mean.fill(self.parameter);
         batch.std.fill(0.5);
         Ok(())
@@ -96,7 +98,7 @@ fn layout(length: usize) -> Arc<UnrollLayout> {
         reward_terms: 2,
         image: 0,
         components: 1,
-        state: 0,
+        state: 3,
     }))
 }
 
@@ -243,6 +245,16 @@ proptest! {
             }
             reported.extend(unroll.episodes.iter().map(|e| (e.steps, e.steps_left_at_start, e.returns.clone())));
             prop_assert_eq!(&reported, &expected, "an episode is reported in the unroll it ends in");
+        }
+    }
+
+    /// What an unroll says is remembered at its first row is what its episode's earlier steps left, across unrolls too.
+    #[test]
+    fn the_state_travels_from_unroll_to_unroll_and_begins_empty(length in 1_usize..10, lengths in episode_lengths()) {
+        let (layout, recorded) = record(length, &[lengths], 8);
+        for unroll in &recorded[0] {
+            let rows = Rows { layout: &layout, payload: &unroll.payload };
+            prop_assert_eq!(rows.row(Field::State, 0), vec![rows.place(0).1 as f32; 3]);
         }
     }
 

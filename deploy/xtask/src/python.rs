@@ -19,10 +19,11 @@ pub(crate) struct FixtureOptions {
 }
 
 /// The scripts that make fixtures: script, its requirements, the directory of its fixtures; all under `tests/`.
-const FIXTURES: [(&str, &str, &str); 3] = [
+const FIXTURES: [(&str, &str, &str); 4] = [
     ("make_tracking_fixtures.py", "requirements-tracking.txt", "golden"),
     ("make_task_fixtures.py", "requirements-tracking.txt", "golden"),
     ("make_vmpo_fixtures.py", "requirements-vmpo.txt", "vmpo"),
+    ("make_distribution_fixtures.py", "requirements-vmpo.txt", "vmpo"),
 ];
 
 /// Makes the tests' fixtures anew.

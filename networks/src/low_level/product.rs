@@ -1,13 +1,12 @@
 //! A product of primitives.
 
-use tch::{Kind, Tensor, nn};
+use tch::nn;
 
 use super::primitives::{Gate, Primitives};
 use super::{Config, Input, LowLevel, Output};
-use crate::{ActionDistribution, DiagonalGaussian};
+use crate::ActionDistribution;
 
-/// π(a|s, z) ∝ Π_k N_k(s)^{w_k(z, s)}, w_k in (0, 1) and not normalised (S; MCP, Peng et al., 2019): one Gaussian again,
-/// with precision Σ w_k / σ_k² and the mean that the precisions weigh.
+/// π(a|s, z) ∝ Π_k N_k(s)^{w_k(z, s)}, w_k in (0, 1) and not normalised (S; MCP, Peng et al., 2019): one Gaussian again.
 ///
 /// The exponents start near ½, so the primitives start √(K/2) wider than `initial_std`, and the product as wide (D).
 #[derive(Debug)]
@@ -27,15 +26,7 @@ impl ProductLowLevel {
 impl LowLevel for ProductLowLevel {
     fn act(&self, input: &Input<'_>) -> Output {
         let exponents = self.gate.forward(input).sigmoid();
-        let action = compose(&self.primitives.forward(input.proprioception), &exponents);
+        let action = self.primitives.forward(input.proprioception).product(&exponents);
         Output { action: ActionDistribution::Gaussian(action), state: input.memory.state.shallow_clone() }
     }
-}
-
-/// Gaussians over `[N, K, A]` and exponents `[N, K]` to one Gaussian over `[N, A]`.
-fn compose(primitives: &DiagonalGaussian, exponents: &Tensor) -> DiagonalGaussian {
-    let sum = |terms: &Tensor| terms.sum_dim_intlist(1i64, false, None::<Kind>);
-    let precisions = exponents.unsqueeze(-1) / primitives.std.square();
-    let variance = sum(&precisions).reciprocal();
-    DiagonalGaussian { mean: sum(&(&precisions * &primitives.mean)) * &variance, std: variance.sqrt() }
 }
