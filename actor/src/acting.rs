@@ -119,10 +119,7 @@ impl ActingRow<'_> {
     pub fn mode(&self) -> &[f32] {
         let components = self.log_weights.len().max(1);
         let actions = self.mean.len() / components;
-        let likelier = |best: usize, other: usize| {
-            if self.log_weights[other] > self.log_weights[best] { other } else { best }
-        };
-        let component = (1..components).fold(0, likelier);
+        let component = likeliest(self.log_weights);
         &self.mean[component * actions..(component + 1) * actions]
     }
 
@@ -138,6 +135,12 @@ impl ActingRow<'_> {
     }
 }
 
+/// The component of the largest weight; the first where there is one component, which has none.
+fn likeliest(log_weights: &[f32]) -> usize {
+    let likelier = |best: usize, other: usize| if log_weights[other] > log_weights[best] { other } else { best };
+    (1..log_weights.len()).fold(0, likelier)
+}
+
 /// The component at `uniform` in [0, 1) of the weights' sum.
 fn draw(log_weights: &[f32], uniform: f32) -> usize {
     let mut left = uniform;
@@ -147,8 +150,8 @@ fn draw(log_weights: &[f32], uniform: f32) -> usize {
             return component;
         }
     }
-    // Rounding may leave a little over.
-    log_weights.len() - 1
+    // Rounding may leave a little over: then it is the likeliest.
+    likeliest(log_weights)
 }
 
 impl ActingBatch {
@@ -290,6 +293,7 @@ mod tests {
     #[test]
     fn weights_that_rounding_leaves_short_of_one_still_draw_a_component() {
         assert_eq!(draw(&[0.1_f32.ln(), 0.2_f32.ln()], 0.999), 1);
+        assert_eq!(draw(&[(1.0_f32 - 1e-6).ln(), -80.0], 1.0 - 1e-7), 0, "and none that all but never acts");
         assert_eq!(draw(&[0.0, f32::NEG_INFINITY], 0.0), 0);
     }
 

@@ -58,7 +58,8 @@ pub fn read(path: &Path) -> Result<Checkpoint, Error> {
     for candidate in numbered(&directory)?.into_iter().rev() {
         match read_one(&candidate) {
             Ok(checkpoint) => return Ok(checkpoint),
-            Err(error) => tracing::warn!("passed over a damaged checkpoint: {error}"),
+            // With its causes: what is wrong stands in the last of them.
+            Err(error) => tracing::warn!("passed over a damaged checkpoint: {:#}", anyhow::Error::from(error)),
         }
     }
     Err(refuse(path, format!("no complete checkpoint here; {WANTED}")))

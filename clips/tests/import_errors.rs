@@ -53,6 +53,15 @@ fn a_bad_line_is_named_with_its_number_and_what_it_should_be() {
 }
 
 #[test]
+fn a_recording_that_was_cut_off_is_recognised_by_the_bones_it_lacks() {
+    let directory = tempfile::tempdir().unwrap();
+    let cut = |text: String| text[..text.rfind("\nlfemur").unwrap() + 1].to_string();
+    let message = changed(directory.path(), same, cut).unwrap_err();
+    assert!(message.contains("has other bones than the first (they differ in lfemur"), "{message}");
+    assert!(message.ends_with("is the file whole?"), "{message}");
+}
+
+#[test]
 fn a_file_of_another_kind_is_recognised() {
     let directory = tempfile::tempdir().unwrap();
     let message = changed(directory.path(), |_| String::new(), same).unwrap_err();

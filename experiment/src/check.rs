@@ -19,6 +19,9 @@ const AT_LEAST_ONE: &str = "must be at least 1";
 /// Below it a squared ratio of float32 numbers overflows; the wire refuses it too.
 const SMALLEST_STD: f64 = 1e-6;
 const AT_LEAST_STD: &str = "must be at least 1e-6";
+/// Beyond it an action is nothing but noise; the wire refuses a thousand times as much.
+const LARGEST_STD: f64 = 1e3;
+const AT_MOST_STD: &str = "must be at most 1000";
 const POSITIVE: &str = "must be positive";
 const NOT_NEGATIVE: &str = "must be 0 or more";
 
@@ -38,6 +41,7 @@ pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
     unroll(&experiment.unroll)?;
     actor(&experiment.actor)?;
     warm_start(&experiment.warm_start)?;
+    together(experiment)?;
     learner(&experiment.learner)?;
     budget(&experiment.budget)
 }
@@ -209,6 +213,7 @@ fn network(network: &Network) -> Result<(), Fault> {
     ensure("network.min_std", min_std, positive(*min_std) && *min_std >= SMALLEST_STD, AT_LEAST_STD)?;
     let holds = positive(*initial_std) && initial_std > min_std;
     ensure("network.initial_std", initial_std, holds, "must exceed network.min_std")?;
+    ensure("network.initial_std", initial_std, *initial_std <= LARGEST_STD, AT_MOST_STD)?;
     ensure("network.policy_head_scale", policy_head_scale, not_negative(*policy_head_scale), NOT_NEGATIVE)?;
     let gated = matches!(network.low_level, LowLevelName::Mixture | LowLevelName::Product);
     let (least, remedy) = if gated { (0, "must be at most 4096") } else { (1, "must be 1 to 4096") };
@@ -288,8 +293,20 @@ fn warm_start(warm_start: &WarmStart) -> Result<(), Fault> {
     let holds = *steps == 0 || *demonstration_steps > 0;
     ensure("warm_start.demonstration_steps", demonstration_steps, holds, AT_LEAST_ONE)?;
     ensure("warm_start.noise", noise, positive(*noise) && *noise >= SMALLEST_STD, AT_LEAST_STD)?;
+    ensure("warm_start.noise", noise, *noise <= LARGEST_STD, AT_MOST_STD)?;
     ensure("warm_start.minibatch_unrolls", minibatch_unrolls, *minibatch_unrolls > 0, AT_LEAST_ONE)?;
     ensure("warm_start.learning_rate", learning_rate, positive(*learning_rate), POSITIVE)
+}
+
+/// Fields that make no sense beside one another.
+fn together(experiment: &Experiment) -> Result<(), Fault> {
+    let Experiment { network, vmpo, warm_start, .. } = experiment;
+    let holds = vmpo.value_burn_in == 0 || !network.value_lstm.is_empty();
+    let remedy = "wakes a recurrent value function, and network.value_lstm names none: set one of the two";
+    ensure("vmpo.value_burn_in", vmpo.value_burn_in, holds, remedy)?;
+    // A product's mean hangs on its primitives' deviations, which a regression on the mean alone would ruin.
+    let holds = warm_start.steps == 0 || network.low_level != LowLevelName::Product;
+    ensure("warm_start.steps", warm_start.steps, holds, "must be 0 with network.low_level = \"product\"")
 }
 
 fn learner(learner: &Learner) -> Result<(), Fault> {

@@ -111,7 +111,7 @@ pub struct Vmpo {
     pub epsilon_std: f64,
     /// ε_discrete: limit on a mixture's weights (S).
     pub epsilon_discrete: f64,
-    /// η, α_μ, α_Σ at the start (S).
+    /// η at the start (S).
     pub initial_temperature: f64,
     /// α_μ at the start (S).
     pub initial_alpha_mean: f64,

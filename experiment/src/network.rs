@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 pub struct Network {
     /// Hidden sizes of the reference encoder (S: 2×1024).
     pub encoder: Vec<usize>,
-    /// A linear path from the encoder's input to its output (S: with the MLP low level).
+    /// A linear path from the encoder's input to its output (S: with the MLP low level); unused without a bottleneck.
     pub encoder_linear_path: bool,
     /// What turns latent and proprioception into an action; the section of its name holds its sizes.
     pub low_level: LowLevelName,

@@ -80,6 +80,22 @@ fn the_other_low_levels_presets_are_the_papers() {
 }
 
 #[test]
+fn fields_that_make_no_sense_beside_one_another_are_refused() {
+    let refused = |overrides: &[&str]| {
+        let overrides: Vec<String> = overrides.iter().map(ToString::to_string).collect();
+        resolve("quickstart", &overrides).unwrap_err().to_string()
+    };
+    let error = refused(&["network.low_level=product"]);
+    assert!(error.contains("warm_start.steps") && error.contains("product"), "{error}");
+    let error = refused(&["vmpo.value_burn_in=2"]);
+    assert!(error.contains("network.value_lstm"), "{error}");
+    let error = refused(&["network.latent.size=0"]);
+    assert!(error.contains("must be 1 to 4096"), "{error}");
+    resolve("quickstart", &["vmpo.value_burn_in=2".into(), "network.value_lstm=[8]".into()]).unwrap();
+    resolve("quickstart", &["network.low_level=mixture".into(), "network.latent.size=0".into()]).unwrap();
+}
+
+#[test]
 fn an_empty_document_is_the_defaults() {
     assert_eq!(Experiment::from_toml("empty.toml", "").unwrap(), Experiment::default());
 }

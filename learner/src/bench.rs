@@ -38,7 +38,7 @@ impl Product {
 struct FusedLstm {
     /// `[T, B, inputs]`.
     input: Tensor,
-    /// `[B, units]`, h and c.
+    /// `[1, B, units]`, h and c.
     state: [Tensor; 2],
     /// Of the input, of the state, and both biases.
     weights: Vec<Tensor>,

@@ -63,6 +63,7 @@ impl Fixture {
 /// Every fixture of one kind. A folder without any is no failure as long as it has fixtures of another kind.
 fn fixtures(kind: &str) -> Vec<Fixture> {
     let named = std::env::var_os("COMIC_VMPO_FIXTURES").map(PathBuf::from);
+    let own = named.is_none();
     let folder = named.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fixtures/vmpo"));
     let entries = std::fs::read_dir(&folder).unwrap_or_else(|error| panic!("{}: {error}", folder.display()));
     let mut files: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
@@ -74,6 +75,7 @@ fn fixtures(kind: &str) -> Vec<Fixture> {
         .any(|path| ["vmpo_", "gaussian_", "returns_", "mixture_", "product_"].iter().any(|kind| is(path, kind)));
     assert!(known, "{} holds no fixture; tests/python/make_vmpo_fixtures.py makes them", folder.display());
     files.retain(|path| is(path, kind));
+    assert!(!own || !files.is_empty(), "{} has lost its {kind}*.npz", folder.display());
     if files.is_empty() {
         eprintln!("{} holds no {kind}*.npz: that comparison is skipped", folder.display());
     }

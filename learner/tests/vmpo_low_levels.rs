@@ -228,3 +228,54 @@ fn primitives_never_see_the_reference() {
         assert_eq!(influence(), 0.0, "{name}");
     }
 }
+
+#[test]
+fn a_warm_start_makes_whatever_acts_aim_at_the_demonstration() {
+    let mixtures = every_low_level().into_iter().filter(|(name, _)| !name.starts_with("product"));
+    for (name, mut experiment) in mixtures {
+        experiment.optimiser.epsilon = 1e-8;
+        experiment.network.initial_std = 0.3;
+        let mut learner = learner(&experiment, 1);
+        let mut demonstration = unrolls(&learner, &experiment, 5);
+        demonstration.mean.fill(0.4);
+        let minibatch = demonstration.minibatch();
+        learner.set_learning_rates(3e-3, 1e-3);
+        let target = |learner: &VmpoLearner| {
+            // How far the components are from one another's demonstrations, whichever is drawn.
+            let unrolls = unrolls(learner, &experiment, 5);
+            let components = experiment.network.components();
+            let actions = unrolls.action.len() / unrolls.valid.len();
+            let spread = |row: &[f32]| {
+                let [low, high] = [f32::min, f32::max].map(|pick: fn(f32, f32) -> f32| {
+                    row.iter().step_by(actions).copied().reduce(pick).unwrap_or_default()
+                });
+                high - low
+            };
+            unrolls.mean.chunks_exact(components * actions).map(spread).fold(0.0, f32::max)
+        };
+        let before = target(&learner);
+        let losses: Vec<f32> =
+            (0..150).map(|_| learner.regress(&minibatch).unwrap().0.to_metrics().regression_loss).collect();
+        assert!(losses[149] < 0.5 * losses[0], "{name}: {} to {}", losses[0], losses[149]);
+        // Fixed biases set a mixture's components apart; regression brings each of them to the demonstration.
+        assert!(!name.starts_with("mixture") || target(&learner) < 0.7 * before, "{name}: {before}");
+    }
+}
+
+#[test]
+fn burnt_in_rows_teach_nothing_and_the_next_one_does() {
+    let (_, mut experiment) = every_low_level().remove(1);
+    experiment.vmpo.value_burn_in = 2;
+    let base = unrolls(&learner(&experiment, 1), &experiment, 6);
+    let changed = |row: usize| {
+        let mut other = base.clone();
+        let width = other.action.len() / other.valid.len();
+        // Unroll 2 has no episode's end.
+        let start = (2 * LENGTH + row) * width;
+        other.action[start..start + width].fill(0.9);
+        other.mean[start..start + width].fill(-0.9);
+        compare(&experiment, &base.minibatch(), &other.minibatch())
+    };
+    assert_eq!((changed(0), changed(1)), (0.0, 0.0));
+    assert!(changed(2) > 1e-5);
+}

@@ -80,6 +80,18 @@ impl ActionDistribution {
         }
     }
 
+    /// Σ ½ ((μ − target) / scale)², `[N]`, of targets `[N, A]`: of a mixture each component's, averaged with the weights, so
+    /// that whichever acts aims there.
+    pub fn mean_error(&self, target: &Tensor, scale: f64) -> Tensor {
+        let error = |mean: &Tensor, target: &Tensor| sum_last(&((mean - target) / scale).square()) * 0.5;
+        match self {
+            Self::Gaussian(gaussian) => error(&gaussian.mean, target),
+            Self::Mixture { log_weights, components } => {
+                sum_last(&(log_weights.exp() * error(&components.mean, &target.unsqueeze(-2))))
+            }
+        }
+    }
+
     /// The differential entropy, `[N]`. A mixture has none in closed form: what is given bounds it from above, the
     /// entropy of (component, action).
     pub fn entropy(&self) -> Tensor {
@@ -113,7 +125,7 @@ impl ActionDistribution {
             (Self::Mixture { components: new, .. }, Self::Mixture { log_weights, components: old }) => {
                 sum_last(&(log_weights.exp() * kl(new, old)))
             }
-            // Two kinds have no limit in common: no step away from the behaviour policy is small.
+            // The learner refuses a minibatch of another kind; beyond that, two kinds have no limit in common.
             (Self::Gaussian(DiagonalGaussian { mean, .. }), _) | (_, Self::Gaussian(DiagonalGaussian { mean, .. })) => {
                 sum_last(&mean.full_like(f64::INFINITY))
             }

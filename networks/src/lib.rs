@@ -9,9 +9,9 @@
 //!   latent are made of.
 //! - [`to_safetensors`] and [`from_safetensors`] carry a parameter store over a wire or onto a disk.
 //!
-//! Every network takes rows: `[N, ·]` float32 tensors, where a learner's N is unrolls × steps.
-//! Sums over N depend in their last bits on N and on the number of threads; with both equal, acting and learning
-//! give the same numbers bit for bit.
+//! Networks take float32 tensors of rows, `[N, ·]`, where a learner's N is unrolls × steps; what remembers takes
+//! `[B, T, ·]`. Sums over N depend in their last bits on N and on the number of threads; with both equal, acting and
+//! learning give the same numbers bit for bit, an LSTM's to 1e-5, since the learner joins the products of all steps.
 //!
 //! Initial weights are uniform in ±1/√fan_in (variance scaling with scale ⅓) and biases 0 unless said otherwise.
 //! They come from libtorch's generator: call `tch::manual_seed` first to make them reproducible.

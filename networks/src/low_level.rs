@@ -1,7 +1,7 @@
 //! The low level: from latent and proprioception to an action.
 //!
-//! Each is one file and one [`LowLevel`]; nobody beyond this module asks which it is. A new one is a new file, a name in
-//! the experiment, and a line in [`build`].
+//! Each is one file and one [`LowLevel`]; neither actor nor learner asks which it is. A new one is a new file, a line in
+//! [`build`], and in the experiment a name, its sizes, and how many components and numbers of state it has.
 
 mod lstm;
 mod mixture;
@@ -19,7 +19,7 @@ use crate::lstm::Memory;
 
 /// π(a_t | s_t, z_t, what was before).
 pub(crate) trait LowLevel: Debug + Send {
-    /// Acts on `unrolls` × steps rows.
+    /// Acts on B·T rows.
     fn act(&self, input: &Input<'_>) -> Output;
 }
 

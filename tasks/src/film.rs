@@ -195,6 +195,6 @@ impl Studio {
         }
         self.renderer.sync_data(simulation).map_err(graphics)?;
         self.renderer.render().map_err(graphics)?;
-        Ok(self.renderer.rgb_flat().unwrap_or_default())
+        self.renderer.rgb_flat().ok_or_else(|| Error::Graphics { reason: "nothing was drawn".into() })
     }
 }

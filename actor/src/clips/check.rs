@@ -47,6 +47,10 @@ With --json one array goes to standard output, an object for each clip:
 impl Check {
     pub(super) fn run(&self) -> Result<(), Error> {
         let source = ClipSource::parse(&self.file);
+        if source.source.starts_with("builtin:") {
+            let what = "built-in clips are checked by the project's own tests: name an HDF5 file";
+            return Err(Error::Usage(format!("{}: {what}", source.source)));
+        }
         let mut chosen = source.ids;
         if let Some(subset) = &source.subset {
             chosen.extend(comic_clips::subset(subset)?);

@@ -59,6 +59,7 @@ impl Import {
     pub(super) fn run(&self) -> Result<(), Error> {
         let takes = self.takes()?;
         let mut writer = ClipWriter::create(&self.out, self.force)?;
+        let mut told = String::new();
         for take in &takes {
             let (clip, taken) = import(take)?;
             for note in &taken.notes {
@@ -66,10 +67,11 @@ impl Import {
             }
             writer.add(&clip)?;
             let (frames, seconds) = (clip.steps(), clip.dt * clip.steps() as f64);
-            print(&format!("{}: {frames} frames, {seconds:.2} s, with {taken}\n", clip.name))?;
+            told += &format!("{}: {frames} frames, {seconds:.2} s, with {taken}\n", clip.name);
         }
+        // Whoever reads the words may be gone: the file comes first.
         writer.finish()?;
-        print(&format!("{} in {}; see `comic-actor clips check`\n", takes.len(), self.out.display()))
+        print(&format!("{told}{} in {}; see `comic-actor clips check`\n", takes.len(), self.out.display()))
     }
 
     fn takes(&self) -> Result<Vec<Take>, Error> {

@@ -8,7 +8,8 @@ use comic_experiment::ClipSource;
 use super::print;
 use crate::Error;
 
-/// Writes the clips of several sources into one file, which dm_control reads too.
+/// Writes the clips of several sources into one file, which dm_control reads too. Poses, velocities and features go along;
+/// markers, props, dates and body masses, which no task here reads, do not.
 #[derive(Args, Clone, Debug)]
 pub(super) struct Merge {
     /// What to take: FILE.h5, FILE.h5#SUBSET, FILE.h5#CLIP,CLIP or builtin:NAME.

@@ -94,21 +94,25 @@ impl Evaluate {
     pub fn run(&self) -> Result<(), Error> {
         let subject = self.subject()?;
         let position = subject.position;
-        let report = self.evaluate(subject)?;
+        let (report, film) = self.evaluate(subject)?;
         let json = serde_json::to_string_pretty(&report)
             .map_err(|error| Error::Usage(format!("cannot write the report as JSON: {error}")))?;
+        // First of all the figures: neither a film that fails nor a learner that is away may cost them.
+        let text = if self.json { format!("{json}\n") } else { report.to_string() };
+        std::io::stdout().write_all(text.as_bytes()).map_err(Error::file("standard output"))?;
         if let Some(learner) = &self.learner {
             let Position { epoch: learner_epoch, version } = position;
-            deliver(learner, EvaluationReport { learner_epoch, version, json: json.clone() })?;
+            deliver(learner, EvaluationReport { learner_epoch, version, json })?;
         }
-        let text = if self.json { json + "\n" } else { report.to_string() };
-        std::io::stdout().write_all(text.as_bytes()).map_err(Error::file("standard output"))
+        film
     }
 
-    fn evaluate(&self, subject: Subject) -> Result<Report, Error> {
+    /// The report, and what became of the film.
+    fn evaluate(&self, subject: Subject) -> Result<(Report, Result<(), Error>), Error> {
         let Subject { mut experiment, parameters, .. } = subject;
         if let Some(out) = &self.video {
             Format::of(out)?;
+            self.look.suits(experiment.task)?;
         }
         // A policy that was never trained starts from the pose of its own clips, whatever it is evaluated on.
         let own = if self.untrained { Some(Catalogue::open(&experiment.clips)?) } else { None };
@@ -128,10 +132,13 @@ impl Evaluate {
         let mut evaluated = policy.as_mut().map_or(Evaluated::Servo, Evaluated::Policy);
         let recorder =
             self.video.as_ref().map(|out| Recorder::new(&self.look, out, task.control_timestep())).transpose()?;
-        let mut follower = Follower { recorder };
+        let mut follower = Follower { recorder, failed: None };
         let report = evaluate(&mut evaluated, &task, sizes, &options, &mut follower)?;
-        follower.recorder.map(Recorder::finish).transpose()?;
-        Ok(report)
+        let film = match (follower.failed, follower.recorder) {
+            (Some(error), _) => Err(error),
+            (None, recorder) => recorder.map_or(Ok(()), Recorder::finish),
+        };
+        Ok((report, film))
     }
 
     /// The experiment, and the parameters when there is a checkpoint.
@@ -175,12 +182,14 @@ impl Evaluate {
 /// Shows how far the evaluation is, and films its first episode if that is wanted.
 struct Follower {
     recorder: Option<Recorder>,
+    /// Why filming ended before its time.
+    failed: Option<Error>,
 }
 
 impl Audience<Box<dyn Simulated>> for Follower {
     fn watch(&mut self, number: usize, environment: &mut Box<dyn Simulated>) -> Result<ControlFlow<()>, Error> {
-        if let (Some(recorder), 0) = (&mut self.recorder, number) {
-            recorder.shoot(environment.as_mut())?;
+        if let (Some(recorder), None, 0) = (&mut self.recorder, &self.failed, number) {
+            self.failed = recorder.shoot(environment.as_mut()).err();
         }
         Ok(ControlFlow::Continue(()))
     }

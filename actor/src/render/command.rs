@@ -39,6 +39,7 @@ impl Render {
     pub fn run(&self) -> Result<(), Error> {
         // What is wrong with the film is said before anything is built.
         super::encode::Format::of(&self.out)?;
+        self.look.suits(self.scene.task())?;
         let mut cast = self.scene.cast()?;
         let step = cast.task.control_timestep();
         let seconds = self.seconds.unwrap_or(USUAL_SECONDS);

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
+use comic_experiment::TaskName;
 use comic_tasks::film::{Camera, Film, Shot, Size};
 use comic_tasks::{Ghost, Simulated};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -55,6 +56,19 @@ pub struct Recorder {
     steps: usize,
     frames: usize,
     bar: Option<ProgressBar>,
+}
+
+impl Look {
+    /// Whether a film of this task can look like that.
+    ///
+    /// # Errors
+    /// A ghost of what has no reference.
+    pub fn suits(&self, task: TaskName) -> Result<(), Error> {
+        if self.ghost.is_none() || task == TaskName::Tracking {
+            return Ok(());
+        }
+        Err(Error::Usage(format!("--ghost: {task} has no reference to show, only tracking has: leave it out")))
+    }
 }
 
 impl Recorder {

@@ -59,6 +59,11 @@ pub(super) struct Cast {
 }
 
 impl Scene {
+    /// The task that is played.
+    pub(super) fn task(&self) -> TaskName {
+        self.task
+    }
+
     /// Reads what there is to read, and builds the task.
     ///
     /// # Errors

@@ -9,6 +9,9 @@ use crate::Error;
 /// Longest recording taken: 100,000 frames of 0.03 s, the longest clip that is read back.
 const FRAMES: usize = 360_000;
 
+/// The root's bit, beyond those of the 56 joints.
+const ROOT: u64 = 1 << 63;
+
 /// A recording, as its file has it.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Recording {
@@ -18,13 +21,16 @@ pub(super) struct Recording {
     pub(super) angles: Vec<[f64; 56]>,
     /// The first frame whose number is not one more than the last one's.
     pub(super) gap: Option<u64>,
+    /// The joints that the first frame tells of, a bit each: every other frame tells of the same.
+    told: Option<u64>,
 }
 
 impl Recording {
     pub(super) fn read(path: &Path) -> Result<Self, Error> {
         let mut lines = Lines::open(path)?;
         let mut recording = Self::default();
-        let (mut number, mut has_root) = (None, true);
+        // None before the first frame.
+        let (mut number, mut seen) = (None, None);
         while let Some(words) = lines.next_words()? {
             let word = words[0].as_str();
             if word.eq_ignore_ascii_case(":radians") {
@@ -34,24 +40,25 @@ impl Recording {
                 continue;
             }
             if let ([_], Ok(next)) = (words.as_slice(), word.parse::<u64>()) {
-                recording.begin(&lines, has_root)?;
+                recording.begin(&lines, seen)?;
                 if number.is_some_and(|last: u64| last.checked_add(1) != Some(next)) {
                     recording.gap = recording.gap.or(Some(next));
                 }
-                (number, has_root) = (Some(next), false);
+                (number, seen) = (Some(next), Some(0));
             } else {
-                has_root |= recording.take(&lines, word, &words[1..])?;
+                let bits = recording.take(&lines, word, &words[1..])?;
+                seen = seen.map(|seen| seen | bits);
             }
         }
         if recording.root.is_empty() {
             return Err(Error::Recording { path: path.into(), reason: "no frames: is this an AMC file?".into() });
         }
-        recording.complete(&lines, has_root)?;
+        recording.complete(&lines, seen)?;
         Ok(recording)
     }
 
-    fn begin(&mut self, lines: &Lines, has_root: bool) -> Result<(), Error> {
-        self.complete(lines, has_root)?;
+    fn begin(&mut self, lines: &Lines, seen: Option<u64>) -> Result<(), Error> {
+        self.complete(lines, seen)?;
         if self.root.len() == FRAMES {
             return Err(lines.error(format!("over {FRAMES} frames: cut the recording")));
         }
@@ -60,12 +67,25 @@ impl Recording {
         Ok(())
     }
 
-    fn complete(&self, lines: &Lines, has_root: bool) -> Result<(), Error> {
-        if has_root { Ok(()) } else { Err(lines.error(format!("frame {} has no `root`", self.root.len()))) }
+    /// Whether the frame before is whole: a file that was cut off lacks its last bones.
+    fn complete(&mut self, lines: &Lines, seen: Option<u64>) -> Result<(), Error> {
+        let Some(seen) = seen else { return Ok(()) };
+        let frame = self.root.len();
+        if seen & ROOT == 0 {
+            return Err(lines.error(format!("frame {frame} has no `root`")));
+        }
+        let told = *self.told.get_or_insert(seen);
+        if seen == told {
+            return Ok(());
+        }
+        let differ = |bone: &&Bone| bone.joints().any(|joint| (seen ^ told) & (1 << joint) != 0);
+        let bones: Vec<&str> = BONES.iter().filter(differ).map(|bone| bone.name).collect();
+        let reason = "has other bones than the first (they differ in";
+        Err(lines.error(format!("frame {frame} {reason} {}): is the file whole?", bones.join(", "))))
     }
 
-    /// Takes a bone's line; whether it was the root's.
-    fn take(&mut self, lines: &Lines, name: &str, words: &[String]) -> Result<bool, Error> {
+    /// Takes a bone's line; a bit for each joint it tells of, or the root's.
+    fn take(&mut self, lines: &Lines, name: &str, words: &[String]) -> Result<u64, Error> {
         let (Some(root), Some(angles)) = (self.root.last_mut(), self.angles.last_mut()) else {
             return Err(lines.error("expected a frame's number: is this an AMC file?"));
         };
@@ -80,7 +100,7 @@ impl Recording {
             for (place, word) in root.iter_mut().zip(words) {
                 *place = lines.number(word)?;
             }
-            return Ok(true);
+            return Ok(ROOT);
         }
         let Some(bone) = Bone::find(name) else {
             let known: Vec<&str> = BONES.iter().map(|bone| bone.name).collect();
@@ -90,6 +110,6 @@ impl Recording {
         for (joint, word) in bone.joints().zip(words) {
             angles[joint] = lines.number(word)?;
         }
-        Ok(false)
+        Ok(bone.joints().fold(0, |bits, joint| bits | 1 << joint))
     }
 }

@@ -1,5 +1,6 @@
 //! A list of takes and the constants of each, as JSON.
 
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
@@ -41,10 +42,13 @@ enum ListedFloor {
 pub fn read_manifest(path: &Path) -> Result<Vec<Take>, Error> {
     let unreadable = |reason| Error::Unreadable { path: path.into(), reason };
     let wrong = |reason: String| Error::Recording { path: path.into(), reason };
-    if std::fs::metadata(path).map_err(unreadable)?.len() > LONGEST {
+    let mut text = String::new();
+    // A device tells no length: what is read is what counts.
+    let file = std::fs::File::open(path).map_err(unreadable)?;
+    let length = file.take(LONGEST + 1).read_to_string(&mut text).map_err(unreadable)?;
+    if length as u64 > LONGEST {
         return Err(wrong("too long for a manifest".into()));
     }
-    let text = std::fs::read_to_string(path).map_err(unreadable)?;
     // Line and column are in serde's words.
     let listed: Vec<Listed> = serde_json::from_str(&text).map_err(|error| wrong(format!("no manifest: {error}")))?;
     let directory = path.parent().unwrap_or(Path::new(""));

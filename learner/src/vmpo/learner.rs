@@ -80,6 +80,8 @@ struct Pass {
     targets: Tensor,
     /// Steps that are learnt from, `[N]`.
     valid: Tensor,
+    /// Share of the rows that are transitions.
+    share: Tensor,
     /// ½ mean (V − G)², summed over the reward terms.
     value_loss: Tensor,
     /// Mean KL to the prior, nats a step.
@@ -132,7 +134,7 @@ impl VmpoLearner {
         &self.policy
     }
 
-    /// η, α_μ, α_Σ.
+    /// η, α_μ, α_Σ and, for a mixture, α_discrete.
     pub fn multipliers(&self) -> &Multipliers {
         &self.multipliers
     }
@@ -209,9 +211,8 @@ impl VmpoLearner {
     pub fn regress(&mut self, minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error> {
         self.check(minibatch)?;
         let pass = self.forward(minibatch);
-        let deviation = (pass.acting.action.mean() - pass.behaviour.mean()) / self.network.initial_std;
-        let squares = deviation.square().sum_dim_intlist(-1i64, false, Kind::Float) * 0.5;
-        let regression = masked_mean(&squares, &pass.valid);
+        let errors = pass.acting.action.mean_error(&pass.behaviour.mean(), self.network.initial_std);
+        let regression = masked_mean(&errors, &pass.valid);
         let total =
             &regression + &pass.value_loss * self.vmpo.value_weight + &pass.latent_kl * self.network.latent.beta;
         let gradients = Tensor::f_run_backward(&[&total], self.adam.parameters(self.networks_group), false, false)?;
@@ -280,6 +281,7 @@ impl VmpoLearner {
         );
         let targets = returns(reward, discount, valid, &values, self.vmpo.discount, self.vmpo.lambda);
         let (targets, values) = (rows(&targets), rows(&values.narrow(1, 0, length)));
+        let share = valid.mean(Kind::Float);
         let valid = self.learnt_from(valid).reshape([-1]);
         let errors = (&values - &targets).square().sum_dim_intlist(-1i64, false, Kind::Float) * 0.5;
         let prior: &Prior = &self.network.latent.prior;
@@ -299,6 +301,7 @@ impl VmpoLearner {
             values,
             targets,
             valid,
+            share,
         }
     }
 
@@ -364,7 +367,7 @@ impl VmpoLearner {
                 &masked_mean(&std, &pass.valid),
                 norm,
                 &variance_explained(pass),
-                &pass.valid.mean(Kind::Float),
+                &pass.share,
             ])
         })
     }

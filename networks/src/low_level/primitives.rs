@@ -22,7 +22,7 @@ pub(crate) struct Primitives {
     heads: Tensor,
     /// `[K, 1, 2·A]`.
     head_biases: Tensor,
-    /// What is added to every dimension of each primitive's mean, `[K, 1]`, and not trained.
+    /// What is added to every dimension of each primitive's mean, K numbers, and not trained.
     fixed_biases: Option<Vec<f32>>,
     count: i64,
     min_std: f64,

@@ -4,29 +4,35 @@ use tch::nn;
 
 use super::primitives::{Gate, Primitives};
 use super::{Config, Input, LowLevel, Output};
-use crate::ActionDistribution;
+use crate::{ActionDistribution, DiagonalGaussian};
 
 /// π(a|s, z) ∝ Π_k N_k(s)^{w_k(z, s)}, w_k in (0, 1) and not normalised (S; MCP, Peng et al., 2019): one Gaussian again.
 ///
-/// The exponents start near ½, so the primitives start √(K/2) wider than `initial_std`, and the product as wide (D).
+/// An exponent is at least 1e-3, and the product's σ no less than `min_std`: a product of nothing would be infinitely wide,
+/// and one of many narrower than any of them (D). The exponents start near ½, so the primitives start √(K/2) wider than `initial_std`, and the product as wide (D).
 #[derive(Debug)]
 pub(crate) struct ProductLowLevel {
     primitives: Primitives,
     gate: Gate,
+    min_std: f64,
 }
+
+/// The least an exponent can be.
+const LEAST_EXPONENT: f64 = 1e-3;
 
 impl ProductLowLevel {
     pub(crate) fn new(path: &nn::Path, config: &Config<'_>) -> Self {
         let wider = (config.network.primitives.count as f64 / 2.0).sqrt();
         let primitives = Primitives::new(path, config, config.network.initial_std * wider);
-        Self { primitives, gate: Gate::new(path, config) }
+        Self { primitives, gate: Gate::new(path, config), min_std: config.network.min_std }
     }
 }
 
 impl LowLevel for ProductLowLevel {
     fn act(&self, input: &Input<'_>) -> Output {
-        let exponents = self.gate.forward(input).sigmoid();
-        let action = self.primitives.forward(input.proprioception).product(&exponents);
+        let exponents = self.gate.forward(input).sigmoid() * (1.0 - LEAST_EXPONENT) + LEAST_EXPONENT;
+        let DiagonalGaussian { mean, std } = self.primitives.forward(input.proprioception).product(&exponents);
+        let action = DiagonalGaussian { mean, std: std.clamp_min(self.min_std) };
         Output { action: ActionDistribution::Gaussian(action), state: input.memory.state.shallow_clone() }
     }
 }

@@ -1,7 +1,8 @@
 //! MP4 through the program ffmpeg, which is given raw pictures.
 
 use std::ffi::OsStr;
-use std::io::{self, Read as _, Write as _};
+use std::fs::File;
+use std::io::{self, Read as _, Seek as _, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
@@ -12,16 +13,22 @@ use super::Encoder;
 use crate::Error;
 
 const PROGRAM: &str = "ffmpeg";
+/// Bytes of its complaints that are passed on.
+const LONGEST_COMPLAINT: u64 = 4096;
 
 /// A running ffmpeg; dropped before its end, it is stopped.
 #[derive(Debug)]
 pub(super) struct Mp4 {
     child: Child,
+    /// What it says of errors.
+    complaints: File,
 }
 
 impl Mp4 {
     pub(super) fn new(out: &Path, size: Size, frame_time: Duration) -> Result<Self, Error> {
         let program = find(&std::env::var_os("PATH").unwrap_or_default())?;
+        // A file, not a pipe: one that nobody drains would stop it, and the film with it.
+        let complaints = tempfile::tempfile().map_err(Error::file(PROGRAM))?;
         let child = Command::new(&program)
             .args(["-hide_banner", "-loglevel", "error", "-y"])
             .args(["-f", "rawvideo", "-pix_fmt", "rgb24"])
@@ -34,23 +41,22 @@ impl Mp4 {
             .arg(out)
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
-            .stderr(Stdio::piped())
+            .stderr(complaints.try_clone().map_err(Error::file(PROGRAM))?)
             .spawn()
             .map_err(Error::file(program))?;
-        Ok(Self { child })
+        Ok(Self { child, complaints })
     }
 
     /// Waits for ffmpeg's end, and says what it had to say if it failed.
     fn end(&mut self) -> io::Result<()> {
         drop(self.child.stdin.take());
-        let mut complaint = String::new();
-        if let Some(mut stderr) = self.child.stderr.take() {
-            stderr.read_to_string(&mut complaint)?;
-        }
         let status = self.child.wait()?;
         if status.success() {
             return Ok(());
         }
+        let mut complaint = String::new();
+        self.complaints.rewind()?;
+        (&self.complaints).take(LONGEST_COMPLAINT).read_to_string(&mut complaint)?;
         Err(io::Error::other(format!("{PROGRAM} failed ({status}): {}", complaint.trim())))
     }
 }

@@ -46,6 +46,11 @@ impl Encoder for WebP {
         WebPEncoder::new(&mut still).encode(picture, width, height, ColorType::Rgb8).map_err(io::Error::other)?;
         let chunks = still.get(HEADER..).unwrap_or_default();
         let length = u32::try_from(chunks.len()).map_err(io::Error::other)?;
+        let end = self.writer.stream_position()? + u64::from(length) + u64::from(FRAME_HEADER) + 8;
+        if end > u64::from(u32::MAX) {
+            let remedy = "ask for an .mp4, fewer --seconds, a smaller --size or less --fps";
+            return Err(io::Error::other(format!("a WebP file has at most 4 GiB: {remedy}")));
+        }
         self.writer.write_all(b"ANMF")?;
         self.writer.write_all(&(FRAME_HEADER + length).to_le_bytes())?;
         // At the canvas's corner.
