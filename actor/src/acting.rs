@@ -71,6 +71,8 @@ pub struct ActingBatch {
     pub log_weights: Vec<f32>,
     /// What the policy remembers `[E, S]`; zero at an episode's first step: read and written by the forward pass.
     pub state: Vec<f32>,
+    /// Whose episode it is, `[E]`: the task's place among the tasks.
+    pub tasks: Vec<usize>,
 }
 
 /// One environment's row of an [`ActingBatch`].
@@ -96,6 +98,8 @@ pub struct ActingRow<'a> {
     pub log_weights: &'a mut [f32],
     /// `[S]`.
     pub state: &'a mut [f32],
+    /// The task's place among the tasks.
+    pub of_task: &'a mut usize,
 }
 
 impl ActingRow<'_> {
@@ -171,6 +175,7 @@ impl ActingBatch {
             std: zeros(sizes.components * sizes.action),
             log_weights: zeros(sizes.weights()),
             state: zeros(sizes.state),
+            tasks: vec![0; environments],
         }
     }
 
@@ -202,6 +207,7 @@ impl ActingBatch {
             std: part(&mut self.std, environment, components * action),
             log_weights: part(&mut self.log_weights, environment, weights),
             state: part(&mut self.state, environment, state),
+            of_task: &mut self.tasks[environment],
         }
     }
 

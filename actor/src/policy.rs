@@ -1,7 +1,7 @@
 //! The forward pass through libtorch.
 
 use comic_experiment::{Experiment, InitialPose, TaskSpec};
-use comic_networks::{Memory, Policy};
+use comic_networks::{Memory, Policy, Routing};
 use tch::nn::VarStore;
 use tch::{Device, Tensor};
 
@@ -13,6 +13,8 @@ use crate::acting::{ActingBatch, ForwardPass};
 pub struct TorchPolicy {
     store: VarStore,
     policy: Policy,
+    /// Number of tasks.
+    tasks: usize,
 }
 
 /// One thread a forward pass: environments are spread over threads already. Call it once, before any other libtorch.
@@ -43,7 +45,7 @@ impl TorchPolicy {
         tch::manual_seed(seed.cast_signed());
         let store = VarStore::new(Device::Cpu);
         let policy = Policy::new(&store.root(), spec, &experiment.network, &pose).map_err(misfit)?;
-        Ok(Self { store, policy })
+        Ok(Self { store, policy, tasks: spec.tasks.len() })
     }
 
     /// The networks of the experiment with these parameters (safetensors).
@@ -86,6 +88,7 @@ impl ForwardPass for TorchPolicy {
                 &matrix(&batch.proprioception, sizes.proprioception)?,
                 &matrix(&batch.task, sizes.task)?,
                 image.as_ref(),
+                &Routing::grouped(&batch.tasks, self.tasks),
             );
             let acting = self.policy.act(
                 &observation,

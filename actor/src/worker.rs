@@ -11,6 +11,9 @@
 //! the environment instead of stepping it, so the next row is the next episode's first. Row T is the observation that
 //! follows the last slot, and row 0 of the next unroll is the same observation again; only where row T is an episode's
 //! last, the next unroll starts with the fresh episode instead.
+//!
+//! An unroll is of one task. Where joint training draws another one for the next episode, that episode waits for the next
+//! unroll, and the rows up to there are padding: `Valid` 0, `First` 1, the last observation again.
 
 mod lane;
 
@@ -174,7 +177,10 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         let (mut steps, mut episodes) = (0, 0);
         for (index, lane) in self.lanes.iter_mut().enumerate() {
             let mut row = self.batch.row(index);
-            if lane.at_episode_end() {
+            if lane.waits() {
+                // The row stays as empty as it was made.
+                row.forget();
+            } else if lane.at_episode_end() {
                 lane.pass(t, &row);
                 lane.begin_episode(&mut row);
             } else {

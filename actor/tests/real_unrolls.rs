@@ -57,7 +57,7 @@ fn unrolls_pass_the_learners_validation() {
                 episodes: unroll.episodes,
                 ..UnrollHeader::default()
             };
-            let expected = Expected { clips: setup.task.spec().clips.len(), epoch: 2, newest_version: 4 };
+            let expected = Expected { clips: &[setup.task.spec().clips.len()], epoch: 2, newest_version: 4 };
             validate(&setup.layout, &header, &unroll.payload, &expected).unwrap();
             assert_eq!(unroll.demonstration, conduct == Conduct::Demonstrate);
         }

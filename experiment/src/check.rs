@@ -4,8 +4,8 @@ use std::fmt::{Debug, Display};
 
 use crate::{
     Actor, BallCatch, Budget, ClipSource, Corridor, Experiment, Gaps, GetUp, GoToTarget, Learner, LowLevelName,
-    Network, Optimiser, Prior, SUBSETS, TRACKING_OBSERVATIONS, Tracking, Unroll, Vmpo, Walls, WarmStart,
-    tracking_observation_size,
+    Network, Optimiser, Prior, SUBSETS, TRACKING_OBSERVATIONS, TaskName, Tracking, Unroll, Vision, Vmpo, Walls,
+    WarmStart, tracking_observation_size,
 };
 
 /// A field whose value is outside its meaning.
@@ -28,6 +28,7 @@ const NOT_NEGATIVE: &str = "must be 0 or more";
 /// The first fault, in the order of the document.
 pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
     ensure("clips", &experiment.clips, !experiment.clips.is_empty(), "name at least one clip source")?;
+    joint(experiment)?;
     experiment.clips.iter().enumerate().try_for_each(|(index, source)| clips(index, source))?;
     tracking(&experiment.tracking)?;
     go_to_target(&experiment.go_to_target)?;
@@ -59,6 +60,37 @@ fn positive(number: f64) -> bool {
 
 fn not_negative(number: f64) -> bool {
     number >= 0.0 && number.is_finite()
+}
+
+fn joint(experiment: &Experiment) -> Result<(), Fault> {
+    let Experiment { task, joint, network, .. } = experiment;
+    for (index, complement) in joint.iter().enumerate() {
+        let field = |name: &str| format!("joint.{index}.{name}");
+        let earlier = joint[..index].iter().any(|other| other.task == complement.task);
+        let new = complement.task != *task && !earlier;
+        ensure(&field("task"), complement.task, new, "must be a task that is not named already")?;
+        let probability = complement.probability;
+        ensure(&field("probability"), probability, probability > 0.0 && probability < 1.0, "must be between 0 and 1")?;
+    }
+    if joint.is_empty() {
+        return Ok(());
+    }
+    let sum: f64 = joint.iter().map(|complement| complement.probability).sum();
+    ensure("joint", sum, sum < 1.0, "probabilities must add up to less than 1: the rest is the experiment's task's")?;
+    for (name, section, corridor) in
+        [(TaskName::Gaps, "gaps", &experiment.gaps.corridor), (TaskName::Walls, "walls", &experiment.walls.corridor)]
+    {
+        let plays = *task == name || joint.iter().any(|complement| complement.task == name);
+        let holds = !plays || corridor.vision == Vision::Off;
+        ensure(&format!("{section}.corridor.vision"), corridor.vision, holds, "must be off in joint training")?;
+    }
+    let lstm = &network.value_lstm;
+    ensure(
+        "network.value_lstm",
+        lstm,
+        lstm.is_empty(),
+        "must be empty in joint training, whose value functions are feed-forward",
+    )
 }
 
 fn clips(index: usize, source: &ClipSource) -> Result<(), Fault> {

@@ -14,6 +14,8 @@ pub struct Experiment {
     pub seed: u64,
     /// What is learnt; the section of the same name holds its numbers.
     pub task: TaskName,
+    /// Tasks learnt beside it through the same low level: every episode draws its task (S: get-up 0.1 or ball 0.2).
+    pub joint: Vec<Complement>,
     /// Motion capture, one entry per source: what is tracked, and the poses other tasks may start in.
     pub clips: Vec<ClipSource>,
     /// Motion-capture tracking.
@@ -44,6 +46,25 @@ pub struct Experiment {
     pub learner: Learner,
     /// When the run ends.
     pub budget: Budget,
+}
+
+/// A complementary task of joint training.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Complement {
+    /// The task; the section of its name holds its numbers.
+    pub task: TaskName,
+    /// Probability that an episode is one of this task's; the experiment's `task` has what is left.
+    pub probability: f64,
+}
+
+impl Experiment {
+    /// Every task and the probability that an episode is one of its own, `task` first.
+    pub fn tasks(&self) -> Vec<(TaskName, f64)> {
+        let others = self.joint.iter().map(|complement| (complement.task, complement.probability));
+        let left = 1.0 - others.clone().map(|(_, probability)| probability).sum::<f64>();
+        std::iter::once((self.task, left)).chain(others).collect()
+    }
 }
 
 /// Where reference motion comes from: a built-in clip or a file in dm_control's HDF5 layout.
@@ -121,6 +142,9 @@ pub struct Vmpo {
     pub initial_alpha_discrete: f64,
     /// Share of the valid steps the E-step imitates (S: the top half).
     pub top_fraction: f64,
+    /// In joint training the E-step's best steps and its temperature are each task's own, since the advantages of different
+    /// tasks have different scales (D); off, one E-step ranks all steps.
+    pub temperature_per_task: bool,
     /// The target network, with which actors act, is copied every so many learner steps (V).
     pub target_period: u64,
     /// Gradient steps on each batch (V: 1).
@@ -150,6 +174,7 @@ impl Default for Vmpo {
             initial_alpha_std: 1.0,
             initial_alpha_discrete: 1.0,
             top_fraction: 0.5,
+            temperature_per_task: true,
             target_period: 100,
             gradient_steps: 1,
             minibatch_unrolls: 128,
@@ -291,6 +316,7 @@ impl Default for Experiment {
             name: "tracking-mlp".into(),
             seed: 1,
             task: TaskName::Tracking,
+            joint: Vec::new(),
             clips: vec![ClipSource::whole("builtin:CMU_007_01")],
             tracking: Tracking::default(),
             go_to_target: GoToTarget::default(),

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use toml::{Table, Value};
 
-use crate::{Experiment, check::check, lines::line_of, presets};
+use crate::{Complement, Experiment, TaskName, check::check, lines::line_of, presets};
 
 /// Why a document is not an experiment.
 #[derive(Debug, thiserror::Error)]
@@ -156,7 +156,8 @@ fn refuse_unknown(table: &Table) -> Result<(), Unknown> {
 
 /// The default document with every optional field present.
 fn vocabulary() -> Result<Table, toml::ser::Error> {
-    let mut everything = Experiment::default();
+    let complement = Complement { task: TaskName::GetUp, probability: 0.1 };
+    let mut everything = Experiment { joint: vec![complement], ..Experiment::default() };
     for clip in &mut everything.clips {
         clip.subset = Some(String::new());
         clip.ids = vec![String::new()];

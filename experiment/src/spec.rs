@@ -17,24 +17,39 @@ pub const TRACKING_REWARD_TERMS: [&str; 5] =
 /// The most a tracking step can pay: 0.5 + 0.5·(0.1 + 1 + 0.15 + 0.65).
 pub const TRACKING_MAX_REWARD: f64 = 1.45;
 
-/// Sizes and names of a task: all that networks, wire and learner know of it.
+/// Sizes and names of what is learnt, one task or several: all that networks, wire and learner know of it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskSpec {
     /// Length of the proprioception vector.
     pub proprioception: usize,
-    /// Length of the task observation vector (for tracking, the references).
+    /// Length of the task observation vector (for tracking, the references); in joint training the longest, and zeros
+    /// follow a shorter one.
     pub task: usize,
     /// Bytes of an image of what the humanoid sees: 64 rows of 64 pixels of red, green and blue; 0 when it is blind.
     pub image: usize,
     /// Length of the action vector, each in [−1, 1].
     pub action: usize,
-    /// Names of the reward terms; their sum is the reward.
+    /// Names of the reward terms; their sum is the reward. Joint training has one, the reward itself.
     pub reward_terms: Vec<String>,
-    /// The most a step can pay: what normalised rewards are relative to.
-    pub max_reward: f64,
-    /// Names of the clips; a clip's index is its place here.
+    /// Names of the clips, task by task; a clip's index is its place here.
     pub clips: Vec<String>,
+    /// The tasks, the experiment's `task` first.
+    pub tasks: Vec<TaskPart>,
+}
+
+/// What is one task's own.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TaskPart {
+    /// The task's name.
+    pub name: String,
+    /// Length of its observation: the first so many entries of the task observation vector.
+    pub observation: usize,
+    /// Number of its clips.
+    pub clips: usize,
+    /// The most a step of it can pay: what normalised rewards are relative to.
+    pub max_reward: f64,
 }
 
 /// Reward terms of go-to-target.
@@ -48,9 +63,12 @@ pub const BALL_CATCH_REWARD_TERMS: [&str; 4] = ["failure", "touch", "standing", 
 /// Height and width of the egocentric camera's image, in pixels of three bytes (C).
 pub const IMAGE_SIZE: usize = 64;
 
+/// The reward term of joint training.
+pub const JOINT_REWARD_TERMS: [&str; 1] = ["reward"];
+
 impl Experiment {
-    fn image_bytes(&self) -> usize {
-        let vision = match self.task {
+    fn image_bytes(&self, task: TaskName) -> usize {
+        let vision = match task {
             TaskName::Gaps => self.gaps.corridor.vision,
             TaskName::Walls => self.walls.corridor.vision,
             _ => Vision::Off,
@@ -59,8 +77,8 @@ impl Experiment {
     }
 
     /// The most a step of the task can pay.
-    fn max_reward(&self) -> f64 {
-        match self.task {
+    fn max_reward(&self, task: TaskName) -> f64 {
+        match task {
             TaskName::Tracking => TRACKING_MAX_REWARD,
             TaskName::GoToTarget | TaskName::Gaps | TaskName::Walls | TaskName::GetUp => 1.0,
             TaskName::BallCatch => {
@@ -72,21 +90,32 @@ impl Experiment {
 }
 
 impl TaskSpec {
-    /// The experiment's task over these clips, whose names only tracking keeps: any other task is a clip of its own.
+    /// The experiment's task, or tasks, over these clips, whose names only tracking keeps: any other task is a clip of its
+    /// own.
     ///
     /// # Errors
     /// The name of an observation that the tracking task does not have.
     pub fn new(experiment: &Experiment, clips: Vec<String>) -> Result<Self, String> {
-        let plain = |task, terms: &[&str]| Self {
-            proprioception: PROPRIOCEPTION_SIZE,
-            task,
-            image: experiment.image_bytes(),
-            action: ACTION_SIZE,
-            reward_terms: terms.iter().map(|term| (*term).to_string()).collect(),
-            max_reward: experiment.max_reward(),
-            clips: vec![experiment.task.name().to_string()],
+        let of = |task| Self::of_task(experiment, task, clips.clone());
+        let mut spec = of(experiment.task)?;
+        for complement in &experiment.joint {
+            spec.join(of(complement.task)?);
+        }
+        Ok(spec)
+    }
+
+    /// One of the experiment's tasks alone.
+    ///
+    /// # Errors
+    /// The name of an observation that the tracking task does not have.
+    pub fn of_task(experiment: &Experiment, task: TaskName, clips: Vec<String>) -> Result<Self, String> {
+        let plain = |observation, terms: &[&str]| {
+            let name = task.name().to_string();
+            let mut spec = Self::alone(name.clone(), observation, experiment.max_reward(task), terms, vec![name]);
+            spec.image = experiment.image_bytes(task);
+            spec
         };
-        Ok(match experiment.task {
+        Ok(match task {
             TaskName::Tracking => return Self::tracking(&experiment.tracking, clips),
             // The target in the root's frame.
             TaskName::GoToTarget => plain(3, &GO_TO_TARGET_REWARD_TERMS),
@@ -104,19 +133,48 @@ impl TaskSpec {
     /// The name of an observation that the tracking task does not have.
     pub fn tracking(config: &Tracking, clips: Vec<String>) -> Result<Self, String> {
         let steps = config.reference_steps.len();
-        let mut task = 0;
+        let mut observation = 0;
         for name in &config.observations {
-            task += tracking_observation_size(name, steps).ok_or_else(|| name.clone())?;
+            observation += tracking_observation_size(name, steps).ok_or_else(|| name.clone())?;
         }
-        Ok(Self {
+        let name = TaskName::Tracking.name().to_string();
+        Ok(Self::alone(name, observation, TRACKING_MAX_REWARD, &TRACKING_REWARD_TERMS, clips))
+    }
+
+    fn alone(name: String, observation: usize, max_reward: f64, terms: &[&str], clips: Vec<String>) -> Self {
+        Self {
             proprioception: PROPRIOCEPTION_SIZE,
-            task,
+            task: observation,
             image: 0,
             action: ACTION_SIZE,
-            reward_terms: TRACKING_REWARD_TERMS.map(String::from).to_vec(),
-            max_reward: TRACKING_MAX_REWARD,
+            reward_terms: terms.iter().map(|term| (*term).to_string()).collect(),
+            tasks: vec![TaskPart { name, observation, clips: clips.len(), max_reward }],
             clips,
-        })
+        }
+    }
+
+    /// One more task.
+    fn join(&mut self, other: Self) {
+        self.task = self.task.max(other.task);
+        self.image = self.image.max(other.image);
+        self.reward_terms = JOINT_REWARD_TERMS.map(String::from).to_vec();
+        self.clips.extend(other.clips);
+        self.tasks.extend(other.tasks);
+    }
+
+    /// The task that a clip belongs to: its place among the tasks, the last one's for a clip there is not.
+    pub fn task_of(&self, clip: usize) -> usize {
+        let mut end = 0;
+        let found = self.tasks.iter().position(|task| {
+            end += task.clips;
+            clip < end
+        });
+        found.unwrap_or(self.tasks.len().saturating_sub(1))
+    }
+
+    /// The most a step of an episode of this clip can pay.
+    pub fn max_reward(&self, clip: usize) -> f64 {
+        self.tasks.get(self.task_of(clip)).map_or(1.0, |task| task.max_reward)
     }
 }
 

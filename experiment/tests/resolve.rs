@@ -119,7 +119,7 @@ fn neither_preset_nor_file_lists_the_presets() {
     assert!(
         message.ends_with(
             "presets are quickstart, quickstart-from-zero, tracking-mlp, tracking-lstm, tracking-mixture, \
-             tracking-product, go-to-target, gaps, walls, get-up, ball-catch"
+             tracking-product, joint-get-up, joint-ball, go-to-target, gaps, walls, get-up, ball-catch"
         ),
         "{message}"
     );

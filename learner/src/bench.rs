@@ -98,44 +98,84 @@ impl Floor {
 
 /// Prints `learner.update` as one JSON line: milliseconds for a gradient step of paper size (128 unrolls of 32), floor
 /// the matrix products of the same shapes, forward and backward, on the same threads, and libtorch's own LSTM where there
-/// is one; medians of interleaved runs. Another low level than the MLP is the preset's of its name, and the figure's
-/// name says it.
+/// is one; medians of interleaved runs. Another low level than the MLP is the preset's of its name, and joint training is
+/// `joint-get-up`'s; the figure's name says it. Joint training stands beside the update of its first task alone, in the
+/// same run.
 ///
 /// # Errors
 /// When libtorch refuses.
-pub fn run(threads: usize, repeats: usize, low_level: LowLevelName) -> Result<()> {
+pub fn run(threads: usize, repeats: usize, subject: Subject) -> Result<()> {
     tch::set_num_threads(threads as i32);
     tch::manual_seed(1);
-    let experiment = comic_experiment::resolve(&format!("tracking-{low_level}"), &[])?;
-    let spec =
-        TaskSpec::new(&experiment, vec!["clip".into()]).map_err(|name| anyhow::anyhow!("no observation `{name}`"))?;
-    let mut learner = VmpoLearner::new(&spec, &experiment, &vec![0.0; spec.action], Device::Cpu)?;
-    let minibatch = random_minibatch(&spec, &experiment)?;
-    let least = floor(&spec, &experiment);
-    let (mut updates, mut floors) = (Vec::new(), Vec::new());
+    let (preset, figure) = match subject {
+        Subject::LowLevel(LowLevelName::Mlp) => ("tracking-mlp".to_string(), "learner.update".to_string()),
+        Subject::LowLevel(other) => (format!("tracking-{other}"), format!("learner.update.{other}")),
+        Subject::Joint => ("joint-get-up".to_string(), "learner.update.joint".to_string()),
+    };
+    let experiment = comic_experiment::resolve(&preset, &[])?;
+    let mut update = Update::new(&experiment)?;
+    let alone = Experiment { joint: Vec::new(), ..experiment.clone() };
+    let mut one_task = matches!(subject, Subject::Joint).then(|| Update::new(&alone)).transpose()?;
+    let least = floor(&update.spec, &experiment);
+    let (mut updates, mut one_tasks, mut floors) = (Vec::new(), Vec::new(), Vec::new());
     for repeat in 0..repeats + 2 {
-        let update = milliseconds(|| learner.step(&minibatch).map(|losses| losses.to_metrics()))?;
+        let value = update.run()?;
+        let one_task = one_task.as_mut().map(Update::run).transpose()?;
         let floor = milliseconds(|| -> Result<(), crate::vmpo::Error> {
             least.run();
             Ok(())
         })?;
         // The first two warm up.
         if repeat >= 2 {
-            updates.push(update);
+            updates.push(value);
+            one_tasks.extend(one_task);
             floors.push(floor);
         }
     }
     let (value, floor) = (median(updates), median(floors));
-    let figure = match low_level {
-        LowLevelName::Mlp => "learner.update".to_string(),
-        other => format!("learner.update.{other}"),
-    };
-    let line = json!({
+    let mut line = json!({
         "figure": figure, "value": value, "unit": "ms", "floor": floor, "ratio": value / floor,
         "threads": threads, "repeats": repeats,
     });
+    if !one_tasks.is_empty() {
+        let one_task = median(one_tasks);
+        line["one_task"] = json!(one_task);
+        line["against_one_task"] = json!(value / one_task);
+    }
     println!("{line}");
     Ok(())
+}
+
+/// What is updated.
+#[derive(Clone, Copy, Debug)]
+pub enum Subject {
+    /// The paper's tracking with this low level.
+    LowLevel(LowLevelName),
+    /// Two tasks together.
+    Joint,
+}
+
+/// Networks of paper size and a batch for them.
+struct Update {
+    spec: TaskSpec,
+    learner: VmpoLearner,
+    minibatch: MinibatchTensors,
+}
+
+impl Update {
+    fn new(experiment: &Experiment) -> Result<Self> {
+        let spec = TaskSpec::new(experiment, vec!["clip".into()])
+            .map_err(|name| anyhow::anyhow!("no observation `{name}`"))?;
+        let learner = VmpoLearner::new(&spec, experiment, &vec![0.0; spec.action], Device::Cpu)?;
+        let minibatch = random_minibatch(&spec, experiment)?;
+        Ok(Self { spec, learner, minibatch })
+    }
+
+    /// Milliseconds of a gradient step.
+    fn run(&mut self) -> Result<f64> {
+        let Self { learner, minibatch, .. } = self;
+        Ok(milliseconds(|| learner.step(minibatch).map(|losses| losses.to_metrics()))?)
+    }
 }
 
 fn floor(spec: &TaskSpec, experiment: &Experiment) -> Floor {
@@ -190,6 +230,9 @@ fn random_minibatch(spec: &TaskSpec, experiment: &Experiment) -> Result<Minibatc
     let random = |count: usize| {
         Vec::<f32>::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu))).context("random numbers")
     };
+    // Unrolls of all tasks in turn; in the bench every task has one clip.
+    let tasks: Vec<usize> = (0..unrolls).map(|unroll| unroll % spec.tasks.len()).collect();
+    let clips: Vec<u32> = tasks.iter().flat_map(|task| vec![*task as u32; shape.length + 1]).collect();
     let source = MinibatchSource {
         proprioception: &random(observations * shape.proprioception)?,
         task: &random(observations * shape.task)?,
@@ -204,10 +247,11 @@ fn random_minibatch(spec: &TaskSpec, experiment: &Experiment) -> Result<Minibatc
         valid: &vec![1.0; rows],
         first: &vec![0.0; observations],
         state: &vec![0.0; unrolls * shape.state],
-        clip: &vec![0; observations],
+        clip: &clips,
         image: &[],
+        tasks: &tasks,
     };
-    let shape = MinibatchShape { unrolls, unroll: shape };
+    let shape = MinibatchShape { unrolls, tasks: spec.tasks.len(), unroll: shape };
     Ok(MinibatchTensors::new(&source, &shape, Device::Cpu)?)
 }
 

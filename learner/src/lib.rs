@@ -7,7 +7,7 @@
 //!   it does before.
 //! - [`vmpo`] is the algorithm: losses, and the gradient step. [`adam`] is its optimiser.
 //! - `state` turns the trainer into a snapshot and back. [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
-//! - [`metrics`] is what a person sees.
+//! - [`metrics`] is what a person sees; [`sizes`] counts parameters.
 //!
 //! There is no MuJoCo here: whatever needs a simulator is done by actors.
 
@@ -19,6 +19,7 @@ pub mod options;
 pub mod publish;
 pub mod run;
 pub mod service;
+pub mod sizes;
 mod state;
 pub mod statistics;
 pub mod tensors;

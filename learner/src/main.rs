@@ -1,9 +1,11 @@
 //! The program `comic-learner`.
 
-use std::io::IsTerminal as _;
+use std::io::{IsTerminal as _, Write as _};
 use std::process::ExitCode;
 
+use anyhow::Context as _;
 use clap::Parser as _;
+use comic_learner::bench::Subject;
 use comic_learner::options::{Command, LogFormat, Options};
 use tracing_subscriber::EnvFilter;
 
@@ -19,9 +21,12 @@ fn main() -> ExitCode {
         LogFormat::Json => log.json().init(),
     }
     let ended = match &options.command {
-        Some(Command::Bench { threads, repeats, low_level }) => {
-            comic_learner::bench::run(*threads, *repeats, *low_level)
+        Some(Command::Bench { threads, repeats, low_level, joint }) => {
+            let subject = if *joint { Subject::Joint } else { Subject::LowLevel(*low_level) };
+            comic_learner::bench::run(*threads, *repeats, subject)
         }
+        Some(Command::Sizes) => comic_learner::sizes::table()
+            .and_then(|table| std::io::stdout().write_all(table.as_bytes()).context("cannot write to stdout")),
         None => comic_learner::run::run(&options),
     };
     match ended {

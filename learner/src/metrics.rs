@@ -7,7 +7,9 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 use comic_experiment::TaskSpec;
-use comic_proto::v1::{EpisodeEnd, UnrollHeader};
+use comic_proto::Field;
+use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
+use comic_replay::Batch;
 use serde_json::{Map, Value, json};
 
 use crate::service::Evaluation;
@@ -15,25 +17,75 @@ use crate::service::Evaluation;
 /// Sums since the last line.
 #[derive(Debug, Default)]
 struct Window {
-    episodes: u64,
-    steps: u64,
-    /// Sum over episodes of return / (the most it could have paid).
-    normalised: f64,
-    /// Sum over episodes of the share of the clip that was survived.
-    survived: f64,
-    diverged: u64,
+    episodes: Episodes,
+    /// Task by task.
+    tasks: Vec<TaskWindow>,
     returns: Vec<f64>,
-    environment_steps: u64,
     unrolls: u64,
     age: u64,
     updates: u64,
 }
 
+/// Sums over episodes.
+#[derive(Clone, Debug, Default)]
+struct Episodes {
+    count: u64,
+    steps: u64,
+    diverged: u64,
+    total: f64,
+    /// Of return / the most that a step pays.
+    share: f64,
+    /// Of return / (the most it could have paid).
+    normalised: f64,
+    /// Of the share of the clip that was survived.
+    survived: f64,
+}
+
+/// What was trained on of one task.
+#[derive(Clone, Debug, Default)]
+struct TaskWindow {
+    episodes: Episodes,
+    unrolls: u64,
+    environment_steps: u64,
+    padding: u64,
+    rows: u64,
+}
+
+impl Episodes {
+    fn add(&mut self, episode: &EpisodeStatistics, max_reward: f64) {
+        let possible = f64::from(episode.steps_left_at_start.max(1));
+        let total: f64 = episode.returns.iter().map(|term| f64::from(*term)).sum();
+        self.count += 1;
+        self.steps += u64::from(episode.steps);
+        self.diverged += u64::from(episode.end == EpisodeEnd::Diverged as i32);
+        self.total += total;
+        self.share += total / max_reward;
+        self.normalised += total / (max_reward * possible);
+        self.survived += f64::from(episode.steps) / possible;
+    }
+
+    fn entries(&self) -> [(&'static str, Value); 7] {
+        [
+            ("episodes", json!(self.count)),
+            ("diverged", json!(self.diverged)),
+            ("episode_length", per(self.steps as f64, self.count)),
+            ("episode_return", per(self.total, self.count)),
+            ("reward_per_step", per(self.share, self.steps)),
+            ("normalised_reward", per(self.normalised, self.count)),
+            ("fraction_survived", per(self.survived, self.count)),
+        ]
+    }
+}
+
+/// Shares of nothing are absent, not 0.
+fn per(value: f64, count: u64) -> Value {
+    if count == 0 { Value::Null } else { json!(value / count as f64) }
+}
+
 /// Collects and writes metrics.
 #[derive(Debug)]
 pub struct Metrics {
-    terms: Vec<String>,
-    max_reward: f64,
+    spec: TaskSpec,
     run: PathBuf,
     file: File,
     window: Window,
@@ -66,8 +118,7 @@ impl Metrics {
         let path = run.join("metrics.jsonl");
         let file = append(&path)?;
         Ok(Self {
-            terms: spec.reward_terms.clone(),
-            max_reward: spec.max_reward,
+            spec: spec.clone(),
             run: run.to_path_buf(),
             file,
             window: Window::default(),
@@ -83,7 +134,7 @@ impl Metrics {
 
     /// Whether a line would say anything that the last one did not: a learner that nobody feeds writes none.
     pub fn has_news(&self, books: &Value) -> bool {
-        self.window.unrolls > 0 || self.window.environment_steps > 0 || self.books != *books
+        self.window.unrolls > 0 || self.window.tasks.iter().any(|task| task.unrolls > 0) || self.books != *books
     }
 
     /// Appends an actor's evaluation to `RUN/evaluations.jsonl`.
@@ -98,9 +149,25 @@ impl Metrics {
         writeln!(file, "{line}").with_context(|| format!("cannot write {}", path.display()))
     }
 
-    /// Counts environment steps that a batch held.
-    pub fn count_steps(&mut self, steps: u64) {
-        self.window.environment_steps += steps;
+    /// Counts what a batch held, whose unrolls are of these tasks; gives its environment steps.
+    pub fn count_steps(&mut self, batch: &Batch, tasks: &[usize]) -> u64 {
+        let length = batch.layout.shape().length.max(1);
+        self.window.tasks.resize(self.spec.tasks.len(), TaskWindow::default());
+        let mut all = 0;
+        let firsts = batch.f32(Field::First).chunks_exact(length + 1);
+        for ((valid, first), task) in batch.f32(Field::Valid).chunks_exact(length).zip(firsts).zip(tasks) {
+            let steps = valid.iter().filter(|valid| **valid > 0.5).count() as u64;
+            // Rows that begin an episode without a step.
+            let padding = valid.iter().zip(first).filter(|(valid, first)| **valid < 0.5 && **first > 0.5).count();
+            all += steps;
+            if let Some(task) = self.window.tasks.get_mut(*task) {
+                task.unrolls += 1;
+                task.environment_steps += steps;
+                task.padding += padding as u64;
+                task.rows += length as u64;
+            }
+        }
+        all
     }
 
     /// Counts a batch that V-MPO trained on.
@@ -111,18 +178,18 @@ impl Metrics {
     /// Counts a batch's episodes, and the age of its unrolls where `version` is the newest.
     pub fn absorb(&mut self, headers: &[UnrollHeader], version: u64) {
         let window = &mut self.window;
-        window.returns.resize(self.terms.len(), 0.0);
+        window.returns.resize(self.spec.reward_terms.len(), 0.0);
+        window.tasks.resize(self.spec.tasks.len(), TaskWindow::default());
         for header in headers {
             window.unrolls += 1;
             window.age += version.saturating_sub(header.version);
             for episode in &header.episodes {
-                let possible = f64::from(episode.steps_left_at_start.max(1));
-                let total: f64 = episode.returns.iter().map(|term| f64::from(*term)).sum();
-                window.normalised += total / (self.max_reward * possible);
-                window.survived += f64::from(episode.steps) / possible;
-                window.episodes += 1;
-                window.steps += u64::from(episode.steps);
-                window.diverged += u64::from(episode.end == EpisodeEnd::Diverged as i32);
+                let clip = episode.clip as usize;
+                let max_reward = self.spec.max_reward(clip);
+                window.episodes.add(episode, max_reward);
+                if let Some(task) = window.tasks.get_mut(self.spec.task_of(clip)) {
+                    task.episodes.add(episode, max_reward);
+                }
                 for (sum, value) in window.returns.iter_mut().zip(&episode.returns) {
                     *sum += f64::from(*value);
                 }
@@ -139,32 +206,44 @@ impl Metrics {
         let window = std::mem::take(&mut self.window);
         self.since = Instant::now();
         self.books = books.clone();
-        let total: f64 = window.returns.iter().sum();
-        // Shares of nothing are absent, not 0.
-        let per = |value: f64, count: u64| if count == 0 { Value::Null } else { json!(value / count as f64) };
+        let environment_steps: u64 = window.tasks.iter().map(|task| task.environment_steps).sum();
+        let named = self.spec.reward_terms.iter().zip(&window.returns);
         let terms: Map<String, Value> =
-            self.terms.iter().zip(&window.returns).map(|(name, sum)| (name.clone(), per(*sum, window.steps))).collect();
-        let line = json!({
+            named.map(|(name, sum)| (name.clone(), per(*sum, window.episodes.steps))).collect();
+        let mut line = json!({
             "seconds": position.seconds,
             "learner_epoch": position.epoch,
             "environment_steps": position.environment_steps,
             "updates": position.updates,
             "version": position.version,
-            "steps_per_second": window.environment_steps as f64 / seconds,
+            "steps_per_second": environment_steps as f64 / seconds,
             "updates_per_second": window.updates as f64 / seconds,
             "unroll_age": per(window.age as f64, window.unrolls),
-            "episodes": window.episodes,
-            "diverged": window.diverged,
-            "episode_length": per(window.steps as f64, window.episodes),
-            "episode_return": per(total, window.episodes),
-            "reward_per_step": per(total / self.max_reward, window.steps),
-            "normalised_reward": per(window.normalised, window.episodes),
-            "fraction_survived": per(window.survived, window.episodes),
             "reward_terms": terms,
             "losses": losses,
             "books": books,
-        })
-        .to_string();
+        });
+        for (name, value) in window.episodes.entries() {
+            line[name] = value;
+        }
+        if self.spec.tasks.len() > 1 {
+            line["tasks"] = self
+                .spec
+                .tasks
+                .iter()
+                .zip(&window.tasks)
+                .map(|(task, window)| {
+                    let mut entries: Map<String, Value> =
+                        window.episodes.entries().map(|(name, value)| (name.to_string(), value)).into_iter().collect();
+                    entries.insert("unrolls".into(), json!(window.unrolls));
+                    entries.insert("environment_steps".into(), json!(window.environment_steps));
+                    entries.insert("padding_share".into(), per(window.padding as f64, window.rows));
+                    (task.name.clone(), Value::Object(entries))
+                })
+                .collect::<Map<String, Value>>()
+                .into();
+        }
+        let line = line.to_string();
         writeln!(self.file, "{line}").context("cannot write metrics.jsonl")?;
         Ok(line)
     }

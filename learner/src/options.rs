@@ -66,6 +66,8 @@ impl Document {
 /// What else than serving.
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    /// Print how many parameters the networks of the paper's presets have.
+    Sizes,
     /// Time the update against its bare matrix products; one JSON line per figure.
     Bench {
         /// libtorch's threads.
@@ -77,6 +79,9 @@ pub enum Command {
         /// The low level: mlp, lstm, mixture or product.
         #[arg(long, default_value_t = LowLevelName::Mlp)]
         low_level: LowLevelName,
+        /// Joint training of two tasks.
+        #[arg(long, conflicts_with = "low_level")]
+        joint: bool,
     },
 }
 

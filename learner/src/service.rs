@@ -89,7 +89,8 @@ pub struct Shared {
     experiment: String,
     task_spec: String,
     seed: u64,
-    clips: usize,
+    /// Of each task.
+    clips: Vec<usize>,
     assets: Vec<Asset>,
     batcher: Batcher,
     publisher: Publisher,
@@ -115,7 +116,7 @@ impl Shared {
             task_spec: toml::to_string(&spec).context("the task's spec cannot be written as TOML")?,
             seed: experiment.seed,
             experiment: experiment.to_toml()?,
-            clips: spec.clips.len(),
+            clips: spec.tasks.iter().map(|task| task.clips).collect(),
             assets,
             batcher,
             publisher,

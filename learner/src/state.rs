@@ -9,9 +9,6 @@ use comic_networks::to_safetensors;
 use crate::checkpoint::{Name, Snapshot};
 use crate::trainer::{Progress, Trainer};
 
-/// The statistics' names in a checkpoint.
-const STATISTICS: [&str; 2] = ["statistics.proprioception", "statistics.task"];
-
 impl Trainer {
     /// Hands a snapshot to the writer; while it is still busy with the last one, only a `final_one` waits.
     pub(crate) fn checkpoint(&mut self, final_one: bool) -> Result<()> {
@@ -25,9 +22,7 @@ impl Trainer {
 
     pub(crate) fn snapshot(&self) -> Result<Snapshot> {
         let mut tensors = self.learner.state();
-        for (statistics, name) in self.statistics.iter().zip(STATISTICS) {
-            tensors.extend(statistics.state(name));
-        }
+        tensors.extend(self.statistics.state());
         let progress = Progress { epoch: self.epoch, seconds: self.seconds(), ..self.progress.clone() };
         let mut snapshot = Snapshot::default();
         for (name, bytes) in [
@@ -46,11 +41,7 @@ impl Trainer {
 
     pub(crate) fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
         let mut tensors = crate::tensors::from_bytes(snapshot.part("learner.safetensors")?)?;
-        for (statistics, name) in self.statistics.iter_mut().zip(STATISTICS) {
-            let find = |wanted: &str| tensors.iter().find(|(name, _)| name == wanted).map(|(_, tensor)| tensor.copy());
-            statistics.restore(name, find).with_context(|| format!("the checkpoint's {name} do not fit the task"))?;
-        }
-        tensors.retain(|(name, _)| !STATISTICS.iter().any(|prefix| name.starts_with(prefix)));
+        self.statistics.restore(&mut tensors)?;
         self.learner.load_state(&tensors).context("the checkpoint does not fit the experiment's networks")?;
         self.target = Bytes::copy_from_slice(snapshot.part("target.safetensors")?);
         self.progress =

@@ -4,10 +4,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
-use anyhow::{Context as _, Result, bail};
+use anyhow::{Result, bail};
 use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec};
-use comic_networks::{NormaliserStatistics, to_safetensors};
+use comic_networks::to_safetensors;
 use comic_proto::Field;
 use comic_proto::v1::Behaviour;
 use comic_replay::{Batch, Batcher, Next, Phase, Reason};
@@ -16,13 +16,13 @@ use rand::seq::SliceRandom as _;
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
-use tch::{Device, Tensor};
+use tch::Device;
 
 use crate::checkpoint::{Name, Snapshot, Store};
 use crate::metrics::{Metrics, Position};
 use crate::publish::Publisher;
 use crate::service::Shared;
-use crate::statistics::Statistics;
+use crate::statistics::ObservationStatistics;
 use crate::vmpo::{self, Losses, MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
 use crate::writer::Writer;
 
@@ -83,8 +83,8 @@ pub struct Trainer {
     pub(crate) spec: TaskSpec,
     pub(crate) epoch: u64,
     pub(crate) learner: VmpoLearner,
-    /// Of the observations, for the normaliser: proprioception and task.
-    pub(crate) statistics: [Statistics; 2],
+    /// Of the observations, for the normaliser.
+    pub(crate) statistics: ObservationStatistics,
     /// The parameters actors act with, as published.
     pub(crate) target: Bytes,
     pub(crate) progress: Progress,
@@ -112,7 +112,7 @@ impl Trainer {
         let learner = VmpoLearner::new(&spec, &experiment, &pose, Device::Cpu)?;
         let store = Store::open(&run, experiment.learner.checkpoints_kept)?;
         let mut trainer = Self {
-            statistics: [spec.proprioception, spec.task].map(|width| Statistics::new(width as i64)),
+            statistics: ObservationStatistics::new(&spec),
             target: Bytes::from(to_safetensors(learner.policy_store())?),
             progress: Progress {
                 epoch,
@@ -185,7 +185,7 @@ impl Trainer {
     fn learn(&mut self, batch: Batch) -> Result<()> {
         let tensors = self.tensors(&batch)?;
         if self.normalises_still() {
-            let unseen = self.statistics[0].count() == 0.0;
+            let unseen = self.statistics.count() == 0.0;
             self.absorb(&batch);
             self.set_normaliser()?;
             if unseen {
@@ -217,6 +217,12 @@ impl Trainer {
     }
 }
 
+/// The task of each unroll: that of its clips.
+fn tasks_of_unrolls(batch: &Batch, spec: &TaskSpec) -> Vec<usize> {
+    let rows = batch.layout.rows(Field::Clip).max(1);
+    batch.clip().iter().step_by(rows).map(|clip| spec.task_of(*clip as usize)).collect()
+}
+
 /// What waiting for a batch led to.
 pub(crate) enum Wait {
     Batch(Batch),
@@ -241,7 +247,9 @@ impl Trainer {
 
     /// The batch on the device, `[B, T(+1), …]`.
     pub(crate) fn tensors(&self, batch: &Batch) -> Result<MinibatchTensors> {
-        let shape = MinibatchShape { unrolls: batch.unrolls, unroll: *batch.layout.shape() };
+        let tasks = tasks_of_unrolls(batch, &self.spec);
+        let shape =
+            MinibatchShape { unrolls: batch.unrolls, tasks: self.spec.tasks.len(), unroll: *batch.layout.shape() };
         let source = MinibatchSource {
             proprioception: batch.f32(Field::Proprioception),
             task: batch.f32(Field::Task),
@@ -258,6 +266,7 @@ impl Trainer {
             state: batch.f32(Field::State),
             clip: batch.clip(),
             image: batch.image(),
+            tasks: &tasks,
         };
         Ok(MinibatchTensors::new(&source, &shape, self.learner.device())?)
     }
@@ -267,23 +276,22 @@ impl Trainer {
         let unrolls = self.experiment.unroll.batch;
         let size = self.experiment.vmpo.minibatch_unrolls;
         let steps = self.experiment.vmpo.gradient_steps;
-        let mut order: Vec<i64> = Vec::new();
+        let mut order: Vec<usize> = Vec::new();
         while order.len() < steps * size {
-            let mut pass: Vec<i64> = (0..unrolls as i64).collect();
+            let mut pass: Vec<usize> = (0..unrolls).collect();
             // With the whole batch in each step, order means nothing; keep it, so that sums are those of the batch.
             if size < unrolls {
                 pass.shuffle(&mut self.progress.random);
             }
             order.extend(pass);
         }
-        (0..steps).map(move |step| tensors.select(&Tensor::from_slice(&order[step * size..(step + 1) * size])))
+        (0..steps).map(move |step| tensors.select(&order[step * size..(step + 1) * size]))
     }
 
     /// Counts a batch's steps, and gives its memory back.
     pub(crate) fn book(&mut self, batch: Batch) {
-        let steps = batch.f32(Field::Valid).iter().filter(|valid| **valid > 0.5).count() as u64;
-        self.progress.environment_steps += steps;
-        self.metrics.count_steps(steps);
+        let tasks = tasks_of_unrolls(&batch, &self.spec);
+        self.progress.environment_steps += self.metrics.count_steps(&batch, &tasks);
         self.batcher.trained(batch);
     }
 
@@ -305,26 +313,15 @@ impl Trainer {
 
     fn normalises_still(&self) -> bool {
         // A count of rows, not of steps: the difference is one row in an unroll.
-        self.statistics[0].count() < self.experiment.network.normaliser_steps as f64
+        self.statistics.count() < self.experiment.network.normaliser_steps as f64
     }
 
     pub(crate) fn absorb(&mut self, batch: &Batch) {
-        for (statistics, field) in self.statistics.iter_mut().zip([Field::Proprioception, Field::Task]) {
-            statistics.absorb(&Tensor::from_slice(batch.f32(field)));
-        }
+        self.statistics.absorb(batch, &tasks_of_unrolls(batch, &self.spec));
     }
 
     pub(crate) fn set_normaliser(&mut self) -> Result<()> {
-        let floats = |tensor: Tensor| Vec::<f32>::try_from(tensor).context("cannot read the statistics");
-        let [proprioception, task] = &self.statistics;
-        let ((proprioception_mean, proprioception_std), (task_mean, task_std)) =
-            (proprioception.mean_and_std(), task.mean_and_std());
-        Ok(self.learner.set_normaliser(&NormaliserStatistics {
-            proprioception_mean: floats(proprioception_mean)?,
-            proprioception_std: floats(proprioception_std)?,
-            task_mean: floats(task_mean)?,
-            task_std: floats(task_std)?,
-        })?)
+        Ok(self.learner.set_normaliser(&self.statistics.to_normaliser()?)?)
     }
 
     /// Keeps the newest losses for the metrics, and refuses to go on with numbers that are none.
@@ -337,6 +334,11 @@ impl Trainer {
             );
         }
         self.losses = losses.entries().into_iter().map(|(name, value)| (name.to_string(), json!(value))).collect();
+        if self.spec.tasks.len() > 1 && losses.temperatures.len() == self.spec.tasks.len() {
+            let names = self.spec.tasks.iter().map(|task| task.name.clone());
+            let temperatures: Map<_, _> = names.zip(losses.temperatures.iter().map(|eta| json!(eta))).collect();
+            self.losses.insert("temperatures".to_string(), Value::Object(temperatures));
+        }
         Ok(())
     }
 

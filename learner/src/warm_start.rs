@@ -4,7 +4,6 @@ use anyhow::Result;
 use comic_proto::v1::Behaviour;
 use rand::Rng as _;
 use rand::seq::index::sample;
-use tch::Tensor;
 
 use crate::checkpoint::Name;
 use crate::trainer::{Trainer, Wait};
@@ -69,10 +68,9 @@ impl Trainer {
         let random = &mut self.progress.random;
         let batch = &mut demonstrations[random.random_range(0..demonstrations.len())];
         let of = batch.shape().unrolls;
-        let chosen: Vec<i64> = sample(random, of, unrolls.min(of)).into_iter().map(|index| index as i64).collect();
-        let indices = Tensor::from_slice(&chosen);
-        let (losses, latents) = self.learner.regress(&batch.select(&indices))?;
-        batch.refresh_previous_latent(&indices, &latents);
+        let chosen = sample(random, of, unrolls.min(of)).into_vec();
+        let (losses, latents) = self.learner.regress(&batch.select(&chosen))?;
+        batch.refresh_previous_latent(&chosen, &latents);
         Ok(losses)
     }
 }

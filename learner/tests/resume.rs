@@ -20,12 +20,19 @@ use rand_pcg::Pcg64;
 const INCARNATION: u64 = 7;
 const UPDATES: u64 = 6;
 
-fn experiment(updates: u64) -> Experiment {
+/// What each preset adds to be small.
+const PRESETS: [(&str, &[&str]); 5] = [
+    ("tracking-mlp", &["network.mlp.hidden=[16]"]),
+    ("tracking-lstm", &["network.lstm.units=[8, 6]", "network.value_lstm=[6]", "vmpo.value_burn_in=1"]),
+    ("tracking-mixture", &["network.primitives.torso=[16]", "network.primitives.hidden=8"]),
+    ("tracking-product", &["network.primitives.torso=[16]", "network.primitives.hidden=8"]),
+    ("joint-get-up", &["network.mlp.hidden=[16]"]),
+];
+
+fn experiment(preset: &str, updates: u64) -> Experiment {
     let mut overrides: Vec<String> = [
         "network.encoder=[16]",
-        "network.mlp.hidden=[16]",
         "network.value=[16]",
-        "network.latent.size=4",
         "network.normaliser_steps=100",
         "vmpo.target_period=2",
         "vmpo.gradient_steps=3",
@@ -37,7 +44,12 @@ fn experiment(updates: u64) -> Experiment {
     .map(String::from)
     .to_vec();
     overrides.push(format!("budget.updates={updates}"));
-    resolve("tracking-mlp", &overrides).unwrap()
+    let own = PRESETS.iter().find(|(name, _)| *name == preset).map_or(&[][..], |(_, own)| own);
+    overrides.extend(own.iter().map(ToString::to_string));
+    let mut experiment = resolve(preset, &overrides).unwrap();
+    // A bottleneck where the preset has one.
+    experiment.network.latent.size = experiment.network.latent.size.min(4);
+    experiment
 }
 
 fn spec(experiment: &Experiment) -> TaskSpec {
@@ -45,15 +57,22 @@ fn spec(experiment: &Experiment) -> TaskSpec {
 }
 
 /// The `sequence`-th unroll of the recording: the same numbers whenever it is asked for.
-fn recorded(layout: &UnrollLayout, sequence: u64) -> UnrollBuffer {
+fn recorded(layout: &UnrollLayout, spec: &TaskSpec, sequence: u64) -> UnrollBuffer {
+    let task = sequence as usize % spec.tasks.len();
+    let first_clip: usize = spec.tasks[..task].iter().map(|task| task.clips).sum();
+    let clips = first_clip as u32..(first_clip + spec.tasks[task].clips) as u32;
     let mut random = Pcg64::seed_from_u64(sequence);
     let mut unroll = UnrollBuffer::new(layout);
     for field in Field::ALL {
         for t in 0..layout.rows(field) {
             match field {
-                Field::Clip => unroll.set_clip(t, random.random_range(0..2)),
+                Field::Clip => unroll.set_clip(t, random.random_range(clips.clone())),
                 Field::Valid | Field::Discount => unroll.row_mut(field, t).fill(1.0),
                 Field::First => {}
+                Field::LogWeights => {
+                    let even = -(layout.width(field) as f32).ln();
+                    unroll.row_mut(field, t).fill(even);
+                }
                 Field::Std => unroll.row_mut(field, t).fill(0.5),
                 _ => unroll.row_mut(field, t).fill_with(|| random.random_range(-1.0..1.0)),
             }
@@ -66,8 +85,8 @@ fn recorded(layout: &UnrollLayout, sequence: u64) -> UnrollBuffer {
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 /// One life of the learner, fed with the recording from where its books say; its last checkpoint.
-fn live(run: &Path, updates: u64) -> Snapshot {
-    let experiment = experiment(updates);
+fn live(preset: &str, run: &Path, updates: u64) -> Snapshot {
+    let experiment = experiment(preset, updates);
     let spec = spec(&experiment);
     let store = Store::open(run, 3).unwrap();
     let resume = store.newest().unwrap().map(|(_, snapshot)| snapshot);
@@ -91,7 +110,7 @@ fn live(run: &Path, updates: u64) -> Snapshot {
     let run = run.to_path_buf();
     let joined = batcher.join(INCARNATION, None).unwrap();
     let feeder = std::thread::spawn({
-        let (batcher, layout) = (batcher.clone(), layout.clone());
+        let (batcher, layout, spec) = (batcher.clone(), layout.clone(), spec.clone());
         // Exactly what the rest of the run needs, so that the books are the same whoever feeds.
         let batch = experiment.unroll.batch as u64;
         let unrolls = (updates + 1) * batch;
@@ -100,7 +119,7 @@ fn live(run: &Path, updates: u64) -> Snapshot {
                 let (actor, incarnation) = (joined.actor, INCARNATION);
                 let header = UnrollHeader { actor, incarnation, sequence, learner_epoch: epoch, ..Default::default() };
                 let header = UnrollHeader { version: batcher.phase().version, ..header };
-                let inserted = batcher.insert(&header, recorded(&layout, sequence).into_bytes());
+                let inserted = batcher.insert(&header, recorded(&layout, &spec, sequence).into_bytes());
                 assert_eq!(futures::executor::block_on(inserted), Outcome::Taken);
                 // Batch by batch, so that none waits while the trainer changes the terms.
                 while (sequence + 1) % batch == 0 && batcher.books().in_flight > 0 {
@@ -135,22 +154,24 @@ fn a_resumed_run_ends_bit_for_bit_where_an_unbroken_one_ends() {
     let _alone = ONE_AT_A_TIME.lock();
     // libtorch's sums depend on its threads.
     tch::set_num_threads(1);
-    let (unbroken, broken) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-    let expected = live(unbroken.path(), UPDATES);
-    live(broken.path(), UPDATES / 2);
-    let resumed = live(broken.path(), UPDATES);
-    let (expected, resumed) = (comparable(&expected), comparable(&resumed));
-    for ((name, expected), (_, resumed)) in expected.iter().zip(&resumed) {
-        assert!(expected == resumed, "{name} differs after a resume");
+    for (preset, _) in PRESETS {
+        let (unbroken, broken) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let expected = live(preset, unbroken.path(), UPDATES);
+        live(preset, broken.path(), UPDATES / 2);
+        let resumed = live(preset, broken.path(), UPDATES);
+        let (expected, resumed) = (comparable(&expected), comparable(&resumed));
+        for ((name, expected), (_, resumed)) in expected.iter().zip(&resumed) {
+            assert!(expected == resumed, "{preset}: {name} differs after a resume");
+        }
+        assert_eq!(expected.len(), resumed.len());
     }
-    assert_eq!(expected.len(), resumed.len());
 }
 
 #[test]
 fn training_changes_the_parameters() {
     let _alone = ONE_AT_A_TIME.lock();
     let run = tempfile::tempdir().unwrap();
-    let trained = live(run.path(), 1);
+    let trained = live("tracking-mlp", run.path(), 1);
     let initial = comic_learner::checkpoint::read(&run.path().join("checkpoints/initial")).unwrap();
     assert_ne!(trained.part("policy.safetensors").unwrap(), initial.part("policy.safetensors").unwrap());
 }

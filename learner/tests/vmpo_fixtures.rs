@@ -90,7 +90,7 @@ fn losses_and_gradients_equal_rlax() {
         let advantage = fixture.array("advantage");
         let [temperature, alpha_mean, alpha_std] =
             ["temperature", "alpha_mean", "alpha_std"].map(|name| fixture.scalar(name) as f32);
-        let multipliers = Multipliers::new(&[temperature, alpha_mean, alpha_std], Device::Cpu);
+        let multipliers = Multipliers::new(&[temperature], &[alpha_mean, alpha_std], Device::Cpu);
         let limits = Limits {
             epsilon_eta: fixture.scalar("epsilon_eta"),
             epsilon_mean: fixture.scalar("epsilon_mean"),
@@ -99,7 +99,16 @@ fn losses_and_gradients_equal_rlax() {
             top_fraction: fixture.scalar("top_fraction"),
         };
         let valid = advantage.ones_like();
-        let evidence = Evidence { log_prob, advantage: &advantage, kl_mean, kl_std, kl_weights: None, valid: &valid };
+        let groups = [valid.to_kind(Kind::Bool)];
+        let evidence = Evidence {
+            log_prob,
+            advantage: &advantage,
+            kl_mean,
+            kl_std,
+            kl_weights: None,
+            valid: &valid,
+            groups: &groups,
+        };
         let improvement = policy_improvement(&evidence, &multipliers, &limits);
         fixture.compare("policy_loss", &improvement.policy);
         fixture.compare("temperature_loss", &improvement.temperature);

@@ -30,7 +30,7 @@ impl Case {
             kl_mean: learnt(&numbers * 0.1),
             kl_std: learnt(&numbers * 0.2),
             valid: Tensor::ones([steps], (Kind::Float, Device::Cpu)),
-            multipliers: Multipliers::new(&[1.0, 2.0, 3.0], Device::Cpu),
+            multipliers: Multipliers::new(&[1.0], &[2.0, 3.0], Device::Cpu),
         }
     }
 
@@ -47,6 +47,7 @@ impl Case {
             kl_std: &self.kl_std,
             kl_weights: None,
             valid: &self.valid,
+            groups: &[self.valid.ones_like().to_kind(Kind::Bool)],
         };
         policy_improvement(&evidence, &self.multipliers, &LIMITS)
     }
@@ -150,7 +151,7 @@ fn masked_steps_may_hold_anything() {
 #[test]
 fn large_advantages_and_tiny_temperatures_do_not_overflow() {
     let mut case = Case::new(&[2000.0, 1999.0, -2000.0, -1e4]);
-    case.multipliers = Multipliers::new(&[1e-8, 1.0, 1.0], Device::Cpu);
+    case.multipliers = Multipliers::new(&[1e-8], &[1.0, 1.0], Device::Cpu);
     let losses = case.losses();
     assert!(number(&losses.total()).is_finite());
     assert!(case.gradient(&losses.total(), case.multipliers.parameter()).iter().all(|value| value.is_finite()));
@@ -191,4 +192,39 @@ proptest! {
         prop_assert!((number(&left.policy) - number(&right.policy)).abs() < 1e-5);
         prop_assert!((number(&left.temperature) - number(&right.temperature)).abs() < 1e-5);
     }
+}
+
+#[test]
+fn groups_have_an_e_step_each_and_their_losses_are_weighed_by_their_steps() {
+    let case = Case::new(&[2.0, 300.0, 0.0, 100.0, 1.0, -3.0]);
+    let of = |members: [bool; 6]| Tensor::from_slice(&members);
+    let groups = [of([true, false, true, false, true, true]), of([false, true, false, true, false, false])];
+    let losses = |groups: &[Tensor], temperatures: &[f32], valid: &Tensor| {
+        let evidence = Evidence {
+            log_prob: &case.log_prob,
+            advantage: &case.advantage,
+            kl_mean: &case.kl_mean,
+            kl_std: &case.kl_std,
+            kl_weights: None,
+            valid,
+            groups,
+        };
+        let multipliers = Multipliers::new(temperatures, &[2.0, 3.0], Device::Cpu);
+        let losses = policy_improvement(&evidence, &multipliers, &LIMITS);
+        let eta = Tensor::run_backward(&[&losses.temperature], &[multipliers.parameter()], true, false).remove(0);
+        (number(&losses.policy), number(&losses.temperature), values(&eta))
+    };
+    let both = losses(&groups, &[1.0, 50.0], &case.valid);
+    let alone = |group: &Tensor, eta: f32| {
+        let valid = group.to_kind(Kind::Float);
+        losses(&[group.shallow_clone()], &[eta], &valid)
+    };
+    let (first, second) = (alone(&groups[0], 1.0), alone(&groups[1], 50.0));
+    let share = |first: f32, second: f32| first * 4.0 / 6.0 + second * 2.0 / 6.0;
+    assert_close(both.0, share(first.0, second.0));
+    assert_close(both.1, share(first.1, second.1));
+    assert_close(both.2[0], first.2[0] * 4.0 / 6.0);
+    assert_close(both.2[1], second.2[0] * 2.0 / 6.0);
+    // A group without a step leaves its temperature alone.
+    assert_eq!(losses(&groups, &[1.0, 50.0], &groups[0].to_kind(Kind::Float)).2[1], 0.0);
 }

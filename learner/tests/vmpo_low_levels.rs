@@ -7,7 +7,7 @@ mod vmpo_support;
 
 use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives};
 use comic_learner::vmpo::{MinibatchTensors, VmpoLearner};
-use comic_networks::Memory;
+use comic_networks::{Memory, Routing};
 use tch::{Device, Kind, Tensor};
 use vmpo_support::{LENGTH, Numbers, Unrolls, difference, experiment, learner};
 
@@ -65,6 +65,7 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
                 &rows(&unrolls.proprioception, LENGTH + 1, t),
                 &rows(&unrolls.task, LENGTH + 1, t),
                 None,
+                &Routing::single(),
             );
             let memory = Memory { state: &remembered, first: None };
             learner.policy().act(&observation, &previous, &rows(&unrolls.latent_noise, LENGTH, t), memory)
@@ -139,7 +140,7 @@ fn compare(experiment: &Experiment, left: &MinibatchTensors, right: &MinibatchTe
 fn permuting_the_batch_changes_nothing() {
     for (name, experiment) in every_low_level() {
         let base = minibatch(&learner(&experiment, 1), &experiment, 3);
-        let permuted = base.select(&Tensor::from_slice(&[2i64, 0, 1]));
+        let permuted = base.select(&[2, 0, 1]);
         assert!(compare(&experiment, &base, &permuted) < 1e-5, "{name}");
     }
 }
@@ -186,6 +187,7 @@ fn a_policy_never_looks_across_an_episodes_beginning() {
                 &tensor(&unrolls.proprioception, LENGTH + 1).narrow(1, 0, LENGTH as i64),
                 &tensor(&unrolls.task, LENGTH + 1).narrow(1, 0, LENGTH as i64),
                 None,
+                &Routing::single(),
             );
             let state = Tensor::from_slice(&unrolls.state).reshape([count, state as i64]);
             let first = tensor(&unrolls.first, LENGTH + 1).squeeze_dim(-1).narrow(1, 0, LENGTH as i64);
@@ -208,7 +210,7 @@ fn primitives_never_see_the_reference() {
         let influence = || {
             let zeros = |width: i64| Tensor::zeros([2, width], (Kind::Float, Device::Cpu));
             let reference = zeros(4).set_requires_grad(true);
-            let observation = learner.policy().normalise(&zeros(5), &reference, None);
+            let observation = learner.policy().normalise(&zeros(5), &reference, None, &Routing::single());
             let latent = experiment.network.latent.size as i64;
             let memory = Memory { state: &zeros(0), first: None };
             let acting = learner.policy().act(&observation, &zeros(latent), &zeros(latent), memory);
@@ -221,8 +223,11 @@ fn primitives_never_see_the_reference() {
         };
         assert!(influence() > 0.0, "{name}: the reference reaches the action");
         // Where the weights no longer hang on it, nothing does.
-        let gate =
-            if experiment.network.latent.size > 0 { "low_level.gate.head.weight" } else { "encoder.head.weight" };
+        let gate = if experiment.network.latent.size > 0 {
+            "low_level.gate.head.weight"
+        } else {
+            "encoder.tracking.head.weight"
+        };
         let mut weights = learner.policy_store().variables().remove(gate).unwrap();
         let _ = tch::no_grad(|| weights.zero_());
         assert_eq!(influence(), 0.0, "{name}");

@@ -184,7 +184,7 @@ fn refreshed_demonstrations_carry_each_steps_own_latent_forward() {
     let mut learner = learner(&training(), 1);
     let unrolls = unrolls(1);
     let mut all = unrolls.minibatch();
-    let indices = Tensor::from_slice(&[5i64, 2]);
+    let indices = [5, 2];
     let (_, latents) = learner.regress(&all.select(&indices)).unwrap();
     assert_eq!(latents.size(), [2, LENGTH as i64, 2]);
     all.refresh_previous_latent(&indices, &latents);

@@ -1,26 +1,27 @@
 //! The reference encoder.
 
-use comic_experiment::Network;
+use comic_experiment::{Network, TaskSpec};
 use tch::{Kind, Tensor, nn};
 
 use crate::DiagonalGaussian;
-use crate::layers::{GaussianHead, GaussianHeadConfig, Torso, linear};
+use crate::layers::{GaussianHeadConfig, Mlp, Torso, gaussian, linear};
+use crate::routing::{PerTask, Routing};
 
-/// q(z_t | x_t, s_t, z_{t−1}): `[x, s, z_{t−1}]` → torso → mean and σ of z, with an optional linear path from input to
-/// output whose weights start at 0 (CoMic supplement 2.1).
+/// q(z_t | x_t, s_t, z_{t−1}), one for each task: `[s, z_{t−1}, x]` → torso → mean and σ of z, with an optional linear path
+/// from input to output whose weights start at 0 (CoMic supplement 2.1).
 ///
 /// Without a bottleneck, which mixture and product may do without, it gives the K weights' logits in z's place and knows
 /// no chance.
 #[derive(Debug)]
 pub(crate) struct Encoder {
-    torso: Torso,
+    networks: PerTask,
     head: Head,
 }
 
 #[derive(Debug)]
 enum Head {
-    Latent(GaussianHead),
-    Weights(nn::Linear),
+    Latent { min_std: f64 },
+    Weights,
 }
 
 /// What the encoder gives, for N rows.
@@ -34,37 +35,45 @@ pub(crate) struct Encoded {
 }
 
 impl Encoder {
-    /// `input` is the width of `[x, s, z_{t−1}]`.
-    pub(crate) fn new(path: &nn::Path, input: i64, config: &Network) -> Self {
-        let torso = Torso::new(path, input, &config.encoder);
+    /// `seen` is how wide the task observation grows by what is seen.
+    pub(crate) fn new(path: &nn::Path, spec: &TaskSpec, seen: i64, config: &Network) -> Self {
         let latent = &config.latent;
-        let head = if latent.size > 0 {
+        let networks = spec.tasks.iter().map(|task| {
+            let path = path / task.name.as_str();
+            let input = (spec.proprioception + latent.size + task.observation) as i64 + seen;
+            let torso = Torso::new(&path, input, &config.encoder);
+            if latent.size == 0 {
+                let head = linear(&(&path / "head"), torso.output(), config.primitives.count as i64, 1.0);
+                return Mlp::new(torso, head, None);
+            }
             let start = GaussianHeadConfig {
                 mean: &vec![0.0; latent.size],
                 initial_std: latent.initial_std,
                 min_std: latent.min_std,
                 scale: 1.0,
-                linear_path: config.encoder_linear_path.then_some(input),
             };
-            Head::Latent(GaussianHead::new(path, torso.output(), &start))
-        } else {
-            Head::Weights(linear(&(path / "head"), torso.output(), config.primitives.count as i64, 1.0))
-        };
-        Self { torso, head }
+            let head = start.linear(&(&path / "head"), torso.output());
+            // At zero: raw observations reach hundreds (contact forces), and must not decide where the latent starts.
+            let size = [2 * latent.size as i64, input];
+            let linear_path = config.encoder_linear_path.then(|| path.var("linear_path", &size, nn::Init::Const(0.0)));
+            Mlp::new(torso, head, linear_path)
+        });
+        let head = if latent.size > 0 { Head::Latent { min_std: latent.min_std } } else { Head::Weights };
+        Self { networks: PerTask::new(networks.collect()), head }
     }
 
-    /// `input [N, X+P+Z]`, `noise [N, Z]`.
-    pub(crate) fn forward(&self, input: &Tensor, noise: &Tensor) -> Encoded {
-        let hidden = self.torso.forward(input);
-        match &self.head {
-            Head::Latent(head) => {
-                let posterior = head.forward(&hidden, input);
+    /// `input [N, P+Z+X]`, `noise [N, Z]`.
+    pub(crate) fn forward(&self, input: &Tensor, noise: &Tensor, routing: &Routing) -> Encoded {
+        let output = self.networks.forward(input, routing);
+        match self.head {
+            Head::Latent { min_std } => {
+                let posterior = gaussian(&output, min_std);
                 let latent = posterior.sample(noise);
                 Encoded { intent: latent.shallow_clone(), latent, posterior: Some(posterior) }
             }
-            Head::Weights(head) => {
+            Head::Weights => {
                 let latent = Tensor::zeros([input.size()[0], 0], (Kind::Float, input.device()));
-                Encoded { intent: hidden.apply(head), latent, posterior: None }
+                Encoded { intent: output, latent, posterior: None }
             }
         }
     }

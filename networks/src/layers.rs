@@ -28,29 +28,29 @@ pub(crate) fn rows(tensor: &Tensor) -> Tensor {
 /// Hidden layers: Linear → LayerNorm → tanh first, then Linear → ELU.
 #[derive(Debug)]
 pub(crate) struct Torso {
-    first: nn::Linear,
-    norm: nn::LayerNorm,
-    others: Vec<nn::Linear>,
+    layers: Vec<nn::Linear>,
+    norm: [Tensor; 2],
     output: i64,
 }
 
 impl Torso {
     /// `sizes` holds at least one entry; the experiment file's check refuses an empty list.
     pub(crate) fn new(path: &nn::Path, input: i64, sizes: &[usize]) -> Self {
-        let layers = path / "layers";
-        let first_size = sizes.first().map_or(input, |size| *size as i64);
-        let mut width = first_size;
-        let mut others = Vec::new();
-        for (index, size) in sizes.iter().enumerate().skip(1) {
-            others.push(linear(&(&layers / index), width, *size as i64, 1.0));
-            width = *size as i64;
-        }
-        Self {
-            first: linear(&(&layers / 0), input, first_size, 1.0),
-            norm: nn::layer_norm(path / "norm", vec![first_size], nn::LayerNormConfig::default()),
-            others,
-            output: width,
-        }
+        let mut width = input;
+        let layers = sizes
+            .iter()
+            .enumerate()
+            .map(|(index, size)| {
+                let layer = linear(&(path / "layers" / index), width, *size as i64, 1.0);
+                width = *size as i64;
+                layer
+            })
+            .collect();
+        let first = sizes.first().map_or(input, |size| *size as i64);
+        let norm = path / "norm";
+        let norm =
+            [norm.var("weight", &[first], nn::Init::Const(1.0)), norm.var("bias", &[first], nn::Init::Const(0.0))];
+        Self { layers, norm, output: width }
     }
 
     /// Width of the last hidden layer.
@@ -63,11 +63,89 @@ impl Torso {
     /// The activations overwrite their inputs: neither the layer norm nor a linear layer needs its own output to
     /// differentiate itself, and a fresh 16 MB tensor a layer costs more than the arithmetic.
     pub(crate) fn forward(&self, input: &Tensor) -> Tensor {
-        let mut hidden = input.apply(&self.first).apply(&self.norm).tanh_();
-        for layer in &self.others {
+        let mut layers = self.layers.iter();
+        let mut hidden = match layers.next() {
+            Some(first) => self.normalise(&input.apply(first)).tanh_(),
+            None => input.shallow_clone(),
+        };
+        for layer in layers {
             hidden = hidden.apply(layer).elu_();
         }
         hidden
+    }
+
+    fn normalise(&self, hidden: &Tensor) -> Tensor {
+        let [weight, bias] = &self.norm;
+        hidden.layer_norm(weight.size(), Some(weight), Some(bias), LAYER_NORM_EPSILON, true)
+    }
+
+    fn parameters(&self) -> Vec<Tensor> {
+        let layers = self.layers.iter().flat_map(of_linear);
+        layers.chain(self.norm.iter().map(Tensor::shallow_clone)).collect()
+    }
+
+    fn with(&self, parameters: &mut impl Iterator<Item = Tensor>) -> Option<Self> {
+        let layers = self.layers.iter().map(|layer| with_linear(layer, parameters)).collect::<Option<_>>()?;
+        Some(Self { layers, norm: [parameters.next()?, parameters.next()?], output: self.output })
+    }
+}
+
+/// PyTorch's own.
+const LAYER_NORM_EPSILON: f64 = 1e-5;
+
+fn of_linear(layer: &nn::Linear) -> Vec<Tensor> {
+    std::iter::once(&layer.ws).chain(&layer.bs).map(Tensor::shallow_clone).collect()
+}
+
+fn with_linear(layer: &nn::Linear, parameters: &mut impl Iterator<Item = Tensor>) -> Option<nn::Linear> {
+    let ws = parameters.next()?;
+    let bs = if layer.bs.is_some() { Some(parameters.next()?) } else { None };
+    Some(nn::Linear { ws, bs })
+}
+
+/// Hidden layers and a linear output, perhaps with a linear path from input to output beside them.
+#[derive(Debug)]
+pub(crate) struct Mlp {
+    torso: Torso,
+    head: nn::Linear,
+    /// `[output, input]`.
+    linear_path: Option<Tensor>,
+}
+
+impl Mlp {
+    pub(crate) fn new(torso: Torso, head: nn::Linear, linear_path: Option<Tensor>) -> Self {
+        Self { torso, head, linear_path }
+    }
+
+    /// Width of its input.
+    pub(crate) fn input(&self) -> i64 {
+        self.torso.layers.first().map_or(0, |layer| layer.ws.size()[1])
+    }
+
+    /// `[N, input]` to `[N, output]`.
+    pub(crate) fn forward(&self, input: &Tensor) -> Tensor {
+        let output = self.torso.forward(input).apply(&self.head);
+        match &self.linear_path {
+            Some(weights) => output.addmm(input, &weights.tr()),
+            None => output,
+        }
+    }
+
+    /// Its parameters, in an order of its own.
+    pub(crate) fn parameters(&self) -> Vec<Tensor> {
+        let mut parameters = self.torso.parameters();
+        parameters.extend(of_linear(&self.head));
+        parameters.extend(self.linear_path.as_ref().map(Tensor::shallow_clone));
+        parameters
+    }
+
+    /// The same network of other parameters, in the same order; none when they are too few.
+    pub(crate) fn with(&self, parameters: impl IntoIterator<Item = Tensor>) -> Option<Self> {
+        let mut parameters = parameters.into_iter();
+        let torso = self.torso.with(&mut parameters)?;
+        let head = with_linear(&self.head, &mut parameters)?;
+        let linear_path = if self.linear_path.is_some() { Some(parameters.next()?) } else { None };
+        Some(Self { torso, head, linear_path })
     }
 }
 
@@ -81,8 +159,6 @@ pub(crate) struct GaussianHeadConfig<'a> {
     pub(crate) min_std: f64,
     /// Scale of the initial weights, relative to the other layers'.
     pub(crate) scale: f64,
-    /// Width of a linear path's input, if there is one.
-    pub(crate) linear_path: Option<i64>,
 }
 
 impl<'a> GaussianHeadConfig<'a> {
@@ -93,45 +169,44 @@ impl<'a> GaussianHeadConfig<'a> {
             initial_std: network.initial_std,
             min_std: network.min_std,
             scale: network.policy_head_scale,
-            linear_path: None,
         }
+    }
+
+    /// The linear layer whose outputs are the mean and the raw standard deviation, side by side. The raw half's bias
+    /// starts at the c for which σ = initial_std.
+    pub(crate) fn linear(&self, path: &nn::Path, input: i64) -> nn::Linear {
+        let layer = linear(path, input, 2 * self.mean.len() as i64, self.scale);
+        let raw = inverse_softplus(self.initial_std - self.min_std) as f32;
+        let bias: Vec<f32> = self.mean.iter().copied().chain(std::iter::repeat_n(raw, self.mean.len())).collect();
+        if let Some(parameter) = &layer.bs {
+            tch::no_grad(|| parameter.shallow_clone().copy_(&Tensor::from_slice(&bias)));
+        }
+        layer
     }
 }
 
-/// One linear layer whose outputs are the mean and the raw standard deviation, side by side:
-/// σ = min_std + softplus(raw). The raw half's bias starts at the c for which σ = initial_std.
+/// Mean and raw standard deviation side by side, `[N, 2·D]`, as Gaussians: σ = min_std + softplus(raw).
+pub(crate) fn gaussian(output: &Tensor, min_std: f64) -> DiagonalGaussian {
+    let size = output.size()[1] / 2;
+    let std = output.narrow(1, size, size).softplus() + min_std;
+    DiagonalGaussian { mean: output.narrow(1, 0, size), std }
+}
+
+/// A Gaussian as one linear layer gives it.
 #[derive(Debug)]
 pub(crate) struct GaussianHead {
     head: nn::Linear,
-    linear_path: Option<Tensor>,
-    size: i64,
     min_std: f64,
 }
 
 impl GaussianHead {
     pub(crate) fn new(path: &nn::Path, input: i64, config: &GaussianHeadConfig) -> Self {
-        let size = config.mean.len() as i64;
-        let head = linear(&(path / "head"), input, 2 * size, config.scale);
-        let raw = inverse_softplus(config.initial_std - config.min_std) as f32;
-        let bias: Vec<f32> = config.mean.iter().copied().chain(std::iter::repeat_n(raw, config.mean.len())).collect();
-        if let Some(parameter) = &head.bs {
-            tch::no_grad(|| parameter.shallow_clone().copy_(&Tensor::from_slice(&bias)));
-        }
-        // At zero: raw observations reach hundreds (contact forces), and must not decide where the latent starts.
-        let linear_path =
-            config.linear_path.map(|width| path.var("linear_path", &[2 * size, width], nn::Init::Const(0.0)));
-        Self { head, linear_path, size, min_std: config.min_std }
+        Self { head: config.linear(&(path / "head"), input), min_std: config.min_std }
     }
 
-    /// `hidden [N, H]`, and `input [N, I]` for the linear path.
-    pub(crate) fn forward(&self, hidden: &Tensor, input: &Tensor) -> DiagonalGaussian {
-        let mut output = hidden.apply(&self.head);
-        if let Some(weights) = &self.linear_path {
-            output = output.addmm(input, &weights.tr());
-        }
-        let mean = output.narrow(1, 0, self.size);
-        let std = output.narrow(1, self.size, self.size).softplus() + self.min_std;
-        DiagonalGaussian { mean, std }
+    /// `hidden [N, H]`.
+    pub(crate) fn forward(&self, hidden: &Tensor) -> DiagonalGaussian {
+        gaussian(&hidden.apply(&self.head), self.min_std)
     }
 }
 

@@ -2,6 +2,7 @@
 //!
 //! # Layout
 //! - [`Policy`] is everything acting needs: normaliser, reference encoder, low level. Its parameters travel.
+//! - Tasks that are learnt jointly have an encoder and a value function each ([`Routing`]) and share the low level.
 //! - The low level is one of several, a file each (`low_level`): MLP, LSTM, mixture and product of primitives.
 //! - An image, where the task has one, becomes a few numbers beside the task observation, for policy and value alike.
 //! - [`Value`] is what only the learner needs. It lives in a parameter store of its own.
@@ -26,6 +27,7 @@ mod lstm;
 mod normaliser;
 mod parameters;
 mod policy;
+mod routing;
 mod sight;
 mod value;
 
@@ -36,4 +38,5 @@ pub use lstm::Memory;
 pub use normaliser::{NORMALISED_LIMIT, NORMALISER_MIN_STD, NormalisedObservation, NormaliserStatistics};
 pub use parameters::{from_safetensors, to_safetensors};
 pub use policy::{Acting, Policy};
+pub use routing::Routing;
 pub use value::Value;

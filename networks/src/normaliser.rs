@@ -1,8 +1,9 @@
 //! Observations brought to mean 0 and standard deviation 1 by fixed statistics.
 
+use comic_experiment::TaskSpec;
 use tch::{Tensor, nn};
 
-use crate::Error;
+use crate::{Error, Routing};
 
 /// Normalised observations are clamped to ± this many standard deviations (D).
 pub const NORMALISED_LIMIT: f64 = 10.0;
@@ -16,24 +17,29 @@ pub struct NormaliserStatistics {
     pub proprioception_mean: Vec<f32>,
     /// Standard deviation of proprioception, P entries.
     pub proprioception_std: Vec<f32>,
-    /// Mean of the task observation, X entries.
+    /// Mean of the task observation, task by task X entries.
     pub task_mean: Vec<f32>,
-    /// Standard deviation of the task observation, X entries.
+    /// Standard deviation of the task observation, task by task X entries.
     pub task_std: Vec<f32>,
 }
 
-/// Observations a policy has normalised; the only thing a [`crate::Value`] reads, so policy and value can never
-/// disagree about the scale.
+/// Observations a policy has normalised, and whose they are; the only thing a [`crate::Value`] reads, so policy and value
+/// can never disagree about scale or task.
 #[derive(Debug)]
 pub struct NormalisedObservation {
     pub(crate) proprioception: Tensor,
     pub(crate) task: Tensor,
+    pub(crate) routing: Routing,
 }
 
 impl NormalisedObservation {
     /// The first `steps` of observations `[B, T, ·]`: views `[B, steps, ·]`, no copy.
     pub fn first_steps(&self, steps: i64) -> Self {
-        Self { proprioception: self.proprioception.narrow(1, 0, steps), task: self.task.narrow(1, 0, steps) }
+        Self {
+            proprioception: self.proprioception.narrow(1, 0, steps),
+            task: self.task.narrow(1, 0, steps),
+            routing: self.routing.shallow_clone(),
+        }
     }
 }
 
@@ -44,31 +50,44 @@ pub(crate) struct Normaliser {
     active: bool,
     proprioception_mean: Tensor,
     proprioception_std: Tensor,
+    /// `[tasks, X]`.
     task_mean: Tensor,
+    /// `[tasks, X]`.
     task_std: Tensor,
 }
 
 impl Normaliser {
-    pub(crate) fn new(path: &nn::Path, proprioception: i64, task: i64, active: bool) -> Self {
+    pub(crate) fn new(path: &nn::Path, spec: &TaskSpec, active: bool) -> Self {
+        let proprioception = [spec.proprioception as i64];
+        let task = [spec.tasks.len() as i64, spec.task as i64];
         Self {
             active,
-            proprioception_mean: path.zeros_no_train("proprioception_mean", &[proprioception]),
-            proprioception_std: path.ones_no_train("proprioception_std", &[proprioception]),
-            task_mean: path.zeros_no_train("task_mean", &[task]),
-            task_std: path.ones_no_train("task_std", &[task]),
+            proprioception_mean: path.zeros_no_train("proprioception_mean", &proprioception),
+            proprioception_std: path.ones_no_train("proprioception_std", &proprioception),
+            task_mean: path.zeros_no_train("task_mean", &task),
+            task_std: path.ones_no_train("task_std", &task),
         }
     }
 
-    pub(crate) fn forward(&self, proprioception: &Tensor, task: &Tensor) -> NormalisedObservation {
+    pub(crate) fn forward(&self, proprioception: &Tensor, task: &Tensor, routing: &Routing) -> NormalisedObservation {
+        let kept = routing.shallow_clone();
         if !self.active {
             return NormalisedObservation {
                 proprioception: proprioception.shallow_clone(),
                 task: task.shallow_clone(),
+                routing: kept,
             };
         }
+        // Each unroll by its own task's statistics, every step of it.
+        let of_task = |statistics: &Tensor| match routing.tasks() {
+            None => statistics.select(0, 0),
+            Some(tasks) if task.dim() > 2 => statistics.index_select(0, tasks).unsqueeze(1),
+            Some(tasks) => statistics.index_select(0, tasks),
+        };
         NormalisedObservation {
             proprioception: normalise(proprioception, &self.proprioception_mean, &self.proprioception_std),
-            task: normalise(task, &self.task_mean, &self.task_std),
+            task: normalise(task, &of_task(&self.task_mean), &of_task(&self.task_std)),
+            routing: kept,
         }
     }
 
@@ -94,7 +113,7 @@ impl Normaliser {
             if is_std {
                 values = values.clamp_min(f64::from(NORMALISER_MIN_STD));
             }
-            tch::no_grad(|| buffer.shallow_clone().f_copy_(&values)).map(drop)?;
+            tch::no_grad(|| buffer.shallow_clone().f_copy_(&values.view_as(buffer))).map(drop)?;
         }
         Ok(())
     }

@@ -8,6 +8,7 @@ use crate::layers::rows;
 use crate::low_level::{self, LowLevel};
 use crate::lstm::Memory;
 use crate::normaliser::Normaliser;
+use crate::routing::Routing;
 use crate::sight::Sight;
 use crate::{ActionDistribution, DiagonalGaussian, Error, NormalisedObservation, NormaliserStatistics};
 
@@ -24,8 +25,8 @@ pub struct Acting {
     pub state: Tensor,
 }
 
-/// The policy: the reference encoder q(z_t | x_t, s_t, z_{t−1}) and the low level π(a_t | s_t, z_t)
-/// (CoMic supplement; sizes in [`Network`]).
+/// The policy: the reference encoders q(z_t | x_t, s_t, z_{t−1}) and the low level π(a_t | s_t, z_t)
+/// (CoMic supplement; sizes in [`Network`]). Tasks that are learnt jointly have an encoder each and share the low level.
 #[derive(Debug)]
 pub struct Policy {
     normaliser: Normaliser,
@@ -44,22 +45,28 @@ impl Policy {
         if pose.len() != spec.action {
             return Err(Error::Length { name: "initial pose", expected: spec.action, found: pose.len() });
         }
-        let (proprioception, task) = (spec.proprioception as i64, spec.task as i64);
+        let proprioception = spec.proprioception as i64;
         let sight = (spec.image > 0).then(|| Sight::new(&(store / "sight"), config.image_features as i64));
         let seen = sight.as_ref().map_or(0, Sight::output);
         let latent = config.latent.size as i64;
-        let encoder = Encoder::new(&(store / "encoder"), task + seen + proprioception + latent, config);
+        let encoder = Encoder::new(&(store / "encoder"), spec, seen, config);
         let low_level = low_level::Config { latent, proprioception, pose, network: config };
         let low_level = low_level::build(&(store / "low_level"), &low_level);
-        let normaliser = Normaliser::new(&(store / "normaliser"), proprioception, task, config.normaliser_steps > 0);
+        let normaliser = Normaliser::new(&(store / "normaliser"), spec, config.normaliser_steps > 0);
         Ok(Self { normaliser, sight, encoder, low_level })
     }
 
-    /// Normalises observations of any leading dimensions: proprioception `[.., P]`, task observation `[.., X]`, image
-    /// `[.., I]` uint8. What is seen in the image joins the task observation, so policy and value share one pair of eyes;
-    /// both learn it.
-    pub fn normalise(&self, proprioception: &Tensor, task: &Tensor, image: Option<&Tensor>) -> NormalisedObservation {
-        let mut observation = self.normaliser.forward(proprioception, task);
+    /// Normalises observations: proprioception `[.., P]`, task observation `[.., X]`, image `[.., I]` uint8, where the
+    /// leading dimensions are `[B]` or `[B, T]` and the B unrolls are of the tasks that `routing` says. What is seen in the
+    /// image joins the task observation, so policy and value share one pair of eyes; both learn it.
+    pub fn normalise(
+        &self,
+        proprioception: &Tensor,
+        task: &Tensor,
+        image: Option<&Tensor>,
+        routing: &Routing,
+    ) -> NormalisedObservation {
+        let mut observation = self.normaliser.forward(proprioception, task, routing);
         if let (Some(sight), Some(image)) = (&self.sight, image) {
             observation.task = Tensor::cat(&[&observation.task, &sight.forward(image)], -1);
         }
@@ -77,9 +84,9 @@ impl Policy {
         latent_noise: &Tensor,
         memory: Memory<'_>,
     ) -> Acting {
-        let NormalisedObservation { proprioception, task } = observation;
-        let input = rows(&Tensor::cat(&[task, proprioception, previous_latent], -1));
-        let encoded = self.encoder.forward(&input, &rows(latent_noise));
+        let NormalisedObservation { proprioception, task, routing } = observation;
+        let input = rows(&Tensor::cat(&[proprioception, previous_latent, task], -1));
+        let encoded = self.encoder.forward(&input, &rows(latent_noise), routing);
         let input = low_level::Input { intent: &encoded.intent, proprioception: &rows(proprioception), memory };
         let low_level::Output { action, state } = self.low_level.act(&input);
         Acting { latent: encoded.latent, action, latent_posterior: encoded.posterior, state }

@@ -4,49 +4,70 @@ use comic_experiment::{Network, TaskSpec};
 use tch::{Kind, Tensor, nn};
 
 use crate::NormalisedObservation;
-use crate::layers::{Torso, linear, rows};
+use crate::layers::{Mlp, Torso, linear, rows};
 use crate::lstm::{LstmStack, Memory};
+use crate::routing::PerTask;
 
-/// V(x_t, s_t, clip): `[x, s, clip embedding]` → torso → one output per reward term (CoMic supplement). A recurrent one
-/// has LSTM layers after the torso, which begin empty at an unroll's first row and are emptied where an episode begins.
+/// V(x_t, s_t, clip), one for each task: `[s, clip embedding, x]` → torso → one output per reward term (CoMic supplement).
+/// A recurrent one has LSTM layers after the torso, which begin empty at an unroll's first row and are emptied where an
+/// episode begins; joint training knows none.
 ///
 /// The clip embedding is learned; its entries start as N(0, 1/width), so a row's length is about 1.
 #[derive(Debug)]
 pub struct Value {
-    embedding: Tensor,
-    torso: Torso,
-    lstm: Option<LstmStack>,
-    head: nn::Linear,
+    /// Task by task, `[clips, width]`.
+    embeddings: Vec<Tensor>,
+    body: Body,
+}
+
+#[derive(Debug)]
+enum Body {
+    FeedForward(PerTask),
+    Recurrent { torso: Torso, lstm: LstmStack, head: nn::Linear },
 }
 
 impl Value {
     /// Creates the value's parameters in `store`.
     pub fn new(store: &nn::Path, spec: &TaskSpec, config: &Network) -> Self {
         let width = config.clip_embedding as i64;
-        let clips = spec.clips.len().max(1) as i64;
         let stdev = 1.0 / (config.clip_embedding.max(1) as f64).sqrt();
         let seen = if spec.image > 0 { config.image_features } else { 0 };
-        let input = (spec.task + seen + spec.proprioception) as i64 + width;
-        let torso = Torso::new(store, input, &config.value);
-        let lstm = (!config.value_lstm.is_empty()).then(|| LstmStack::new(store, torso.output(), &config.value_lstm));
-        let hidden = lstm.as_ref().map_or(torso.output(), LstmStack::output);
-        let head = linear(&(store / "head"), hidden, spec.reward_terms.len() as i64, 1.0);
-        let embedding = store.var("clip_embedding", &[clips, width], nn::Init::Randn { mean: 0.0, stdev });
-        Self { embedding, torso, lstm, head }
+        let terms = spec.reward_terms.len() as i64;
+        let (mut embeddings, mut networks) = (Vec::new(), Vec::new());
+        for task in &spec.tasks {
+            let path = store / task.name.as_str();
+            let size = [task.clips.max(1) as i64, width];
+            embeddings.push(path.var("clip_embedding", &size, nn::Init::Randn { mean: 0.0, stdev }));
+            let input = (spec.proprioception + task.observation + seen) as i64 + width;
+            let torso = Torso::new(&path, input, &config.value);
+            if !config.value_lstm.is_empty() {
+                let lstm = LstmStack::new(&path, torso.output(), &config.value_lstm);
+                let head = linear(&(&path / "head"), lstm.output(), terms, 1.0);
+                return Self { embeddings, body: Body::Recurrent { torso, lstm, head } };
+            }
+            let head = linear(&(&path / "head"), torso.output(), terms, 1.0);
+            networks.push(Mlp::new(torso, head, None));
+        }
+        Self { embeddings, body: Body::FeedForward(PerTask::new(networks)) }
     }
 
     /// Observations `[B, T, P]`, `[B, T, X]`, the clips' indices, `[B, T]` int64 below the number of clips, and where
     /// episodes begin, `[B, T]`; `[B, T, R]` out.
     pub fn forward(&self, observation: &NormalisedObservation, clip: &Tensor, first: &Tensor) -> Tensor {
-        let embedded = Tensor::embedding(&self.embedding, clip, -1, false, false);
-        let input = rows(&Tensor::cat(&[&observation.task, &observation.proprioception, &embedded], -1));
+        let NormalisedObservation { proprioception, task, routing } = observation;
+        // Clips are numbered through, task by task.
+        let embedded = Tensor::embedding(&Tensor::cat(&self.embeddings, 0), clip, -1, false, false);
+        let input = rows(&Tensor::cat(&[proprioception, &embedded, task], -1));
         let (unrolls, steps) = (clip.size()[0], clip.size()[1]);
-        let mut hidden = self.torso.forward(&input);
-        if let Some(lstm) = &self.lstm {
-            let state = Tensor::zeros([unrolls, lstm.state_size()], (Kind::Float, hidden.device()));
-            let memory = Memory { state: &state, first: Some(first) };
-            hidden = lstm.forward(&hidden.reshape([unrolls, steps, -1]), memory).0.flatten(0, 1);
-        }
-        hidden.apply(&self.head).reshape([unrolls, steps, -1])
+        let values = match &self.body {
+            Body::FeedForward(networks) => networks.forward(&input, routing),
+            Body::Recurrent { torso, lstm, head } => {
+                let state = Tensor::zeros([unrolls, lstm.state_size()], (Kind::Float, input.device()));
+                let memory = Memory { state: &state, first: Some(first) };
+                let hidden = torso.forward(&input).reshape([unrolls, steps, -1]);
+                lstm.forward(&hidden, memory).0.flatten(0, 1).apply(head)
+            }
+        };
+        values.reshape([unrolls, steps, -1])
     }
 }

@@ -2,8 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
-use comic_experiment::{LowLevelName, Lstm, Network, Primitives, TaskSpec, resolve};
-use comic_networks::{ActionDistribution, DiagonalGaussian, Memory, Policy};
+use comic_experiment::{LowLevelName, Lstm, Network, Primitives, TaskPart, TaskSpec, resolve};
+use comic_networks::{ActionDistribution, DiagonalGaussian, Memory, Policy, Routing};
 use tch::{Device, Kind, Tensor, nn};
 
 /// libtorch's generator is the process's: tests that seed it take turns.
@@ -14,7 +14,8 @@ fn random(size: &[i64]) -> Tensor {
 }
 
 fn spec() -> TaskSpec {
-    TaskSpec { proprioception: 7, task: 11, action: 3, ..TaskSpec::default() }
+    let task = TaskPart { name: "tracking".into(), observation: 11, clips: 1, max_reward: 1.0 };
+    TaskSpec { proprioception: 7, task: 11, action: 3, tasks: vec![task], ..TaskSpec::default() }
 }
 
 fn policy(network: &Network) -> (nn::VarStore, Policy) {
@@ -71,7 +72,7 @@ fn an_lstm_is_libtorchs_own() {
     let (proprioception, task) = (random(&[unrolls, steps, 7]), random(&[unrolls, steps, 11]));
     let (previous, noise) = (random(&[unrolls, steps, latent]), random(&[unrolls, steps, latent]));
     let state = random(&[unrolls, 12]);
-    let observation = policy.normalise(&proprioception, &task, None);
+    let observation = policy.normalise(&proprioception, &task, None, &Routing::single());
     let acting = policy.act(&observation, &previous, &noise, Memory { state: &state, first: None });
 
     let mut variables = store.variables();
@@ -101,7 +102,7 @@ fn fixed_biases_set_primitives_apart_and_are_not_trained() {
         let (store, policy) = policy(network);
         let zeros = |width: i64| Tensor::zeros([1, width], (Kind::Float, Device::Cpu));
         let latent = network.latent.size as i64;
-        let observation = policy.normalise(&zeros(7), &zeros(11), None);
+        let observation = policy.normalise(&zeros(7), &zeros(11), None, &Routing::single());
         let memory = Memory { state: &zeros(0), first: None };
         let (mean, ..) = policy.act(&observation, &zeros(latent), &zeros(latent), memory).action.to_rows();
         let parameters: usize = store.trainable_variables().iter().map(Tensor::numel).sum();
@@ -132,7 +133,7 @@ fn a_product_starts_as_wide_as_it_is_told() {
     let mut gate = store.variables().remove("low_level.gate.head.weight").unwrap();
     let _ = tch::no_grad(|| gate.zero_());
     let zeros = |width: i64| Tensor::zeros([1, width], (Kind::Float, Device::Cpu));
-    let observation = policy.normalise(&zeros(7), &zeros(11), None);
+    let observation = policy.normalise(&zeros(7), &zeros(11), None, &Routing::single());
     let memory = Memory { state: &zeros(0), first: None };
     let acting = policy.act(&observation, &zeros(60), &zeros(60), memory);
     // The least exponent shifts a half by a two-thousandth.
@@ -152,7 +153,7 @@ fn a_product_of_next_to_nothing_is_finite_and_one_of_many_is_no_narrower_than_th
         let _ = tch::no_grad(|| variables.get_mut("low_level.gate.head.bias").unwrap().fill_(logit));
         let heads = variables.get_mut("low_level.primitives.head_biases").unwrap();
         let _ = tch::no_grad(|| heads.narrow(2, 3, 3).fill_(raw));
-        let observation = policy.normalise(&zeros(7), &zeros(11), None);
+        let observation = policy.normalise(&zeros(7), &zeros(11), None, &Routing::single());
         let memory = Memory { state: &zeros(0), first: None };
         policy.act(&observation, &zeros(60), &zeros(60), memory).action
     };

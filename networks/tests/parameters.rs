@@ -4,7 +4,7 @@
 
 use std::collections::HashMap;
 
-use comic_experiment::{Mlp, Network, TaskSpec};
+use comic_experiment::{Mlp, Network, TaskPart, TaskSpec};
 use comic_networks::{Error, Policy, from_safetensors, to_safetensors};
 use proptest::prelude::*;
 use safetensors::tensor::{Dtype, TensorView};
@@ -16,9 +16,9 @@ fn store() -> nn::VarStore {
         task: 4,
         action: 2,
         reward_terms: vec!["a".into()],
-        max_reward: 1.0,
         image: 0,
         clips: vec!["x".into()],
+        tasks: vec![TaskPart { name: "tracking".into(), observation: 4, clips: 1, max_reward: 1.0 }],
     };
     let mut network =
         Network { encoder: vec![8], mlp: Mlp { hidden: vec![8] }, normaliser_steps: 1, ..Network::default() };

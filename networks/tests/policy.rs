@@ -2,9 +2,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
-use comic_experiment::{Mlp, Network, TaskSpec};
+use comic_experiment::{Mlp, Network, TaskPart, TaskSpec};
 use comic_networks::{
-    DiagonalGaussian, Error, Memory, NORMALISED_LIMIT, NormalisedObservation, NormaliserStatistics, Policy, Value,
+    DiagonalGaussian, Error, Memory, NORMALISED_LIMIT, NormalisedObservation, NormaliserStatistics, Policy, Routing,
+    Value,
 };
 use tch::{Device, Kind, Tensor, nn};
 
@@ -16,9 +17,9 @@ fn spec() -> TaskSpec {
         task: 11,
         action: 3,
         reward_terms: vec!["a".into(), "b".into()],
-        max_reward: 1.0,
         image: 0,
         clips: vec!["x".into(), "y".into(), "z".into()],
+        tasks: vec![TaskPart { name: "tracking".into(), observation: 11, clips: 3, max_reward: 1.0 }],
     }
 }
 
@@ -65,7 +66,7 @@ struct Pass {
 
 fn act(policy: &Policy) -> Pass {
     let [proprioception, task, previous, noise] = inputs();
-    pass(policy, &policy.normalise(&proprioception, &task, None), &previous, &noise)
+    pass(policy, &policy.normalise(&proprioception, &task, None, &Routing::single()), &previous, &noise)
 }
 
 #[test]
@@ -84,7 +85,7 @@ fn rows_of_an_unroll_are_the_same_rows() {
     let (_store, policy) = policy(&network(), 1, &[0.0; 3]);
     let [proprioception, task, previous, noise] = inputs();
     let unrolled = |tensor: &Tensor| tensor.reshape([4, 6, -1]);
-    let observation = policy.normalise(&unrolled(&proprioception), &unrolled(&task), None);
+    let observation = policy.normalise(&unrolled(&proprioception), &unrolled(&task), None, &Routing::single());
     let acting = pass(&policy, &observation, &unrolled(&previous), &unrolled(&noise));
     assert_eq!(acting.action.mean, act(&policy).action.mean);
 }
@@ -169,7 +170,9 @@ fn the_normaliser_travels_is_not_trained_and_clamps() {
     let [_, task, previous, noise] = inputs();
     let far = |value: f64| {
         let proprioception = Tensor::full([ROWS, 7], value, (Kind::Float, Device::Cpu));
-        pass(&policy, &policy.normalise(&proprioception, &task, None), &previous, &noise).action.mean
+        pass(&policy, &policy.normalise(&proprioception, &task, None, &Routing::single()), &previous, &noise)
+            .action
+            .mean
     };
     const { assert!(NORMALISED_LIMIT < 1e3) };
     assert_eq!(far(1e3), far(1e6));
@@ -201,7 +204,7 @@ fn the_value_has_one_output_per_reward_term_and_sees_the_clip() {
     let value = Value::new(&store.root(), &spec(), &network());
     let [proprioception, task, ..] = inputs();
     let unrolled = |tensor: &Tensor| tensor.reshape([4, 6, -1]);
-    let observation = policy.normalise(&unrolled(&proprioception), &unrolled(&task), None);
+    let observation = policy.normalise(&unrolled(&proprioception), &unrolled(&task), None, &Routing::single());
     let of = |clip: i64| {
         let clip = Tensor::full([4, 6], clip, (Kind::Int64, Device::Cpu));
         value.forward(&observation, &clip, &clip.zeros_like().to_kind(Kind::Float))
@@ -225,7 +228,9 @@ fn what_is_seen_changes_what_is_done_and_is_learnt_from() {
     let image = |grey: i64| Tensor::full([rows, 64 * 64 * 3], grey, (Kind::Uint8, Device::Cpu));
     let latent = |grey| {
         let image = image(grey);
-        pass(&policy, &policy.normalise(&zeros(7), &zeros(11), Some(&image)), &zeros(5), &zeros(5)).posterior.mean
+        pass(&policy, &policy.normalise(&zeros(7), &zeros(11), Some(&image), &Routing::single()), &zeros(5), &zeros(5))
+            .posterior
+            .mean
     };
     let (dark, bright) = (latent(0), latent(255));
     assert!((&dark - &bright).abs().max().double_value(&[]) > 1e-3);
@@ -251,7 +256,7 @@ fn an_image_is_seen_alike_in_a_batch_of_unrolls_and_as_a_row() {
         let shape = |width: i64| [leading, &[width]].concat();
         let zeros = |width: i64| Tensor::zeros(shape(width), (Kind::Float, Device::Cpu));
         let image = image.reshape(shape(64 * 64 * 3));
-        let observation = policy.normalise(&zeros(7), &zeros(11), Some(&image));
+        let observation = policy.normalise(&zeros(7), &zeros(11), Some(&image), &Routing::single());
         pass(&policy, &observation, &zeros(5), &zeros(5)).posterior.mean
     };
     assert_eq!(acted(&[1]), acted(&[1, 1]));

@@ -80,6 +80,18 @@ impl UnrollBuffer {
         self.words[self.row_words(Field::Clip, t).start]
     }
 
+    /// Row `t` as padding: the observation of the row before it again, as if an episode began there that takes no step.
+    ///
+    /// # Panics
+    /// When there is no row `t`, or none before it.
+    pub fn repeat_observation(&mut self, t: usize) {
+        for field in [Field::Proprioception, Field::Task, Field::Clip, Field::Image] {
+            let (before, place) = (self.row_words(field, t - 1), self.row_words(field, t).start);
+            self.words.copy_within(before, place);
+        }
+        self.row_mut(Field::First, t).fill(1.0);
+    }
+
     /// The payload, copied: the buffer can be written again at once.
     pub fn to_bytes(&self) -> Bytes {
         Bytes::copy_from_slice(bytemuck::cast_slice(&self.words))

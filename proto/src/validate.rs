@@ -14,9 +14,9 @@ const EXPONENT: u32 = 0x7f80_0000;
 
 /// What the learner knows at this moment and a header has to agree with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Expected {
-    /// Number of clips.
-    pub clips: usize,
+pub struct Expected<'a> {
+    /// Number of clips of each task; an unroll is of one task.
+    pub clips: &'a [usize],
     /// The learner's epoch. An unroll of an earlier one is not invalid but superseded, which is the batcher's to say.
     pub epoch: u64,
     /// The newest version of the parameters that was published in this epoch.
@@ -107,6 +107,14 @@ pub enum Invalid {
         /// Number of clips.
         clips: usize,
     },
+    /// Clips of two tasks in one unroll.
+    #[error("clip {clip} in row {row} is of another task than row 0: an unroll belongs to one task")]
+    Task {
+        /// As received.
+        clip: u32,
+        /// The row.
+        row: usize,
+    },
     /// More episodes than an unroll has room for.
     #[error("{found} episodes ended in one unroll, at most {limit} can")]
     Episodes {
@@ -142,7 +150,7 @@ pub fn validate(
     layout: &UnrollLayout,
     header: &UnrollHeader,
     payload: &[u8],
-    expected: &Expected,
+    expected: &Expected<'_>,
 ) -> Result<(), Invalid> {
     check_header(layout, header, expected)?;
     if payload.len() != layout.size() {
@@ -171,7 +179,7 @@ pub fn validate(
     check_clips(layout, payload, expected.clips)
 }
 
-fn check_header(layout: &UnrollLayout, header: &UnrollHeader, expected: &Expected) -> Result<(), Invalid> {
+fn check_header(layout: &UnrollLayout, header: &UnrollHeader, expected: &Expected<'_>) -> Result<(), Invalid> {
     if header.sequence >= MAX_SEQUENCE {
         return Err(Invalid::Sequence { sequence: header.sequence });
     }
@@ -188,7 +196,7 @@ fn check_header(layout: &UnrollLayout, header: &UnrollHeader, expected: &Expecte
     if header.episodes.len() > layout.max_episodes() {
         return Err(Invalid::Episodes { found: header.episodes.len(), limit: layout.max_episodes() });
     }
-    header.episodes.iter().try_for_each(|episode| check_episode(layout, episode, expected.clips))
+    header.episodes.iter().try_for_each(|episode| check_episode(layout, episode, expected.clips.iter().sum()))
 }
 
 fn check_episode(layout: &UnrollLayout, episode: &EpisodeStatistics, clips: usize) -> Result<(), Invalid> {
@@ -271,11 +279,22 @@ fn check_boundaries(layout: &UnrollLayout, payload: &[u8]) -> Result<(), Invalid
     }
 }
 
-fn check_clips(layout: &UnrollLayout, payload: &[u8], clips: usize) -> Result<(), Invalid> {
-    for (row, clip) in field(layout, payload, Field::Clip).enumerate() {
-        if clip as usize >= clips {
-            return Err(Invalid::Clip { clip, row, clips });
-        }
+fn check_clips(layout: &UnrollLayout, payload: &[u8], clips: &[usize]) -> Result<(), Invalid> {
+    let rows = || field(layout, payload, Field::Clip).enumerate();
+    let total: usize = clips.iter().sum();
+    if let Some((row, clip)) = rows().find(|(_, clip)| *clip as usize >= total) {
+        return Err(Invalid::Clip { clip, row, clips: total });
     }
-    Ok(())
+    // The clips of the task that the first row's clip is one of.
+    let first = rows().next().map_or(0, |(_, clip)| clip as usize);
+    let mut end = 0;
+    let own = clips.iter().map(|clips| {
+        end += clips;
+        end - clips..end
+    });
+    let own = own.into_iter().find(|own| own.contains(&first)).unwrap_or(0..total);
+    match rows().find(|(_, clip)| !own.contains(&(*clip as usize))) {
+        Some((row, clip)) => Err(Invalid::Task { clip, row }),
+        None => Ok(()),
+    }
 }

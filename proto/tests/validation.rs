@@ -7,7 +7,7 @@ use comic_proto::{Expected, Field, Invalid, MAX_SEQUENCE, UnrollBuffer, UnrollLa
 use proptest::prelude::*;
 use prost::Message as _;
 
-const EXPECTED: Expected = Expected { clips: 4, epoch: 2, newest_version: 9 };
+const EXPECTED: Expected<'_> = Expected { clips: &[3, 1], epoch: 2, newest_version: 9 };
 
 fn layout() -> UnrollLayout {
     UnrollLayout::new(UnrollShape {
@@ -52,7 +52,7 @@ fn unroll() -> UnrollBuffer {
         unroll.row_mut(Field::First, t)[0] = if t == 2 { 1.0 } else { 0.0 };
     }
     for t in 0..5 {
-        unroll.set_clip(t, t as u32 % 4);
+        unroll.set_clip(t, t as u32 % 3);
     }
     unroll
 }
@@ -81,6 +81,32 @@ fn an_unroll_that_makes_sense_passes() {
 #[test]
 fn an_unroll_may_begin_in_the_middle_of_an_episode_or_with_its_first_observation() {
     assert_eq!(payload_refusal(|unroll| unroll.row_mut(Field::First, 0)[0] = 1.0), None);
+}
+
+#[test]
+fn an_unroll_is_of_one_task() {
+    assert_eq!(
+        payload_refusal(|unroll| (0..5).for_each(|t| unroll.set_clip(t, 3))),
+        None,
+        "the second task's one clip"
+    );
+    assert_eq!(payload_refusal(|unroll| unroll.set_clip(4, 3)), Some(Invalid::Task { clip: 3, row: 4 }));
+    assert_eq!(payload_refusal(|unroll| unroll.set_clip(0, 3)), Some(Invalid::Task { clip: 1, row: 1 }));
+    assert_eq!(payload_refusal(|unroll| unroll.set_clip(4, 4)), Some(Invalid::Clip { clip: 4, row: 4, clips: 4 }));
+}
+
+#[test]
+fn padding_up_to_the_end_passes_and_repeats_the_observation_before_it() {
+    let mut unroll = unroll();
+    unroll.row_mut(Field::Proprioception, 2).fill(0.25);
+    unroll.row_mut(Field::Valid, 2)[0] = 0.0;
+    for t in 3..5 {
+        unroll.repeat_observation(t);
+        assert_eq!(unroll.row(Field::Proprioception, t), [0.25; 3]);
+        assert_eq!((unroll.row(Field::First, t), unroll.clip(t)), ([1.0].as_slice(), unroll.clip(2)));
+    }
+    unroll.row_mut(Field::Valid, 3)[0] = 0.0;
+    assert_eq!(refusal(&header(), &unroll), None);
 }
 
 #[test]

@@ -143,7 +143,7 @@ impl Environment for TrackingEnvironment {
     fn episode(&self) -> Episode {
         let reference = self.reference();
         let steps_left = reference.last_step(self.task.look_ahead).saturating_sub(self.start);
-        Episode { clip: self.clip, start: reference.first + self.start, steps_left }
+        Episode { clip: self.clip, start: reference.first + self.start, steps_left, task: 0 }
     }
 
     fn servo_action(&self, action: &mut [f32]) {

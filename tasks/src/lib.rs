@@ -27,6 +27,7 @@ mod get_up;
 mod ghost;
 mod go_to_target;
 pub mod humanoid;
+mod joint;
 mod observation;
 mod physics;
 mod quaternion;
@@ -57,6 +58,7 @@ use ball_catch::BallCatchRules;
 use corridor::CorridorRules;
 use get_up::GetUpRules;
 use go_to_target::GoToTargetRules;
+use joint::JointTask;
 use rules::RuledTask;
 use start::Poses;
 
@@ -88,17 +90,28 @@ pub trait Task: Debug + Send + Sync {
     fn environment(self: Arc<Self>, seed: u64) -> Result<Box<dyn Simulated>, Error>;
 }
 
-/// The task of an experiment. Tracking follows the catalogue's clips, the others may start in their poses.
+/// The task of an experiment, or its tasks. Tracking follows the catalogue's clips, the others may start in their poses.
 ///
 /// # Errors
 /// [`Error`]: clips that are missing or unusable, dm_control's XML missing.
 pub fn build(experiment: &Experiment, catalogue: &Catalogue) -> Result<Arc<dyn Task>, Error> {
+    if experiment.joint.is_empty() {
+        return build_one(experiment, experiment.task, catalogue);
+    }
+    let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
+    let spec = TaskSpec::new(experiment, names).map_err(tracking::unknown)?;
+    let tasks = experiment.tasks().into_iter();
+    let tasks = tasks.map(|(task, probability)| Ok((build_one(experiment, task, catalogue)?, probability)));
+    Ok(Arc::new(JointTask::new(spec, tasks.collect::<Result<_, Error>>()?)))
+}
+
+fn build_one(experiment: &Experiment, task: TaskName, catalogue: &Catalogue) -> Result<Arc<dyn Task>, Error> {
     let spec = || {
         let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
-        TaskSpec::new(experiment, names).map_err(tracking::unknown)
+        TaskSpec::of_task(experiment, task, names).map_err(tracking::unknown)
     };
     let poses = |kind| Poses::new(kind, catalogue);
-    Ok(match experiment.task {
+    Ok(match task {
         TaskName::Tracking => Arc::new(TrackingTask::new(&experiment.tracking, catalogue)?),
         TaskName::GoToTarget => {
             let config = &experiment.go_to_target;
@@ -275,4 +288,6 @@ pub struct Episode {
     pub start: usize,
     /// Control steps from there to the clip's end: the most the episode can last, time limit apart.
     pub steps_left: usize,
+    /// The task's place among the spec's tasks.
+    pub task: usize,
 }

@@ -212,7 +212,7 @@ impl<R: Rules> Environment for RuledEnvironment<R> {
     }
 
     fn episode(&self) -> Episode {
-        Episode { clip: 0, start: self.start, steps_left: self.most_steps() }
+        Episode { clip: 0, start: self.start, steps_left: self.most_steps(), task: 0 }
     }
 
     fn servo_action(&self, action: &mut [f32]) {

@@ -1,56 +1,10 @@
 //! One learner and two actors, real processes and real sockets, through every death a run must survive.
 
-use std::fs;
-use std::time::Duration;
-
-use anyhow::{Context, Result, ensure};
-use comic_proto::v1::{Books, Status};
-use comic_tests::system::{Process, System, balance, metric};
-
-/// Long enough for the slowest machine; no step waits longer than it needs.
-const LIMIT: Duration = Duration::from_secs(120);
-/// An actor promises to leave within five seconds.
-const ACTOR_LEAVES: Duration = Duration::from_secs(6);
-/// More unrolls than a dead actor can have left behind: two batches in the batcher, one in training, its window.
-const BEYOND_WHAT_IS_LEFT: u64 = 200;
-/// More versions than actors may lag behind.
-const VERSIONS: f64 = 30.0;
-
-/// Small enough that an update takes milliseconds.
-const SMALL: [&str; 32] = [
-    "--preset",
-    "quickstart",
-    "--clips",
-    "builtin:CMU_007_01",
-    "--set",
-    "network.encoder=[32]",
-    "--set",
-    "network.mlp.hidden=[32]",
-    "--set",
-    "network.value=[32]",
-    "--set",
-    "network.normaliser_steps=256",
-    "--set",
-    "vmpo.target_period=1",
-    "--set",
-    "vmpo.gradient_steps=1",
-    "--set",
-    "vmpo.minibatch_unrolls=8",
-    "--set",
-    "unroll.length=8",
-    "--set",
-    "unroll.batch=8",
-    "--set",
-    "actor.environments=2",
-    "--set",
-    "warm_start.steps=0",
-    "--set",
-    "learner.checkpoint_seconds=0.5",
-    "--set",
-    "learner.metrics_seconds=0.2",
-    "--set",
-    "budget.minutes=0",
-];
+use anyhow::{Result, ensure};
+use comic_tests::steps::{
+    LIMIT, SMALL, kill_and_restart_the_learner, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on,
+};
+use comic_tests::system::System;
 
 #[tokio::test]
 async fn two_actors_and_a_learner_survive_every_death_and_their_books_balance() -> Result<()> {
@@ -82,68 +36,4 @@ async fn two_actors_and_a_learner_survive_every_death_and_their_books_balance() 
     parameters_arrive(&mut system, "the third actor acts with the restarted learner's parameters").await?;
     leaves(third).await?;
     the_books_balance_at_the_end(system).await
-}
-
-fn books(status: &Status) -> Books {
-    status.books.unwrap_or_default()
-}
-
-/// Training goes beyond whatever an actor that is gone can have left behind.
-async fn trains_on(system: &mut System, what: &str) -> Result<()> {
-    let before = books(&system.status().await?).trained;
-    system.until(what, LIMIT, |status| (books(status).trained >= before + BEYOND_WHAT_IS_LEFT).then_some(())).await
-}
-
-/// While versions go up, what is trained on stays only a few versions old: it was made with new parameters.
-async fn parameters_arrive(system: &mut System, what: &str) -> Result<()> {
-    let before = metric(&system.status().await?, "version");
-    system
-        .until(what, LIMIT, |status| {
-            let grown = metric(status, "version") - before;
-            (grown >= VERSIONS && metric(status, "unroll_age") < grown / 2.0).then_some(())
-        })
-        .await
-}
-
-/// Kills the learner in mid-stream; the next one goes on from a checkpoint.
-async fn kill_and_restart_the_learner(system: &mut System) -> Result<Status> {
-    let updates = newest_checkpoint(system).await?;
-    system.learner.take().context("no learner")?.kill()?;
-    ensure!(system.status().await.is_err(), "a killed learner does not answer");
-    let status = system.start_learner(LIMIT).await?;
-    let what = format!("the restarted learner goes on from update {updates}");
-    system.until(&what, LIMIT, |status| (metric(status, "updates") > updates as f64).then_some(())).await?;
-    let resumed = system.learner.as_ref().context("no learner")?.log();
-    ensure!(!resumed.contains("damaged"), "the checkpoint did not verify: {resumed}");
-    Ok(status)
-}
-
-/// Updates of the newest whole checkpoint, once there is one.
-async fn newest_checkpoint(system: &mut System) -> Result<u64> {
-    let directory = system.run().join("checkpoints");
-    system
-        .until("a checkpoint is written", LIMIT, |_| {
-            let entries = fs::read_dir(&directory).ok()?.flatten();
-            let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
-            names.filter_map(|name| name.strip_prefix("checkpoint-")?.parse().ok()).max()
-        })
-        .await
-}
-
-async fn leaves(actor: Process) -> Result<()> {
-    let status = actor.terminate(ACTOR_LEAVES).await?;
-    ensure!(status.success(), "an actor that is asked to leave leaves with {status}");
-    Ok(())
-}
-
-/// Nobody produces any more: what was produced is trained on, dropped for a counted reason, or in an open batch.
-async fn the_books_balance_at_the_end(mut system: System) -> Result<()> {
-    let books = books(&system.status().await?);
-    ensure!(balance(&books), "{books:?}");
-    ensure!(books.trained > 4 * BEYOND_WHAT_IS_LEFT, "{books:?}");
-    ensure!(books.dropped_invalid == 0, "no actor sends what is invalid: {books:?}");
-    let learner = system.learner.take().context("no learner")?;
-    let status = learner.terminate(LIMIT).await?;
-    ensure!(status.success(), "a learner that is asked to leave leaves with {status}");
-    Ok(())
 }

@@ -153,7 +153,7 @@ type Messages<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 async fn take(batcher: &Batcher, message: UnrollMessage) -> Result<UnrollAck, Status> {
     let header = message.header.ok_or_else(|| Status::invalid_argument("no header"))?;
-    let expected = Expected { clips: 1, epoch: 1, newest_version: 1 };
+    let expected = Expected { clips: &[1], epoch: 1, newest_version: 1 };
     validate(batcher.layout(), &header, &message.payload, &expected)
         .map_err(|invalid| Status::invalid_argument(invalid.to_string()))?;
     let verdict = match batcher.insert(&header, message.payload).await {

@@ -84,6 +84,7 @@ impl ClipReport {
         let mean = |value: &dyn Fn(&Finished) -> f64| ratio(finished.iter().map(value).sum(), finished.len() as f64);
         let total = |episode: &Finished| episode.returns.iter().sum::<f64>();
         let steps: f64 = finished.iter().map(|episode| episode.steps as f64).sum();
+        let most = |episode: &Finished| spec.max_reward(episode.clip);
         let per_step = |value: &dyn Fn(&Finished) -> f64| ratio(finished.iter().map(value).sum(), steps);
         Self {
             clip: clip.to_string(),
@@ -91,8 +92,8 @@ impl ClipReport {
             diverged: finished.iter().filter(|episode| episode.diverged).count(),
             length_mean: mean(&|episode| episode.steps as f64),
             return_mean: mean(&total),
-            normalised_reward: mean(&|episode| ratio(total(episode), spec.max_reward * episode.steps_left as f64)),
-            reward_per_step: ratio(per_step(&total), spec.max_reward),
+            normalised_reward: mean(&|episode| ratio(total(episode), most(episode) * episode.steps_left as f64)),
+            reward_per_step: per_step(&|episode| ratio(total(episode), most(episode))),
             fraction_survived: mean(&|episode| ratio(episode.steps as f64, episode.steps_left as f64)),
             reward_terms: spec
                 .reward_terms
@@ -111,6 +112,8 @@ fn ratio(sum: f64, count: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use comic_experiment::TaskPart;
+
     use super::*;
 
     fn spec() -> TaskSpec {
@@ -119,9 +122,9 @@ mod tests {
             task: 1,
             action: 1,
             reward_terms: vec!["pose".into(), "velocity".into()],
-            max_reward: 1.45,
             image: 0,
             clips: vec!["walk".into(), "run".into(), "unused".into()],
+            tasks: vec![TaskPart { name: "tracking".into(), observation: 1, clips: 3, max_reward: 1.45 }],
         }
     }
 

@@ -151,7 +151,9 @@ impl<E: Environment> Lane<E> {
         let mut row = batch.row(index);
         self.environment.observe(row.proprioception, row.task);
         row.forget();
-        let steps_left = self.environment.episode().steps_left;
+        let episode = self.environment.episode();
+        *row.of_task = episode.task;
+        let steps_left = episode.steps_left;
         self.episode = Some(Finished {
             clip: start.clip,
             steps_left,
@@ -228,7 +230,7 @@ mod tests {
             Ok(())
         }
         fn episode(&self) -> Episode {
-            Episode { clip: 0, start: self.start, steps_left: 10 }
+            Episode { clip: 0, start: self.start, steps_left: 10, task: 0 }
         }
         fn servo_action(&self, action: &mut [f32]) {
             action.fill(0.25);

@@ -78,10 +78,11 @@ impl Scene {
             .map(|parameters| TorchPolicy::from_parameters(task.spec(), &experiment, &parameters))
             .transpose()?;
         let starts = self.starts(task.as_ref())?;
+        let name = self.task;
         let options =
             Options { deterministic: self.deterministic, seed: self.seed, environments: 1, ..Options::default() };
         let sizes = ActingSizes::new(task.spec(), &experiment);
-        Ok(Cast { task, policy, sizes, name: experiment.task, starts, options })
+        Ok(Cast { task, policy, sizes, name, starts, options })
     }
 
     /// The experiment, and the parameters when there is a checkpoint.
@@ -98,7 +99,7 @@ impl Scene {
                 (comic_experiment::resolve(preset, &self.set)?, None, format!("preset {preset}"))
             }
         };
-        if experiment.task == self.task {
+        if experiment.tasks().iter().any(|(task, _)| *task == self.task) {
             return Ok((experiment, parameters));
         }
         Err(Error::Usage(format!(
@@ -109,7 +110,9 @@ impl Scene {
 
     /// All starts of the first clip that has any, the wanted one first.
     fn starts(&self, task: &dyn Task) -> Result<Vec<Start>, Error> {
-        let clip = task.starts().iter().find(|clip| !clip.frames.is_empty());
+        let spec = task.spec();
+        let is_own = |clip: usize| spec.tasks.get(spec.task_of(clip)).is_some_and(|part| part.name == self.task.name());
+        let clip = task.starts().iter().find(|clip| is_own(clip.clip) && !clip.frames.is_empty());
         let clip = clip.ok_or_else(|| Error::Usage("the clip is too short for an episode to start".into()))?;
         let first = self.start.unwrap_or(clip.frames.start);
         if !clip.frames.contains(&first) {

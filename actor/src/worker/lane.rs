@@ -18,6 +18,8 @@ pub(super) struct Lane<E> {
     /// The current observation is its episode's last: no action follows it.
     ended: bool,
     episode: Episode,
+    /// The task of the current unroll, which is that of its first row; an episode of another waits for the next unroll.
+    task: usize,
     /// Steps and sums of the reward terms since the episode began.
     steps: u32,
     returns: [f64; MAX_REWARD_TERMS],
@@ -37,6 +39,7 @@ impl<E: Environment> Lane<E> {
             first: true,
             ended: false,
             episode,
+            task: episode.task,
             steps: 0,
             returns: [0.0; MAX_REWARD_TERMS],
             finished: Vec::new(),
@@ -51,17 +54,27 @@ impl<E: Environment> Lane<E> {
         self.ended
     }
 
+    /// Whether the current observation begins an episode that is of another task than this unroll.
+    pub(super) fn waits(&self) -> bool {
+        self.episode.task != self.task
+    }
+
     /// The current observation as row `t`. What it looks like is drawn here, once for the row and once for acting.
     pub(super) fn write_observation(&mut self, t: usize, row: &mut ActingRow<'_>) -> Result<(), Error> {
+        if t == 0 {
+            self.task = self.episode.task;
+            self.unroll.row_mut(Field::State, 0).copy_from_slice(row.state);
+        }
+        if self.waits() {
+            self.unroll.repeat_observation(t);
+            return Ok(());
+        }
         self.environment.draw(row.image)?;
         self.unroll.image_mut(t).copy_from_slice(row.image);
         self.unroll.row_mut(Field::Proprioception, t).copy_from_slice(row.proprioception);
         self.unroll.row_mut(Field::Task, t).copy_from_slice(row.task);
         self.unroll.row_mut(Field::First, t)[0] = f32::from(u8::from(self.first));
         self.unroll.set_clip(t, self.episode.clip as u32);
-        if t == 0 {
-            self.unroll.row_mut(Field::State, 0).copy_from_slice(row.state);
-        }
         Ok(())
     }
 
@@ -128,6 +141,7 @@ impl<E: Environment> Lane<E> {
 
     fn observe(&self, row: &mut ActingRow<'_>) {
         self.environment.observe(row.proprioception, row.task);
+        *row.of_task = self.episode.task;
     }
 
     fn write_decision(&mut self, t: usize, row: &ActingRow<'_>) {

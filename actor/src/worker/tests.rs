@@ -10,6 +10,8 @@ use super::*;
 #[derive(Debug)]
 struct Counter {
     lengths: Vec<usize>,
+    /// The task of each episode, in turn; its clip is the same number.
+    tasks: Vec<usize>,
     /// Counted from 1 after the first reset.
     episodes: usize,
     step: usize,
@@ -18,7 +20,10 @@ struct Counter {
 
 impl Counter {
     fn new(lengths: &[usize]) -> Self {
-        Self { lengths: lengths.to_vec(), episodes: 0, step: 0, last_action: 0.0 }
+        Self { lengths: lengths.to_vec(), tasks: Vec::new(), episodes: 0, step: 0, last_action: 0.0 }
+    }
+    fn task(&self) -> usize {
+        if self.tasks.is_empty() { 0 } else { self.tasks[(self.episodes - 1) % self.tasks.len()] }
     }
     fn length(&self) -> usize {
         self.lengths[(self.episodes - 1) % self.lengths.len()]
@@ -58,7 +63,8 @@ impl Environment for Counter {
         Ok(())
     }
     fn episode(&self) -> Episode {
-        Episode { clip: self.episodes % 2, start: 0, steps_left: self.length() }
+        let clip = if self.tasks.is_empty() { self.episodes % 2 } else { self.task() };
+        Episode { clip, start: 0, steps_left: self.length(), task: self.task() }
     }
     fn servo_action(&self, action: &mut [f32]) {
         action.fill(self.step as f32 / 1000.0);
@@ -150,6 +156,16 @@ fn record(length: usize, lanes: &[Vec<usize>], unrolls: usize) -> (Arc<UnrollLay
         }
     }
     (layout, recorded)
+}
+
+/// One environment's unrolls, whose episodes have these lengths and tasks.
+fn record_tasks(length: usize, lengths: &[usize], tasks: &[usize]) -> (Arc<UnrollLayout>, Vec<FinishedUnroll>) {
+    let layout = layout(length);
+    let environment = Counter { tasks: tasks.to_vec(), ..Counter::new(lengths) };
+    let mut worker = Worker::new(vec![environment], Plain::default(), Arc::clone(&layout), 0.1, 3);
+    worker.adopt(&directive(0, Conduct::Policy)).unwrap();
+    let unrolls = (0..12).flat_map(|_| worker.unroll(&|| false, &Progress::default()).unwrap().unwrap()).collect();
+    (layout, unrolls)
 }
 
 fn episode_lengths() -> impl Strategy<Value = Vec<usize>> {
@@ -245,6 +261,51 @@ proptest! {
             }
             reported.extend(unroll.episodes.iter().map(|e| (e.steps, e.steps_left_at_start, e.returns.clone())));
             prop_assert_eq!(&reported, &expected, "an episode is reported in the unroll it ends in");
+        }
+    }
+
+    /// An unroll is of one task: an episode of another waits for the next one, and the rows up to there are padding.
+    #[test]
+    fn an_unroll_belongs_to_one_task_and_padding_fills_it(
+        length in 1_usize..10,
+        lengths in episode_lengths(),
+        tasks in prop::collection::vec(0_usize..3, 1..6),
+    ) {
+        let (layout, unrolls) = record_tasks(length, &lengths, &tasks);
+        let task_of = |episode: usize| tasks[(episode - 1) % tasks.len()];
+        let (mut expected, mut padded) = ((1, 0), false);
+        for unroll in &unrolls {
+            let rows = Rows { layout: &layout, payload: &unroll.payload };
+            let task = rows.clip(0);
+            prop_assert_eq!(rows.place(0), expected, "no step is lost and none comes twice");
+            prop_assert!(!padded || rows.one(Field::First, 0) == 1.0, "an episode that has waited begins the unroll");
+            prop_assert_eq!(rows.row(Field::State, 0), vec![expected.1 as f32; 3], "and has nothing to remember");
+            padded = false;
+            for t in 0..length {
+                let ends = expected.1 == lengths[(expected.0 - 1) % lengths.len()];
+                prop_assert_eq!(rows.clip(t), task);
+                prop_assert_eq!(rows.one(Field::Valid, t) == 1.0, !padded && !ends);
+                if padded {
+                    prop_assert_eq!(rows.one(Field::First, t), 1.0);
+                    prop_assert_eq!(rows.place(t), rows.place(t - 1), "the last observation again");
+                    prop_assert_eq!(rows.row(Field::Std, t), vec![1.0; 3]);
+                } else {
+                    prop_assert_eq!(rows.place(t), expected);
+                    expected = if ends { (expected.0 + 1, 0) } else { (expected.0, expected.1 + 1) };
+                    padded = task_of(expected.0) as u32 != task;
+                }
+            }
+            // Row T may be an episode's last: then the next unroll begins with the next episode.
+            if !padded && expected.1 == lengths[(expected.0 - 1) % lengths.len()] {
+                expected = (expected.0 + 1, 0);
+            }
+            let header = comic_proto::v1::UnrollHeader {
+                layout_hash: layout.hash().to_vec(),
+                episodes: unroll.episodes.clone(),
+                ..Default::default()
+            };
+            let checked = comic_proto::Expected { clips: &[1, 1, 1], epoch: 0, newest_version: 0 };
+            prop_assert_eq!(comic_proto::validate(&layout, &header, &unroll.payload, &checked), Ok(()));
         }
     }
 

@@ -64,7 +64,7 @@ async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAc
         return Ok(Some(ack(shared, 0, Verdict::Invalid, Invalid::Header.to_string())));
     };
     let expected = Expected {
-        clips: shared.clips,
+        clips: &shared.clips,
         epoch: shared.publisher.epoch(),
         newest_version: shared.publisher.newest_version(),
     };

@@ -20,6 +20,8 @@ pub struct Evidence<'a> {
     pub kl_weights: Option<&'a Tensor>,
     /// 1 where the step is a transition; a step with 0 has no influence, whatever its other numbers are.
     pub valid: &'a Tensor,
+    /// The steps that each E-step ranks, booleans: as many as there are ηs, and no step in two of them.
+    pub groups: &'a [Tensor],
 }
 
 /// V-MPO's limits.
@@ -80,9 +82,12 @@ impl Improvement {
 /// - L_π = −Σ_{D̃} ψ ln π(a|s), ψ = softmax over D̃ of A/η, without gradient.
 /// - L_η = η ε_η + η ln(1/|D̃| Σ_{D̃} exp(A/η)).
 /// - L_α = Σ_k α_k (ε_k − sg KL_k) + sg(α_k) KL_k, KL_k the mean over all valid steps.
+///
+/// Several groups have a D̃ and an η each, and L_π and L_η are their means, weighed by their shares of the valid steps
+/// (D): a step counts the same whatever it is grouped with, and a group without a step has no influence.
 pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits: &Limits) -> Improvement {
     let mask = evidence.valid.gt(0.5);
-    let (policy, temperature) = expectation_step(evidence, &mask, &multipliers.temperature(), limits);
+    let (policy, temperature) = expectation_steps(evidence, &mask, multipliers, limits);
     let kl_mean = masked_mean(evidence.kl_mean, evidence.valid);
     let kl_std = masked_mean(evidence.kl_std, evidence.valid);
     let gaussian = constraint(&kl_mean, &multipliers.alpha_mean(), limits.epsilon_mean)
@@ -100,6 +105,25 @@ pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits
         kl_std: kl_std.detach(),
         kl_weights: kl_weights.map(|kl| kl.detach()),
     }
+}
+
+fn expectation_steps(
+    evidence: &Evidence,
+    mask: &Tensor,
+    multipliers: &Multipliers,
+    limits: &Limits,
+) -> (Tensor, Tensor) {
+    let steps = mask.sum(Kind::Float).clamp_min(1.0);
+    let (mut policies, mut temperatures) = (Vec::new(), Vec::new());
+    for (group, eta) in evidence.groups.iter().zip(multipliers.temperatures().unbind(0)) {
+        let mask = mask.logical_and(group);
+        let share = mask.sum(Kind::Float) / &steps;
+        let (of_policy, of_temperature) = expectation_step(evidence, &mask, &eta, limits);
+        policies.push(of_policy * &share);
+        temperatures.push(of_temperature * share);
+    }
+    let sum = |terms: &[Tensor]| Tensor::stack(terms, 0).sum(Kind::Float);
+    (sum(&policies), sum(&temperatures))
 }
 
 fn expectation_step(evidence: &Evidence, mask: &Tensor, eta: &Tensor, limits: &Limits) -> (Tensor, Tensor) {

@@ -1,7 +1,7 @@
 //! Networks, multipliers and optimiser, stepped together.
 
 use comic_experiment::{Experiment, Network, Optimiser, Prior, TaskSpec, Vmpo};
-use comic_networks::{Acting, ActionDistribution, Memory, NormaliserStatistics, Policy, Value};
+use comic_networks::{Acting, ActionDistribution, Memory, NormaliserStatistics, Policy, Routing, Value};
 use comic_proto::UnrollShape;
 use tch::{Device, Kind, Tensor, nn};
 
@@ -24,6 +24,14 @@ pub enum Error {
         expected: usize,
         /// Elements found.
         found: usize,
+    },
+    /// An unroll of a task there is not.
+    #[error("an unroll is of task {task}, and there are {tasks}")]
+    Task {
+        /// As found.
+        task: usize,
+        /// Number of tasks.
+        tasks: usize,
     },
     /// A batch that was made for another task or network.
     #[error("batch is {found:?} with clips below {clips} where the networks take {expected:?} and {known} clips")]
@@ -80,6 +88,8 @@ struct Pass {
     targets: Tensor,
     /// Steps that are learnt from, `[N]`.
     valid: Tensor,
+    /// The steps that each E-step ranks, `[N]` booleans; together all of them.
+    groups: Vec<Tensor>,
     /// Share of the rows that are transitions.
     share: Tensor,
     /// ½ mean (V − G)², summed over the reward terms.
@@ -100,7 +110,8 @@ impl VmpoLearner {
         let value_store = nn::VarStore::new(device);
         let policy = Policy::new(&policy_store.root(), spec, network, pose)?;
         let value = Value::new(&value_store.root(), spec, network);
-        let multipliers = Multipliers::initial(vmpo, network.components(), device);
+        let temperatures = if vmpo.temperature_per_task { spec.tasks.len() } else { 1 };
+        let multipliers = Multipliers::initial(vmpo, temperatures, network.components(), device);
         let mut adam = Adam::new(optimiser);
         let mut parameters = trainable("policy", &policy_store);
         parameters.extend(trainable("value", &value_store));
@@ -180,6 +191,7 @@ impl VmpoLearner {
             kl_std: &policy.kl_std(&pass.behaviour),
             kl_weights: kl_weights.as_ref(),
             valid: &pass.valid,
+            groups: &pass.groups,
         };
         let improvement = policy_improvement(&evidence, &self.multipliers, &self.limits);
         let mut total = improvement.total()
@@ -224,6 +236,13 @@ impl VmpoLearner {
         Ok((losses, latents))
     }
 
+    /// Every trained parameter's name and number of elements.
+    pub fn parameter_counts(&self) -> Vec<(String, usize)> {
+        let mut parameters = trainable("policy", &self.policy_store);
+        parameters.extend(trainable("value", &self.value_store));
+        parameters.into_iter().map(|(name, tensor)| (name, tensor.numel())).collect()
+    }
+
     /// Everything that changes future steps, by name: both networks, the multipliers and Adam. The tensors are copies on
     /// the CPU, so another thread can write them while the next step runs.
     pub fn state(&self) -> Vec<(String, Tensor)> {
@@ -259,7 +278,7 @@ impl VmpoLearner {
             components: self.network.components(),
             state: self.network.state_size(),
         };
-        let expected = MinibatchShape { unrolls: found.unrolls, unroll };
+        let expected = MinibatchShape { unrolls: found.unrolls, tasks: self.spec.tasks.len(), unroll };
         let known = self.spec.clips.len();
         if found == expected && minibatch.clips <= known {
             return Ok(());
@@ -269,8 +288,9 @@ impl VmpoLearner {
 
     fn forward(&self, minibatch: &MinibatchTensors) -> Pass {
         let length = minibatch.shape().unroll.length as i64;
-        let observation = self.policy.normalise(&minibatch.proprioception, &minibatch.task, minibatch.image.as_ref());
-        let MinibatchTensors { reward, discount, valid, first, .. } = minibatch;
+        let MinibatchTensors { reward, discount, valid, first, routing, .. } = minibatch;
+        let image = minibatch.image.as_ref();
+        let observation = self.policy.normalise(&minibatch.proprioception, &minibatch.task, image, routing);
         let values = self.value.forward(&observation, &minibatch.clip, first);
         let first = first.narrow(1, 0, length);
         let acting = self.policy.act(
@@ -295,6 +315,7 @@ impl VmpoLearner {
                 &rows(&minibatch.std),
                 &rows(&minibatch.log_weights),
             ),
+            groups: self.groups(routing, length, &valid),
             value_loss: masked_mean(&errors, &valid),
             latent_kl: masked_mean(&latent_kl, &valid),
             acting,
@@ -302,6 +323,17 @@ impl VmpoLearner {
             targets,
             valid,
             share,
+        }
+    }
+
+    /// Task by task the steps that belong to it, if each has an E-step of its own.
+    fn groups(&self, routing: &Routing, length: i64, valid: &Tensor) -> Vec<Tensor> {
+        match routing.tasks() {
+            Some(tasks) if self.vmpo.temperature_per_task => {
+                let of_rows = tasks.repeat_interleave_self_int(length, 0, valid.size()[0]);
+                (0..self.spec.tasks.len() as i64).map(|task| of_rows.eq(task)).collect()
+            }
+            _ => vec![valid.ones_like().to_kind(Kind::Bool)],
         }
     }
 
@@ -344,12 +376,12 @@ impl VmpoLearner {
         tch::no_grad(|| {
             let zero = Tensor::zeros([1], (Kind::Float, self.device()));
             let of = |entry: fn(&Improvement) -> &Tensor| improvement.map_or(&zero, entry);
-            let [temperature, alpha_mean, alpha_std] =
-                [self.multipliers.temperature(), self.multipliers.alpha_mean(), self.multipliers.alpha_std()];
+            let temperatures = self.multipliers.temperatures();
+            let [alpha_mean, alpha_std] = [self.multipliers.alpha_mean(), self.multipliers.alpha_std()];
             let alpha_discrete = self.multipliers.alpha_discrete();
             let kl_weights = improvement.and_then(|improvement| improvement.kl_weights.as_ref());
             let std = pass.acting.action.std().mean_dim(-1i64, false, Kind::Float);
-            Losses::pack([
+            let scalars = [
                 total,
                 of(|improvement| &improvement.policy),
                 of(|improvement| &improvement.temperature),
@@ -360,7 +392,7 @@ impl VmpoLearner {
                 of(|improvement| &improvement.kl_mean),
                 of(|improvement| &improvement.kl_std),
                 kl_weights.unwrap_or(&zero),
-                &temperature,
+                &temperatures.mean(Kind::Float),
                 &alpha_mean,
                 &alpha_std,
                 alpha_discrete.as_ref().unwrap_or(&zero),
@@ -368,7 +400,8 @@ impl VmpoLearner {
                 norm,
                 &variance_explained(pass),
                 &pass.share,
-            ])
+            ];
+            Losses::pack(scalars, &temperatures)
         })
     }
 }

@@ -12,9 +12,10 @@ pub struct Losses {
 }
 
 impl Losses {
-    /// Packs scalars in the order of [`Metrics`]' fields.
-    pub(crate) fn pack(entries: [&Tensor; COUNT]) -> Self {
-        let entries = entries.map(|entry| entry.detach().reshape([1]).to_kind(Kind::Float));
+    /// Packs scalars in the order of [`Metrics`]' fields, and the ηs.
+    pub(crate) fn pack(entries: [&Tensor; COUNT], temperatures: &Tensor) -> Self {
+        let scalars = entries.map(|entry| entry.detach().reshape([1]).to_kind(Kind::Float));
+        let entries: Vec<&Tensor> = scalars.iter().chain([temperatures]).collect();
         Self { packed: Tensor::cat(&entries, 0) }
     }
 
@@ -29,9 +30,11 @@ impl Losses {
 
     /// Reads the report from the device, in one transfer.
     pub fn to_metrics(&self) -> Metrics {
-        let mut values = [f32::NAN; COUNT];
+        let mut all = vec![f32::NAN; self.packed.numel()];
+        let count = all.len();
         // A failed transfer leaves NaN, which `Metrics::is_finite` reports.
-        let _ = self.packed.to_device(Device::Cpu).f_copy_data(&mut values, COUNT);
+        let _ = self.packed.to_device(Device::Cpu).f_copy_data(&mut all, count);
+        let temperatures = all.split_off(COUNT.min(count));
         let [
             total_loss,
             policy_loss,
@@ -51,7 +54,7 @@ impl Losses {
             gradient_norm,
             variance_explained,
             valid_share,
-        ] = values;
+        ] = all.try_into().unwrap_or([f32::NAN; COUNT]);
         Metrics {
             total_loss,
             policy_loss,
@@ -71,12 +74,13 @@ impl Losses {
             gradient_norm,
             variance_explained,
             valid_share,
+            temperatures,
         }
     }
 }
 
 /// A gradient step in numbers.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Metrics {
     /// The loss that was differentiated.
     pub total_loss: f32,
@@ -98,7 +102,7 @@ pub struct Metrics {
     pub kl_std: f32,
     /// Mean KL of a mixture's weights to the behaviour policy's, nats a step; 0 for one Gaussian.
     pub kl_weights: f32,
-    /// η after the step.
+    /// η after the step; the mean where there are several.
     pub temperature: f32,
     /// α_μ after the step.
     pub alpha_mean: f32,
@@ -114,6 +118,8 @@ pub struct Metrics {
     pub variance_explained: f32,
     /// Share of the rows that are transitions.
     pub valid_share: f32,
+    /// Every η after the step: one, or one for each task.
+    pub temperatures: Vec<f32>,
 }
 
 impl Metrics {

@@ -1,5 +1,6 @@
 //! Unrolls as tensors.
 
+use comic_networks::Routing;
 use comic_proto::UnrollShape;
 use tch::{Device, Tensor};
 
@@ -10,6 +11,8 @@ use super::Error;
 pub struct MinibatchShape {
     /// B, unrolls.
     pub unrolls: usize,
+    /// Tasks that they may be of.
+    pub tasks: usize,
     /// The sizes of each.
     pub unroll: UnrollShape,
 }
@@ -47,6 +50,8 @@ pub struct MinibatchSource<'a> {
     pub clip: &'a [u32],
     /// What the humanoid sees, `[B, T+1, I]`; empty when the task is blind.
     pub image: &'a [u8],
+    /// The task of each unroll, `[B]`.
+    pub tasks: &'a [usize],
 }
 
 /// A minibatch of unrolls, batch first, float32 except `clip` and `image`.
@@ -73,6 +78,10 @@ pub struct MinibatchTensors {
     pub(super) image: Option<Tensor>,
     /// One more than the largest clip index: known on the host, so no step has to ask the device.
     pub(super) clips: usize,
+    /// The task of each unroll, `[B]`, on the host, where it is decided which network each goes through.
+    tasks: Vec<usize>,
+    task_count: usize,
+    pub(super) routing: Routing,
 }
 
 impl MinibatchTensors {
@@ -81,7 +90,7 @@ impl MinibatchTensors {
     /// # Errors
     /// [`Error::Length`] when a slice is not as long as `shape` says.
     pub fn new(source: &MinibatchSource, shape: &MinibatchShape, device: Device) -> Result<Self, Error> {
-        let MinibatchShape { unrolls, unroll } = *shape;
+        let MinibatchShape { unrolls, tasks: task_count, unroll } = *shape;
         let (steps, observations) = (unroll.length, unroll.length + 1);
         let tensor = |name, values: &[f32], rows: usize, width: usize| {
             let size = [unrolls, rows, width];
@@ -96,6 +105,10 @@ impl MinibatchTensors {
             Ok::<Tensor, Error>(tensor(name, values, steps, width)?.f_where_scalarother(&mask, blank)?)
         };
         check("clip", source.clip.len(), &[unrolls, observations])?;
+        check("tasks", source.tasks.len(), &[unrolls])?;
+        if let Some(task) = source.tasks.iter().copied().find(|task| *task >= task_count) {
+            return Err(Error::Task { task, tasks: task_count });
+        }
         let size = [unrolls, observations, unroll.image];
         check("image", source.image.len(), &size)?;
         let image = if unroll.image == 0 {
@@ -122,6 +135,9 @@ impl MinibatchTensors {
             clip: Tensor::from_slice(&clip).f_reshape([unrolls as i64, observations as i64])?.f_to_device(device)?,
             image,
             clips: source.clip.iter().max().map_or(0, |clip| *clip as usize + 1),
+            routing: Routing::blocked(source.tasks, task_count, device),
+            tasks: source.tasks.to_vec(),
+            task_count,
             valid,
         })
     }
@@ -131,6 +147,7 @@ impl MinibatchTensors {
         let width = |tensor: &Tensor, dimension: i64| tensor.size()[dimension as usize] as usize;
         MinibatchShape {
             unrolls: width(&self.valid, 0),
+            tasks: self.task_count,
             unroll: UnrollShape {
                 length: width(&self.valid, 1),
                 proprioception: width(&self.proprioception, 2),
@@ -150,10 +167,15 @@ impl MinibatchTensors {
         &self.previous_latent
     }
 
-    /// The unrolls at `indices`, `[M]` int64 below B, copied.
-    pub fn select(&self, indices: &Tensor) -> Self {
-        let take = |tensor: &Tensor| tensor.index_select(0, indices);
+    /// The unrolls at `unrolls`, each below B, copied.
+    pub fn select(&self, unrolls: &[usize]) -> Self {
+        let indices = self.indices(unrolls);
+        let take = |tensor: &Tensor| tensor.index_select(0, &indices);
+        let tasks: Vec<usize> = unrolls.iter().filter_map(|unroll| self.tasks.get(*unroll).copied()).collect();
         Self {
+            routing: Routing::blocked(&tasks, self.task_count, self.valid.device()),
+            tasks,
+            task_count: self.task_count,
             proprioception: take(&self.proprioception),
             task: take(&self.task),
             previous_latent: take(&self.previous_latent),
@@ -173,10 +195,15 @@ impl MinibatchTensors {
         }
     }
 
-    /// Replaces z_{t−1} of the unrolls at `indices` (`[M]` int64) by `latents`, z_t as recomputed for them,
-    /// `[M, T, Z]`: row t takes z_{t−1}, an episode's first row zeros, and row 0 keeps what it has, since the step
-    /// before it is not here.
-    pub fn refresh_previous_latent(&mut self, indices: &Tensor, latents: &Tensor) {
+    fn indices(&self, unrolls: &[usize]) -> Tensor {
+        let indices: Vec<i64> = unrolls.iter().map(|unroll| *unroll as i64).collect();
+        Tensor::from_slice(&indices).to_device(self.valid.device())
+    }
+
+    /// Replaces z_{t−1} of M unrolls by `latents`, z_t as recomputed for them, `[M, T, Z]`: row t takes z_{t−1}, an
+    /// episode's first row zeros, and row 0 keeps what it has, since the step before it is not here.
+    pub fn refresh_previous_latent(&mut self, unrolls: &[usize], latents: &Tensor) {
+        let indices = &self.indices(unrolls);
         tch::no_grad(|| {
             let steps = latents.size()[1] - 1;
             let stored = self.previous_latent.index_select(0, indices);

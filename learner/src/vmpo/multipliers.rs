@@ -6,50 +6,54 @@ use tch::{Device, Tensor};
 /// Multipliers are projected to at least this after each step (V).
 pub const MULTIPLIER_FLOOR: f64 = 1e-8;
 
-/// η, α_μ, α_Σ and, for a mixture, α_discrete: positive numbers that are learned as they are, one parameter.
+/// The ηs, α_μ, α_Σ and, for a mixture, α_discrete: positive numbers that are learned as they are, one parameter.
 #[derive(Debug)]
 pub struct Multipliers {
     parameter: Tensor,
+    /// Number of ηs: one, or one for each task.
+    temperatures: i64,
 }
 
 impl Multipliers {
-    /// From η, α_μ, α_Σ and perhaps α_discrete; each at least [`MULTIPLIER_FLOOR`].
-    pub fn new(values: &[f32], device: Device) -> Self {
-        let values: Vec<f32> = values.iter().map(|value| value.max(MULTIPLIER_FLOOR as f32)).collect();
-        Self { parameter: Tensor::from_slice(&values).to_device(device).set_requires_grad(true) }
+    /// From the ηs, and α_μ, α_Σ and perhaps α_discrete; each at least [`MULTIPLIER_FLOOR`].
+    pub fn new(temperatures: &[f32], alphas: &[f32], device: Device) -> Self {
+        let values: Vec<f32> =
+            temperatures.iter().chain(alphas).map(|value| value.max(MULTIPLIER_FLOOR as f32)).collect();
+        let parameter = Tensor::from_slice(&values).to_device(device).set_requires_grad(true);
+        Self { parameter, temperatures: temperatures.len() as i64 }
     }
 
     /// The experiment's starting values (S: 1 each).
-    pub fn initial(config: &Vmpo, components: usize, device: Device) -> Self {
-        let mut values = vec![config.initial_temperature, config.initial_alpha_mean, config.initial_alpha_std];
+    pub fn initial(config: &Vmpo, temperatures: usize, components: usize, device: Device) -> Self {
+        let mut alphas = vec![config.initial_alpha_mean as f32, config.initial_alpha_std as f32];
         if components > 1 {
-            values.push(config.initial_alpha_discrete);
+            alphas.push(config.initial_alpha_discrete as f32);
         }
-        let values: Vec<f32> = values.into_iter().map(|value| value as f32).collect();
-        Self::new(&values, device)
+        Self::new(&vec![config.initial_temperature as f32; temperatures], &alphas, device)
     }
 
-    /// η, a scalar that carries gradient.
-    pub fn temperature(&self) -> Tensor {
-        self.parameter.select(0, 0)
+    /// Every η, `[1]` or one for each task; carries gradient.
+    pub fn temperatures(&self) -> Tensor {
+        self.parameter.narrow(0, 0, self.temperatures)
     }
 
     /// α_μ, a scalar that carries gradient.
     pub fn alpha_mean(&self) -> Tensor {
-        self.parameter.select(0, 1)
+        self.parameter.select(0, self.temperatures)
     }
 
     /// α_Σ, a scalar that carries gradient.
     pub fn alpha_std(&self) -> Tensor {
-        self.parameter.select(0, 2)
+        self.parameter.select(0, self.temperatures + 1)
     }
 
     /// α_discrete, a scalar that carries gradient; only mixtures have one.
     pub fn alpha_discrete(&self) -> Option<Tensor> {
-        (self.parameter.numel() > 3).then(|| self.parameter.select(0, 3))
+        let place = self.temperatures + 2;
+        (self.parameter.size()[0] > place).then(|| self.parameter.select(0, place))
     }
 
-    /// The parameter itself: η, α_μ, α_Σ and perhaps α_discrete, `[3]` or `[4]`.
+    /// The parameter itself: the ηs, α_μ, α_Σ and perhaps α_discrete.
     pub fn parameter(&self) -> &Tensor {
         &self.parameter
     }

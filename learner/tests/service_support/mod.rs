@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Result;
 use bytes::Bytes;
 use comic_clips::Asset;
-use comic_experiment::{Experiment, TaskSpec};
+use comic_experiment::{Experiment, TaskPart, TaskSpec};
 use comic_learner::publish::Publisher;
 use comic_learner::service::{Setup, Shared, serve};
 use comic_proto::v1::learner_client::LearnerClient;
@@ -53,9 +53,9 @@ impl World {
             task: 3,
             action: 2,
             reward_terms: vec!["posture".into(), "progress".into()],
-            max_reward: 1.0,
             image: 0,
             clips: vec!["walk".into(), "run".into()],
+            tasks: vec![TaskPart { name: "tracking".into(), observation: 3, clips: 2, max_reward: 1.0 }],
         };
         let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
         let config = Config { unrolls: BATCH, max_staleness: 5, ahead: 2 };

@@ -1,9 +1,9 @@
 //! Small tasks and made-up unrolls for the tests of V-MPO.
 #![allow(dead_code, reason = "each test uses its part")]
 
-use comic_experiment::{Experiment, TaskSpec};
+use comic_experiment::{Experiment, TaskPart, TaskSpec};
 use comic_learner::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
-use comic_networks::Memory;
+use comic_networks::{Memory, Routing};
 use comic_proto::UnrollShape;
 use tch::{Device, Tensor};
 
@@ -25,10 +25,19 @@ pub(crate) fn spec() -> TaskSpec {
         task: WIDTHS.task,
         action: WIDTHS.action,
         reward_terms: vec!["near".into(), "far".into()],
-        max_reward: 1.0,
         image: 0,
         clips: vec!["walk".into(), "run".into(), "jump".into()],
+        tasks: vec![TaskPart { name: "tracking".into(), observation: WIDTHS.task, clips: 3, max_reward: 1.0 }],
     }
+}
+
+/// The same with a second task, whose clip is `lie` and whose observation is the first two entries.
+pub(crate) fn joint_spec() -> TaskSpec {
+    let mut spec = spec();
+    spec.reward_terms = vec!["reward".into()];
+    spec.clips.push("lie".into());
+    spec.tasks.push(TaskPart { name: "get-up".into(), observation: 2, clips: 1, max_reward: 1.0 });
+    spec
 }
 
 /// Small networks. ε of Adam is large, so that a step is nearly the gradient times a number: parameters that agree after
@@ -49,11 +58,15 @@ pub(crate) fn experiment() -> Experiment {
 static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
 pub(crate) fn learner(experiment: &Experiment, seed: i64) -> VmpoLearner {
+    learner_of(&spec(), experiment, seed)
+}
+
+pub(crate) fn learner_of(spec: &TaskSpec, experiment: &Experiment, seed: i64) -> VmpoLearner {
     let _guard = GENERATOR.lock().unwrap();
     // Tests run side by side, on networks too small to share among threads.
     tch::set_num_threads(1);
     tch::manual_seed(seed);
-    VmpoLearner::new(&spec(), experiment, &[0.1, -0.2, 0.3], Device::Cpu).unwrap()
+    VmpoLearner::new(spec, experiment, &[0.1, -0.2, 0.3], Device::Cpu).unwrap()
 }
 
 /// Unrolls as the wire has them; every field may be changed by a test.
@@ -74,6 +87,8 @@ pub(crate) struct Unrolls {
     pub(crate) first: Vec<f32>,
     pub(crate) state: Vec<f32>,
     pub(crate) clip: Vec<u32>,
+    pub(crate) tasks: Vec<usize>,
+    pub(crate) task_count: usize,
 }
 
 /// A reproducible stream of numbers in [−1, 1], so that no test depends on libtorch's generator.
@@ -116,6 +131,8 @@ impl Unrolls {
             first: vec![0.0; observations],
             state: Vec::new(),
             clip: (0..observations).map(|row| (row / (LENGTH + 1) % 3) as u32).collect(),
+            tasks: vec![0; count],
+            task_count: 1,
         }
     }
 
@@ -134,12 +151,12 @@ impl Unrolls {
             task: WIDTHS.task,
             action: WIDTHS.action,
             latent: self.latent_noise.len() / (self.count * LENGTH),
-            reward_terms: WIDTHS.reward_terms,
+            reward_terms: self.reward.len() / (self.count * LENGTH),
             image: 0,
             components: self.mean.len() / self.action.len(),
             state: self.state.len() / self.count,
         };
-        MinibatchShape { unrolls: self.count, unroll }
+        MinibatchShape { unrolls: self.count, tasks: self.task_count, unroll }
     }
 
     pub(crate) fn source(&self) -> MinibatchSource<'_> {
@@ -159,6 +176,7 @@ impl Unrolls {
             state: &self.state,
             clip: &self.clip,
             image: &[],
+            tasks: &self.tasks,
         }
     }
 
@@ -185,7 +203,7 @@ impl Unrolls {
             let [s, x, z, noise] = inputs.each_ref().map(|input| input.narrow(0, start as i64, length));
             let acting = tch::no_grad(|| {
                 let state = s.narrow(1, 0, 0);
-                let observation = learner.policy().normalise(&s, &x, None);
+                let observation = learner.policy().normalise(&s, &x, None, &Routing::single());
                 learner.policy().act(&observation, &z, &noise, Memory { state: &state, first: None })
             });
             means.extend(values(&acting.action.mean()));

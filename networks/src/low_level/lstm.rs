@@ -29,6 +29,6 @@ impl LowLevel for LstmLowLevel {
         let unrolls = input.memory.state.size()[0];
         let (hidden, state) = self.stack.forward(&joined.reshape([unrolls, -1, joined.size()[1]]), input.memory);
         let hidden = hidden.flatten(0, 1);
-        Output { action: ActionDistribution::Gaussian(self.head.forward(&hidden, &joined)), state }
+        Output { action: ActionDistribution::Gaussian(self.head.forward(&hidden)), state }
     }
 }

@@ -26,7 +26,7 @@ impl MlpLowLevel {
 impl LowLevel for MlpLowLevel {
     fn act(&self, input: &Input<'_>) -> Output {
         let joined = Tensor::cat(&[input.intent, input.proprioception], 1);
-        let action = self.head.forward(&self.torso.forward(&joined), &joined);
+        let action = self.head.forward(&self.torso.forward(&joined));
         Output { action: ActionDistribution::Gaussian(action), state: input.memory.state.shallow_clone() }
     }
 }

@@ -1,0 +1,223 @@
+//! Joint training: one low level, an encoder, a value function and a temperature for each task.
+
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
+mod vmpo_support;
+
+use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives};
+use comic_learner::vmpo::{MinibatchTensors, VmpoLearner};
+use comic_networks::{Memory, Routing};
+use tch::Tensor;
+use vmpo_support::{LENGTH, Numbers, Unrolls, difference, joint_spec, learner_of, state};
+
+const COUNT: usize = 5;
+/// The tasks of the unrolls: tracking's clips are 0 to 2, getting up's is 3.
+const TASKS: [usize; COUNT] = [0, 1, 0, 1, 0];
+/// Width of a task observation, and of getting up's own.
+const WIDTHS: (usize, usize) = (4, 2);
+
+fn every_low_level() -> Vec<Experiment> {
+    LowLevelName::ALL
+        .map(|name| {
+            let mut experiment = vmpo_support::experiment();
+            experiment.network.low_level = name;
+            experiment.network.lstm = Lstm { units: vec![6, 5] };
+            experiment.network.primitives =
+                Primitives { count: 3, torso: vec![8], hidden: 6, gate: vec![7], biases: true };
+            experiment
+        })
+        .to_vec()
+}
+
+fn learner(experiment: &Experiment) -> VmpoLearner {
+    learner_of(&joint_spec(), experiment, 1)
+}
+
+/// Unrolls of both tasks as this learner's own policy makes them, acting step by step: one with two episodes, and one
+/// whose second half is padding.
+fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls {
+    let mut unrolls = Unrolls::random(seed, COUNT).end_episode(0, 3, true);
+    let mut numbers = Numbers::new(seed + 100);
+    unrolls.task_count = 2;
+    unrolls.tasks = TASKS.to_vec();
+    unrolls.reward = numbers.take(COUNT * LENGTH);
+    for (row, clip) in unrolls.clip.iter_mut().enumerate() {
+        *clip = if TASKS[row / (LENGTH + 1)] == 1 { 3 } else { *clip };
+    }
+    for (row, observation) in unrolls.task.chunks_exact_mut(WIDTHS.0).enumerate() {
+        if TASKS[row / (LENGTH + 1)] == 1 {
+            observation[WIDTHS.1..].fill(0.0);
+        }
+    }
+    // Unroll 1 ends its episode in row 4, and the next one's is another task's.
+    for t in 4..LENGTH {
+        unrolls.valid[LENGTH + t] = 0.0;
+        unrolls.discount[LENGTH + t] = 0.0;
+        unrolls.first[LENGTH + 1 + t + 1] = 1.0;
+    }
+    let (latent, state) = (experiment.network.latent.size, experiment.network.state_size());
+    unrolls.state = numbers.take(COUNT * state);
+    let matrix = |values: &[f32], width: usize| Tensor::from_slice(values).reshape([COUNT as i64, width as i64]);
+    let mut remembered = matrix(&unrolls.state, state);
+    let mut previous = matrix(&numbers.take(COUNT * latent), latent);
+    let at = |values: &[f32], length: usize, t: usize| {
+        let width = values.len() / (COUNT * length);
+        Tensor::from_slice(values).reshape([COUNT, length, width].map(|size| size as i64)).select(1, t as i64)
+    };
+    let (mut means, mut stds, mut weights, mut latents) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    for t in 0..LENGTH {
+        let within = 1.0 - at(&unrolls.first, LENGTH + 1, t);
+        (previous, remembered) = (previous * &within, remembered * within);
+        latents.push(previous.copy());
+        let acting = tch::no_grad(|| {
+            let (proprioception, task) = (at(&unrolls.proprioception, LENGTH + 1, t), at(&unrolls.task, LENGTH + 1, t));
+            let routing = Routing::grouped(&TASKS, 2);
+            let observation = learner.policy().normalise(&proprioception, &task, None, &routing);
+            let memory = Memory { state: &remembered, first: None };
+            learner.policy().act(&observation, &previous, &at(&unrolls.latent_noise, LENGTH, t), memory)
+        });
+        let (mean, std, log_weights) = acting.action.to_rows();
+        (previous, remembered) = (acting.latent, acting.state);
+        means.push(mean);
+        stds.push(std);
+        weights.extend(log_weights);
+    }
+    let unrolled = |steps: &[Tensor]| match steps {
+        [] => Vec::new(),
+        steps => Vec::<f32>::try_from(Tensor::stack(steps, 1).flatten(0, -1).contiguous()).unwrap(),
+    };
+    (unrolls.mean, unrolls.std) = (unrolled(&means), unrolled(&stds));
+    (unrolls.log_weights, unrolls.previous_latent) = (unrolled(&weights), unrolled(&latents));
+    unrolls
+}
+
+/// Steps two learners, one on each minibatch, and gives the difference of everything they hold.
+fn compare(experiment: &Experiment, left: &MinibatchTensors, right: &MinibatchTensors) -> f64 {
+    let (mut one, mut other) = (learner(experiment), learner(experiment));
+    one.step(left).unwrap();
+    other.step(right).unwrap();
+    difference(&one, &other)
+}
+
+/// What a step changed, by name.
+fn changed(experiment: &Experiment, unrolls: &Unrolls) -> Vec<String> {
+    let mut learner = learner(experiment);
+    let before = state(&learner);
+    learner.step(&unrolls.minibatch()).unwrap();
+    let moved =
+        |((name, before), (_, after)): ((String, Vec<f64>), (String, Vec<f64>))| (before != after).then_some(name);
+    before.into_iter().zip(state(&learner)).filter_map(moved).collect()
+}
+
+#[test]
+fn acting_step_by_step_is_learning_on_the_whole_unroll() {
+    for experiment in every_low_level() {
+        let mut learner = learner(&experiment);
+        let metrics = learner.step(&unrolls(&learner, &experiment, 2).minibatch()).unwrap().to_metrics();
+        for kl in [metrics.kl_mean, metrics.kl_std, metrics.kl_weights] {
+            assert!(kl.abs() < 1e-5, "{}: {metrics:?}", experiment.network.low_level);
+        }
+    }
+}
+
+#[test]
+fn another_tasks_encoder_is_noticed() {
+    let experiment = vmpo_support::experiment();
+    let mut learner = learner(&experiment);
+    let mut unrolls = unrolls(&learner, &experiment, 2);
+    unrolls.tasks = TASKS.map(|task| 1 - task).to_vec();
+    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_metrics();
+    assert!(metrics.kl_mean > 1e-5, "{metrics:?}");
+}
+
+#[test]
+fn permuting_the_batch_changes_nothing() {
+    for experiment in every_low_level() {
+        let base = unrolls(&learner(&experiment), &experiment, 3).minibatch();
+        let permuted = base.select(&[3, 0, 4, 1, 2]);
+        assert!(compare(&experiment, &base, &permuted) < 1e-5, "{}", experiment.network.low_level);
+    }
+}
+
+#[test]
+fn padding_changes_nothing() {
+    for experiment in every_low_level() {
+        let base = unrolls(&learner(&experiment), &experiment, 3);
+        let mut other = base.clone();
+        // Rows 5 and later of unroll 1; row 4 is its episode's last observation, from which it may be bootstrapped.
+        for (values, length) in
+            [(&mut other.proprioception, LENGTH + 1), (&mut other.task, LENGTH + 1), (&mut other.mean, LENGTH)]
+        {
+            let width = values.len() / (COUNT * length);
+            values[(length + 5) * width..2 * length * width].fill(0.7);
+        }
+        assert_eq!(
+            compare(&experiment, &base.minibatch(), &other.minibatch()),
+            0.0,
+            "{}",
+            experiment.network.low_level
+        );
+    }
+}
+
+#[test]
+fn a_task_teaches_its_own_encoder_value_and_temperature_and_the_shared_low_level() {
+    let experiment = vmpo_support::experiment();
+    let mut unrolls = unrolls(&learner(&experiment), &experiment, 4);
+    // Nothing but getting up is left.
+    for (row, valid) in unrolls.valid.iter_mut().enumerate() {
+        *valid = if TASKS[row / LENGTH] == 1 { *valid } else { 0.0 };
+    }
+    let changed = changed(&experiment, &unrolls);
+    let any = |prefix: &str| changed.iter().any(|name| name.starts_with(prefix));
+    assert!(any("policy.encoder.get-up.") && any("value.get-up.") && any("policy.low_level."), "{changed:?}");
+    assert!(!any("policy.encoder.tracking.") && !any("value.tracking."), "{changed:?}");
+    let mut learner = learner(&experiment);
+    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_metrics();
+    assert_eq!(metrics.temperatures[0], 1.0, "an absent task's temperature stays");
+    assert_ne!(metrics.temperatures[1], 1.0);
+}
+
+#[test]
+fn advantages_of_one_task_do_not_crowd_out_the_others() {
+    let mut experiment = vmpo_support::experiment();
+    let base = unrolls(&learner(&experiment), &experiment, 5);
+    let mut rich = base.clone();
+    for (row, reward) in rich.reward.iter_mut().enumerate() {
+        *reward += if TASKS[row / LENGTH] == 1 { 1000.0 } else { 0.0 };
+    }
+    let tracking_encoder_moves_as_before = |experiment: &Experiment| {
+        let after = |unrolls: &Unrolls| {
+            let mut learner = learner(experiment);
+            learner.step(&unrolls.minibatch()).unwrap();
+            state(&learner)
+        };
+        let is_encoder = |name: &str| name.starts_with("policy.encoder.tracking.");
+        let pairs = after(&base).into_iter().zip(after(&rich));
+        pairs.filter(|((name, _), _)| is_encoder(name)).all(|((_, left), (_, right))| left == right)
+    };
+    assert!(tracking_encoder_moves_as_before(&experiment));
+    experiment.vmpo.temperature_per_task = false;
+    assert!(!tracking_encoder_moves_as_before(&experiment), "one E-step ranks all steps");
+}
+
+#[test]
+fn with_one_temperature_there_is_one() {
+    let mut experiment = vmpo_support::experiment();
+    assert_eq!(learner(&experiment).multipliers().temperatures().size(), [2]);
+    experiment.vmpo.temperature_per_task = false;
+    assert_eq!(learner(&experiment).multipliers().temperatures().size(), [1]);
+}
+
+#[test]
+fn a_batch_of_other_tasks_is_refused() {
+    let experiment = vmpo_support::experiment();
+    let mut learner = learner(&experiment);
+    let mut unrolls = unrolls(&learner, &experiment, 6);
+    unrolls.tasks[2] = 2;
+    let error = MinibatchTensors::new(&unrolls.source(), &unrolls.shape(), tch::Device::Cpu).unwrap_err();
+    assert_eq!(error.to_string(), "an unroll is of task 2, and there are 2");
+    unrolls.task_count = 3;
+    let error = learner.step(&unrolls.minibatch()).unwrap_err().to_string();
+    assert!(error.contains("tasks: 3"), "{error}");
+}

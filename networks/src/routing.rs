@@ -1,0 +1,280 @@
+//! Which network of several each unroll goes through.
+//!
+//! In joint training every task has an encoder and a value function of its own, and a batch holds unrolls of all of them.
+//! A [`Routing`] says which unroll is whose; [`PerTask`] is one network for each task.
+//!
+//! Whoever acts takes the rows of each task that is there, and leaves out the networks of those that are not
+//! ([`Routing::grouped`]). A learner's shapes must not depend on the mix, or a compiler of graphs would compile every one
+//! ([`Routing::blocked`]): its unrolls are sorted by task into blocks of one task each, a few more than they would fill,
+//! and every block is multiplied with the weights of its own task, gathered by index. With blocks of an eighth of the batch
+//! and two tasks this is ninth eighths of the products, where every network over every unroll would be twice of them.
+
+use tch::{Device, Tensor};
+
+use crate::layers::Mlp;
+
+/// Which task each unroll, or each environment, is of.
+#[derive(Debug)]
+pub struct Routing(Option<Routed>);
+
+#[derive(Debug)]
+struct Routed {
+    /// The task of each unroll, `[B]` int64.
+    tasks: Tensor,
+    way: Way,
+}
+
+#[derive(Debug)]
+enum Way {
+    /// Task by task, the places of its unrolls, int64.
+    Groups(Vec<Tensor>),
+    Blocks(Blocks),
+}
+
+/// Unrolls sorted by task, with slots left over where a task does not fill its last block.
+#[derive(Debug)]
+struct Blocks {
+    /// The unroll in each slot, `[blocks · size]` int64; any unroll in a slot left over, whose output nobody reads.
+    slots: Tensor,
+    /// The slot of each unroll, `[B]` int64.
+    places: Tensor,
+    /// The task of each block, `[blocks]` int64.
+    tasks: Tensor,
+    /// Unrolls a block.
+    size: i64,
+}
+
+/// A batch is cut into so many blocks, and one more for each further task.
+const BLOCKS: usize = 8;
+
+impl Routing {
+    /// For one task: every network is the only one.
+    pub fn single() -> Self {
+        Self(None)
+    }
+
+    /// For whoever acts: `tasks` holds each environment's task, below `count`.
+    pub fn grouped(tasks: &[usize], count: usize) -> Self {
+        if count < 2 {
+            return Self::single();
+        }
+        let groups = (0..count).map(|task| indices(places_of(tasks, task), Device::Cpu)).collect();
+        Self(Some(Routed { tasks: indices(tasks.iter().copied(), Device::Cpu), way: Way::Groups(groups) }))
+    }
+
+    /// For a learner: `tasks` holds each unroll's task, below `count`. Every shape is decided by how many unrolls and how
+    /// many tasks there are.
+    pub fn blocked(tasks: &[usize], count: usize, device: Device) -> Self {
+        if count < 2 {
+            return Self::single();
+        }
+        let size = tasks.len().div_ceil(BLOCKS).max(1);
+        let blocks = tasks.len().div_ceil(size) + count - 1;
+        let (mut slots, mut places, mut of_block) = (Vec::new(), vec![0; tasks.len()], Vec::new());
+        for task in 0..count {
+            for unroll in places_of(tasks, task) {
+                places[unroll] = slots.len();
+                slots.push(unroll);
+            }
+            // Up to the block's end.
+            slots.resize(slots.len().next_multiple_of(size), 0);
+            of_block.resize(slots.len() / size, task);
+        }
+        slots.resize(blocks * size, 0);
+        of_block.resize(blocks, 0);
+        let blocks = Blocks {
+            slots: indices(slots, device),
+            places: indices(places, device),
+            tasks: indices(of_block, device),
+            size: size as i64,
+        };
+        Self(Some(Routed { tasks: indices(tasks.iter().copied(), device), way: Way::Blocks(blocks) }))
+    }
+
+    /// The same one again; its tensors are shared.
+    pub fn shallow_clone(&self) -> Self {
+        Self(self.0.as_ref().map(|Routed { tasks, way }| {
+            let way = match way {
+                Way::Groups(groups) => Way::Groups(groups.iter().map(Tensor::shallow_clone).collect()),
+                Way::Blocks(Blocks { slots, places, tasks, size }) => Way::Blocks(Blocks {
+                    slots: slots.shallow_clone(),
+                    places: places.shallow_clone(),
+                    tasks: tasks.shallow_clone(),
+                    size: *size,
+                }),
+            };
+            Routed { tasks: tasks.shallow_clone(), way }
+        }))
+    }
+
+    /// The task of each unroll, `[B]` int64; none where there is one task.
+    pub fn tasks(&self) -> Option<&Tensor> {
+        self.0.as_ref().map(|routed| &routed.tasks)
+    }
+}
+
+fn places_of(tasks: &[usize], task: usize) -> impl Iterator<Item = usize> {
+    tasks.iter().enumerate().filter(move |(_, of)| **of == task).map(|(place, _)| place)
+}
+
+fn indices(values: impl IntoIterator<Item = usize>, device: Device) -> Tensor {
+    let values: Vec<i64> = values.into_iter().map(|value| value as i64).collect();
+    Tensor::from_slice(&values).to_device(device)
+}
+
+/// One network for each task, of the same sizes but for the input: a task's network reads the first entries of it, as many
+/// as it is wide.
+#[derive(Debug)]
+pub(crate) struct PerTask {
+    networks: Vec<Mlp>,
+}
+
+impl PerTask {
+    /// At least one network.
+    pub(crate) fn new(networks: Vec<Mlp>) -> Self {
+        Self { networks }
+    }
+
+    /// `[N, I]` to `[N, O]`, N rows unroll by unroll, I the widest input.
+    pub(crate) fn forward(&self, input: &Tensor, routing: &Routing) -> Tensor {
+        match (&self.networks[..], &routing.0) {
+            ([network], _) => network.forward(input),
+            (networks, None) => networks[0].forward(&input.narrow(1, 0, networks[0].input())),
+            (networks, Some(routed)) => match &routed.way {
+                Way::Groups(groups) => by_group(networks, groups, input),
+                Way::Blocks(blocks) => by_block(networks, blocks, input),
+            },
+        }
+    }
+}
+
+/// Each task's rows through its own network.
+fn by_group(networks: &[Mlp], groups: &[Tensor], input: &Tensor) -> Tensor {
+    let present = || networks.iter().zip(groups).filter(|(_, rows)| rows.numel() > 0);
+    let outputs: Vec<Tensor> = present()
+        .map(|(network, rows)| network.forward(&input.index_select(0, rows).narrow(1, 0, network.input())))
+        .collect();
+    let rows: Vec<&Tensor> = present().map(|(_, rows)| rows).collect();
+    // Sorted by task, and back.
+    Tensor::cat(&outputs, 0).index_select(0, &Tensor::cat(&rows, 0).argsort(0, false))
+}
+
+/// Each block through its task's network; no shape depends on which that is.
+fn by_block(networks: &[Mlp], blocks: &Blocks, input: &Tensor) -> Tensor {
+    let (unrolls, count) = (blocks.places.size()[0], blocks.tasks.size()[0]);
+    let sorted = input.reshape([unrolls, -1]).index_select(0, &blocks.slots).reshape([count, -1, input.size()[1]]);
+    let of_tasks: Vec<Vec<Tensor>> = networks.iter().map(Mlp::parameters).collect();
+    let mut of_blocks: Vec<Vec<Tensor>> = (0..count).map(|_| Vec::new()).collect();
+    for index in 0..of_tasks[0].len() {
+        let same: Vec<&Tensor> = of_tasks.iter().map(|parameters| &parameters[index]).collect();
+        let gathered = stack(&same).index_select(0, &blocks.tasks).unbind(0);
+        for (block, parameter) in of_blocks.iter_mut().zip(gathered) {
+            block.push(parameter);
+        }
+    }
+    let outputs: Vec<Tensor> = of_blocks
+        .into_iter()
+        .zip(sorted.unbind(0))
+        .filter_map(|(parameters, rows)| Some(networks[0].with(parameters)?.forward(&rows)))
+        .collect();
+    let output = Tensor::cat(&outputs, 0);
+    let width = output.size()[1];
+    output.reshape([count * blocks.size, -1]).index_select(0, &blocks.places).reshape([-1, width])
+}
+
+/// The same parameter of every task, `[tasks, …]`: narrow ones are filled up with zeros, for inputs that are zero.
+fn stack(same: &[&Tensor]) -> Tensor {
+    let width = |tensor: &Tensor| tensor.size().last().copied().unwrap_or(1);
+    let widest = same.iter().map(|tensor| width(tensor)).max().unwrap_or(1);
+    let filled: Vec<Tensor> = same.iter().map(|tensor| tensor.constant_pad_nd([0, widest - width(tensor)])).collect();
+    Tensor::stack(&filled, 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use tch::Kind;
+
+    use super::*;
+
+    fn numbers(tensor: &Tensor) -> Vec<usize> {
+        Vec::<i64>::try_from(tensor).unwrap().into_iter().map(|number| number as usize).collect()
+    }
+
+    fn blocks(tasks: &[usize], count: usize) -> Blocks {
+        match Routing::blocked(tasks, count, Device::Cpu).0 {
+            Some(Routed { way: Way::Blocks(blocks), .. }) => blocks,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn every_unroll_has_a_slot_of_its_own_in_a_block_of_its_task_and_no_shape_depends_on_the_mix(
+            (count, tasks) in (2_usize..5).prop_flat_map(|count| (Just(count), prop::collection::vec(0..count, 1..40))),
+        ) {
+            let Blocks { slots, places, tasks: of_blocks, size } = blocks(&tasks, count);
+            let even = blocks(&vec![0; tasks.len()], count);
+            prop_assert_eq!((slots.size(), of_blocks.size(), size), (even.slots.size(), even.tasks.size(), even.size));
+            let (slots, places, of_blocks) = (numbers(&slots), numbers(&places), numbers(&of_blocks));
+            for (unroll, task) in tasks.iter().enumerate() {
+                prop_assert_eq!(slots[places[unroll]], unroll);
+                prop_assert_eq!(of_blocks[places[unroll] / size as usize], *task);
+            }
+        }
+    }
+
+    #[test]
+    fn half_of_a_batch_of_128_each_costs_an_eighth_more() {
+        let tasks: Vec<usize> = (0..128).map(|unroll| unroll % 2).collect();
+        assert_eq!(blocks(&tasks, 2).slots.size(), [144]);
+    }
+
+    /// Networks of different inputs, and what each makes of all rows.
+    fn networks(store: &tch::nn::VarStore) -> PerTask {
+        let networks = [5_i64, 3].into_iter().enumerate().map(|(task, input)| {
+            let path = store.root() / task;
+            let torso = crate::layers::Torso::new(&path, input, &[8, 7]);
+            let head = crate::layers::linear(&(&path / "head"), torso.output(), 4, 1.0);
+            let linear_path = path.var("linear_path", &[4, input], tch::nn::Init::Randn { mean: 0.0, stdev: 1.0 });
+            Mlp::new(torso, head, Some(linear_path))
+        });
+        PerTask::new(networks.collect())
+    }
+
+    #[test]
+    fn grouped_or_blocked_every_unroll_goes_through_its_own_tasks_network() {
+        let store = tch::nn::VarStore::new(Device::Cpu);
+        let per_task = networks(&store);
+        let (tasks, steps) = ([0, 1, 1, 0, 1, 0, 0, 1, 1, 1, 0], 3);
+        let input = Tensor::randn([11 * steps, 5], (Kind::Float, Device::Cpu));
+        // What is beyond a task's own width is zero in a batch.
+        for (unroll, task) in tasks.iter().enumerate() {
+            if *task == 1 {
+                let _ = input.narrow(0, unroll as i64 * steps, steps).narrow(1, 3, 2).zero_();
+            }
+        }
+        let blocked = per_task.forward(&input, &Routing::blocked(&tasks, 2, Device::Cpu));
+        for (unroll, task) in tasks.iter().enumerate() {
+            let own = |tensor: &Tensor| tensor.narrow(0, unroll as i64 * steps, steps);
+            let network = &per_task.networks[*task];
+            let expected = network.forward(&own(&input).narrow(1, 0, network.input()));
+            assert!((own(&blocked) - &expected).abs().max().double_value(&[]) < 1e-6, "unroll {unroll}");
+        }
+        // Whoever acts has a row for each environment.
+        let rows = input.reshape([11, steps, 5]).select(1, 0);
+        let grouped = per_task.forward(&rows, &Routing::grouped(&tasks, 2));
+        let same = blocked.reshape([11, steps, 4]).select(1, 0);
+        assert!((grouped - same).abs().max().double_value(&[]) < 1e-6);
+    }
+
+    #[test]
+    fn tasks_that_are_not_there_are_left_out() {
+        let store = tch::nn::VarStore::new(Device::Cpu);
+        let per_task = networks(&store);
+        let input = Tensor::randn([4, 5], (Kind::Float, Device::Cpu));
+        let output = per_task.forward(&input, &Routing::grouped(&[1, 1, 1, 1], 2));
+        let expected = per_task.networks[1].forward(&input.narrow(1, 0, 3));
+        assert_eq!((output - expected).abs().max().double_value(&[]), 0.0);
+    }
+}

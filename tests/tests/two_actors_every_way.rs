@@ -1,0 +1,53 @@
+//! One learner and two actors, real processes and real sockets, with every other low level and with two tasks: both
+//! actors' unrolls are trained on, new parameters reach them, and a killed learner goes on from its checkpoint, whatever
+//! was remembered in flight.
+
+use anyhow::{Result, ensure};
+use comic_tests::steps::{
+    LIMIT, SMALL, kill_and_restart_the_learner, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on,
+};
+use comic_tests::system::System;
+
+async fn two_actors_learn(overrides: &[&str]) -> Result<()> {
+    let arguments = overrides.iter().flat_map(|field| ["--set", *field]);
+    let mut system = System::new(&SMALL.into_iter().chain(arguments).collect::<Vec<_>>())?;
+    let begun = system.start_learner(LIMIT).await?;
+    let mut actors = [system.start_actor()?, system.start_actor()?];
+    for actor in &mut actors {
+        actor.until_log_holds("joined the learner", LIMIT).await?;
+    }
+    trains_on(&mut system, "the actors' unrolls are trained on").await?;
+    parameters_arrive(&mut system, "the actors act with new parameters").await?;
+    let resumed = kill_and_restart_the_learner(&mut system).await?;
+    ensure!(resumed.learner_epoch > begun.learner_epoch, "a restarted learner lives in a new epoch");
+    for actor in &mut actors {
+        actor.until_log_holds(&format!("learner_epoch={}", resumed.learner_epoch), LIMIT).await?;
+    }
+    trains_on(&mut system, "training goes on after the restart").await?;
+    for actor in actors {
+        leaves(actor).await?;
+    }
+    the_books_balance_at_the_end(system).await
+}
+
+#[tokio::test]
+async fn with_an_lstm_and_a_recurrent_value_function() -> Result<()> {
+    two_actors_learn(&["network.low_level=lstm", "network.lstm.units=[12, 8]", "network.value_lstm=[8]"]).await
+}
+
+#[tokio::test]
+async fn with_a_mixture_of_primitives() -> Result<()> {
+    two_actors_learn(&["network.low_level=mixture", "network.primitives.torso=[32]", "network.primitives.hidden=16"])
+        .await
+}
+
+#[tokio::test]
+async fn with_a_product_of_primitives_and_no_bottleneck() -> Result<()> {
+    let sizes = ["network.primitives.torso=[32]", "network.primitives.hidden=16", "network.latent.size=0"];
+    two_actors_learn(&[&["network.low_level=product"][..], &sizes].concat()).await
+}
+
+#[tokio::test]
+async fn with_two_tasks() -> Result<()> {
+    two_actors_learn(&[r#"joint=[{task="get-up", probability=0.3}]"#, "get_up.lying_share=0"]).await
+}
