@@ -94,18 +94,17 @@ impl LstmLayer {
     fn forward(&self, input: &Tensor, mut h: Tensor, mut c: Tensor, kept: Option<&Tensor>) -> (Tensor, Tensor, Tensor) {
         let projected = input.apply(&self.input);
         let recurrent = self.recurrent.tr();
-        let steps = projected.size()[0];
-        let mut outputs = Vec::with_capacity(steps as usize);
-        for t in 0..steps {
-            if let Some(kept) = kept {
-                let kept = kept.select(0, t);
+        // Taken apart all at once, so that the gradient is put together once: of a part taken alone it is as large as the
+        // whole, and nearly all zeros.
+        let mut kept = kept.map(|kept| kept.unbind(0).into_iter());
+        let mut outputs = Vec::with_capacity(projected.size()[0] as usize);
+        for projected in projected.unbind(0) {
+            if let Some(kept) = kept.as_mut().and_then(Iterator::next) {
                 (h, c) = (h * &kept, c * kept);
             }
-            let gates = projected.select(0, t).addmm(&h, &recurrent);
-            let [input, forget, output] =
-                [0, 1, 3].map(|gate| gates.narrow(1, gate * self.units, self.units).sigmoid());
-            let cell = gates.narrow(1, 2 * self.units, self.units).tanh();
-            c = (forget * c).addcmul(&input, &cell);
+            let gates = projected.addmm(&h, &recurrent).split(self.units, 1);
+            let [input, forget, output] = [0, 1, 3].map(|gate| gates[gate].sigmoid());
+            c = (forget * c).addcmul(&input, &gates[2].tanh());
             h = output * c.tanh();
             outputs.push(h.shallow_clone());
         }

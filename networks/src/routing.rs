@@ -48,7 +48,7 @@ struct Blocks {
 const BLOCKS: usize = 8;
 
 impl Routing {
-    /// For one task: every network is the only one.
+    /// For one task; of several networks, everything goes through the first.
     pub fn single() -> Self {
         Self(None)
     }

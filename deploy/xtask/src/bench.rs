@@ -37,6 +37,9 @@ struct Figure {
     unit: String,
     floor: f64,
     ratio: f64,
+    /// What else the program says of it.
+    #[serde(flatten)]
+    rest: serde_json::Map<String, serde_json::Value>,
 }
 
 /// Rounds in which our update and PyTorch's take turns.
@@ -60,12 +63,16 @@ pub(crate) fn run(options: &Options) -> Result<()> {
 
 /// Our update and the same update in Python PyTorch, by turns, so that a busy moment of the machine meets both.
 fn learner(threads: u16, arguments: &[String]) -> Result<()> {
+    // The other script knows the MLP alone.
+    let compares = !arguments.iter().any(|argument| argument.starts_with("--low-level") || argument == "--joint");
     let mut ours = Vec::new();
     let mut theirs = Vec::new();
     for _ in 0..ROUNDS {
         let mut bench = Command::new(workspace::program("comic-learner")?);
         ours.push(figures(bench.args(["bench", "--threads", &threads.to_string()]).args(arguments))?);
-        theirs.push(pytorch(threads)?);
+        if compares {
+            theirs.push(pytorch(threads)?);
+        }
     }
     let Some(first) = ours.first() else { return Ok(()) };
     let mut lines = Vec::new();
@@ -75,10 +82,12 @@ fn learner(threads: u16, arguments: &[String]) -> Result<()> {
         let (value, floor) = (of_rounds(|figure| figure.value), of_rounds(|figure| figure.floor));
         lines.push(Figure { value, floor, ratio: value / floor, ..figure.clone() });
     }
-    let update = lines.iter().find(|figure| figure.figure == "learner.update");
-    let update = update.context("comic-learner bench printed no learner.update")?.clone();
-    let floor = median(theirs);
-    lines.push(Figure { figure: "learner.pytorch".into(), floor, ratio: update.value / floor, ..update });
+    if compares {
+        let update = lines.iter().find(|figure| figure.figure == "learner.update");
+        let update = update.context("comic-learner bench printed no learner.update")?.clone();
+        let floor = median(theirs);
+        lines.push(Figure { figure: "learner.pytorch".into(), floor, ratio: update.value / floor, ..update });
+    }
     show(&lines)
 }
 
