@@ -23,8 +23,7 @@ impl Process {
     /// Starts `command`; both its outputs are appended to `log`.
     pub(super) fn start(name: impl Into<String>, command: &mut Command, log: PathBuf) -> Result<Self> {
         let name = name.into();
-        let output = OpenOptions::new().create(true).append(true).open(&log);
-        let output = output.with_context(|| format!("cannot write {}", log.display()))?;
+        let output = append(&log)?;
         let log_start = output.metadata().map_or(0, |metadata| metadata.len());
         let child = command
             .stdin(Stdio::null())
@@ -93,6 +92,12 @@ impl Drop for Process {
             self.wait(Duration::from_secs(10));
         }
     }
+}
+
+/// A log to write to, after whatever it holds.
+pub(super) fn append(log: &Path) -> Result<File> {
+    let file = OpenOptions::new().create(true).append(true).open(log);
+    file.with_context(|| format!("cannot write {}", log.display()))
 }
 
 /// Reads a file that grows, line by line.
