@@ -92,11 +92,15 @@ impl Display {
             self.event("unreadable metrics", &[("line", text.to_owned())]);
             return;
         };
+        let ticks = (self.share(&line) * TICKS) as u64;
         match &self.sight {
-            Sight::Panel(bar) | Sight::Row(bar) => {
-                let alone = self.name.is_none();
-                bar.set_message(if alone { panel_text(&line) } else { row_text(&line) });
-                bar.set_position((self.share(&line) * TICKS) as u64);
+            Sight::Panel(panel) => {
+                panel.set_message(panel_text(&line));
+                panel.set_position(ticks);
+            }
+            Sight::Row(row) => {
+                row.set_message(row_text(&line));
+                row.set_position(ticks);
             }
             Sight::Text | Sight::Lines => {
                 let facts = serde_json::from_str::<Map<String, Value>>(text).unwrap_or_default();

@@ -130,7 +130,7 @@ impl Job {
         self.directory.make()?;
         // Chosen only now: the build takes minutes, and a port that was free before it may be taken.
         let port = self.port.map_or_else(free_port, Ok)?;
-        display.event("starting", &[("run", self.path().display().to_string()), ("port", port.to_string())]);
+        display.event("starting", &[("directory", self.path().display().to_string()), ("port", port.to_string())]);
         let outcome = Supervisor::start(self, port, display, interrupt).and_then(|mut supervisor| {
             let outcome = supervisor.watch(display, interrupt);
             supervisor.stop(display);
