@@ -45,7 +45,7 @@ pub(crate) fn run(options: Options) -> Result<()> {
         }
         run.job.evaluate(display, &interrupt).map(drop)
     });
-    println!("{}\nkept in {}", table::markdown(&sweep.rows()), sweep.directory.display());
+    println!("\n{}\nkept in {}", table::markdown(&sweep.rows()), sweep.directory.display());
     ended
 }
 
