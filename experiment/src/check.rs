@@ -336,6 +336,9 @@ fn together(experiment: &Experiment) -> Result<(), Fault> {
     let holds = vmpo.value_burn_in == 0 || !network.value_lstm.is_empty();
     let remedy = "wakes a recurrent value function, and network.value_lstm names none: set one of the two";
     ensure("vmpo.value_burn_in", vmpo.value_burn_in, holds, remedy)?;
+    let demonstrates = experiment.tasks().iter().any(|(task, _)| *task == TaskName::Tracking);
+    let holds = warm_start.steps == 0 || demonstrates;
+    ensure("warm_start.steps", warm_start.steps, holds, "must be 0 without tracking, whose reference is demonstrated")?;
     // A product's mean hangs on its primitives' deviations, which a regression on the mean alone would ruin.
     let holds = warm_start.steps == 0 || network.low_level != LowLevelName::Product;
     ensure("warm_start.steps", warm_start.steps, holds, "must be 0 with network.low_level = \"product\"")

@@ -6,7 +6,7 @@
 //! - [`presets`] holds the built-in documents.
 //! - [`resolve`] turns a preset or a file plus `--set key=value` overrides into an [`Experiment`],
 //!   refusing unknown fields with the nearest known name.
-//!
+//! - [`find_field`] knows a field by the end of its name, [`Experiment::difference`] the field in which two differ.
 //! - [`TaskSpec`] is what networks, wire and learner know of a task: sizes and names.
 //!
 //! Every default is the paper's: (S) the CoMic supplement, (V) V-MPO, (D) a decision of this project where both are
@@ -14,6 +14,7 @@
 
 mod check;
 mod document;
+mod fields;
 mod lines;
 mod network;
 pub mod presets;
@@ -22,6 +23,7 @@ mod spec;
 mod tasks;
 
 pub use document::*;
+pub use fields::{Difference, find_field, nearest};
 pub use network::*;
 pub use resolve::{Error, resolve};
 pub use spec::*;

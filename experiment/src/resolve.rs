@@ -4,7 +4,9 @@ use std::path::Path;
 
 use toml::{Table, Value};
 
-use crate::{Complement, Experiment, TaskName, check::check, lines::line_of, presets};
+use crate::{
+    ClipSource, Complement, Experiment, TaskName, check::check, fields::nearest, lines::line_of, presets,
+};
 
 /// Why a document is not an experiment.
 #[derive(Debug, thiserror::Error)]
@@ -37,6 +39,16 @@ pub enum Error {
         field: String,
         /// "; did you mean `…`?", or the names known there.
         hint: String,
+    },
+    /// The end of several fields' names.
+    #[error("{origin}: `{field}` could be {candidates}: write one of them")]
+    AmbiguousField {
+        /// Where it stands.
+        origin: String,
+        /// As it was written.
+        field: String,
+        /// The fields it could be.
+        candidates: String,
     },
     /// `--set` without `=`.
     #[error("--set {argument}: expected FIELD=VALUE, for instance --set vmpo.epsilon_eta=0.2")]
@@ -79,6 +91,15 @@ pub fn resolve(document: &str, overrides: &[String]) -> Result<Experiment, Error
 }
 
 impl Experiment {
+    /// The same experiment on `sources` in the command line's form, [`ClipSource::parse`]; on its own clips if empty.
+    #[must_use]
+    pub fn with_clips(mut self, sources: &[String]) -> Self {
+        if !sources.is_empty() {
+            self.clips = sources.iter().map(|source| ClipSource::parse(source)).collect();
+        }
+        self
+    }
+
     /// Reads a resolved document, for instance one that came over the wire. `origin` names it in errors.
     ///
     /// # Errors
@@ -98,6 +119,10 @@ impl Experiment {
     /// [`Error::Malformed`] when a number is beyond what TOML can write.
     pub fn to_toml(&self) -> Result<String, Error> {
         toml::to_string(self).map_err(|error| malformed("experiment", &error))
+    }
+
+    pub(crate) fn to_table(&self) -> Result<Table, Error> {
+        Table::try_from(self).map_err(|error| malformed("experiment", &error))
     }
 }
 
@@ -155,7 +180,7 @@ fn refuse_unknown(table: &Table) -> Result<(), Unknown> {
 }
 
 /// The default document with every optional field present.
-fn vocabulary() -> Result<Table, toml::ser::Error> {
+pub(crate) fn vocabulary() -> Result<Table, toml::ser::Error> {
     let complement = Complement { task: TaskName::GetUp, probability: 0.1 };
     let mut everything = Experiment { joint: vec![complement], ..Experiment::default() };
     for clip in &mut everything.clips {
@@ -188,18 +213,14 @@ fn refuse_unknown_in(prefix: &str, table: &Table, known: &Table, everything: &Ta
     Ok(())
 }
 
-fn join(prefix: &str, key: &str) -> String {
+pub(crate) fn join(prefix: &str, key: &str) -> String {
     if prefix.is_empty() { key.to_string() } else { format!("{prefix}.{key}") }
 }
 
 /// The same name in another section, else the nearest in this one, else all names of this one.
 fn hint(prefix: &str, key: &str, known: &Table, everything: &Table) -> String {
-    /// Jaro-Winkler similarity from which a name is taken for a misspelling.
-    const SIMILAR: f64 = 0.7;
-    let similarity = |name: &&String| strsim::jaro_winkler(name, key);
-    let nearest = known.keys().max_by(|a, b| similarity(a).total_cmp(&similarity(b)));
     let meant = elsewhere("", key, everything)
-        .or_else(|| nearest.filter(|name| similarity(name) > SIMILAR).map(|name| join(prefix, name)));
+        .or_else(|| nearest(key, known.keys().map(String::as_str)).map(|name| join(prefix, name)));
     match meant {
         Some(path) => format!("; did you mean `{path}`?"),
         None => format!("; known here are {}", known.keys().cloned().collect::<Vec<_>>().join(", ")),

@@ -24,7 +24,7 @@ pub struct TaskSpec {
     /// Length of the proprioception vector.
     pub proprioception: usize,
     /// Length of the task observation vector (for tracking, the references); in joint training the longest, and zeros
-    /// follow a shorter one.
+    /// stand before a shorter one.
     pub task: usize,
     /// Bytes of an image of what the humanoid sees: 64 rows of 64 pixels of red, green and blue; 0 when it is blind.
     pub image: usize,
@@ -44,12 +44,14 @@ pub struct TaskSpec {
 pub struct TaskPart {
     /// The task's name.
     pub name: String,
-    /// Length of its observation: the first so many entries of the task observation vector.
+    /// Length of its observation: the last so many entries of the task observation vector.
     pub observation: usize,
     /// Number of its clips.
     pub clips: usize,
     /// The most a step of it can pay: what normalised rewards are relative to.
     pub max_reward: f64,
+    /// Whether it has a reference, whose servo action is a demonstration.
+    pub demonstrated: bool,
 }
 
 /// Reward terms of go-to-target.
@@ -148,7 +150,13 @@ impl TaskSpec {
             image: 0,
             action: ACTION_SIZE,
             reward_terms: terms.iter().map(|term| (*term).to_string()).collect(),
-            tasks: vec![TaskPart { name, observation, clips: clips.len(), max_reward }],
+            tasks: vec![TaskPart {
+                demonstrated: name == TaskName::Tracking.name(),
+                name,
+                observation,
+                clips: clips.len(),
+                max_reward,
+            }],
             clips,
         }
     }

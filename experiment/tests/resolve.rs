@@ -2,8 +2,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
 
 use comic_experiment::{
-    ClipSource, Error, Experiment, InitialPose, LowLevelName, Prior, TRACKING_OBSERVATIONS, TerminationError, presets,
-    resolve,
+    ClipSource, Difference, Error, Experiment, InitialPose, LowLevelName, Prior, TRACKING_OBSERVATIONS, TaskName,
+    TaskSpec, TerminationError, find_field, presets, resolve,
 };
 use proptest::prelude::*;
 
@@ -77,6 +77,51 @@ fn the_other_low_levels_presets_are_the_papers() {
     assert_eq!(of("tracking-lstm"), (LowLevelName::Lstm, 0.1, 0.1, 1e-5, 1e-3, (60, 5e-4, false)));
     assert_eq!(of("tracking-mixture"), (LowLevelName::Mixture, 0.1, 0.1, 1e-3, 1e-3, (0, 5e-4, true)));
     assert_eq!(of("tracking-product"), (LowLevelName::Product, 0.1, 0.1, 1e-3, 1e-3, (60, 5e-4, false)));
+}
+
+#[test]
+fn the_joint_presets_have_the_papers_probabilities() {
+    let of = |preset: &str| resolve(preset, &[]).unwrap().tasks();
+    assert_eq!(of("joint-get-up"), [(TaskName::Tracking, 0.9), (TaskName::GetUp, 0.1)]);
+    assert_eq!(of("joint-ball"), [(TaskName::Tracking, 0.8), (TaskName::BallCatch, 0.2)]);
+}
+
+#[test]
+fn joint_tasks_that_make_no_sense_are_refused() {
+    let refused = |joint: &str, other: &str| {
+        let overrides = [format!("joint=[{joint}]"), other.to_string()];
+        resolve("quickstart", &overrides).unwrap_err().to_string()
+    };
+    let get_up = r#"{task="get-up", probability=0.1}"#;
+    for (joint, other, field) in [
+        (r#"{task="tracking", probability=0.1}"#, "seed=1", "joint.0.task"),
+        (&format!("{get_up}, {get_up}"), "seed=1", "joint.1.task"),
+        (r#"{task="get-up", probability=0}"#, "seed=1", "joint.0.probability"),
+        (r#"{task="get-up", probability=1}"#, "seed=1", "joint.0.probability"),
+        (r#"{task="get-up", probability=nan}"#, "seed=1", "joint.0.probability"),
+        (r#"{task="get-up", probability=0.5}, {task="ball-catch", probability=0.5}"#, "seed=1", "joint"),
+        (r#"{task="gaps", probability=0.5}"#, "seed=1", "gaps.corridor.vision"),
+        (get_up, "network.value_lstm=[8]", "network.value_lstm"),
+        (r#"{task="get-up", probability=0.1}"#, "task=go-to-target", "warm_start.steps"),
+    ] {
+        let error = refused(joint, other);
+        assert!(error.contains(field), "{joint}, {other}: {error}");
+    }
+    resolve("quickstart", &[r#"joint=[{task="gaps", probability=0.5}]"#.into(), "gaps.corridor.vision=off".into()]).unwrap();
+    let error = resolve("quickstart", &[r#"joint=[{task="get-up", probabilty=0.1}]"#.into()]).unwrap_err().to_string();
+    assert!(error.contains("joint.0.probability"), "{error}");
+}
+
+#[test]
+fn a_clip_belongs_to_the_task_it_was_listed_with() {
+    let experiment = resolve("joint-ball", &[]).unwrap();
+    let spec = TaskSpec::new(&experiment, vec!["walk".into(), "run".into()]).unwrap();
+    assert_eq!(spec.clips, ["walk", "run", "ball-catch"]);
+    assert_eq!([0, 1, 2].map(|clip| spec.task_of(clip)), [0, 0, 1]);
+    let ball = &experiment.ball_catch;
+    let most = 2.0 * ball.touch_reward + ball.standing_reward + ball.walking_reward;
+    assert_eq!([0, 1, 2].map(|clip| spec.max_reward(clip)), [1.45, 1.45, most]);
+    assert_eq!((spec.reward_terms.len(), spec.task), (1, TaskSpec::tracking(&experiment.tracking, Vec::new()).unwrap().task));
 }
 
 #[test]
@@ -289,6 +334,49 @@ fn an_override_of_the_wrong_type_names_itself_and_the_field() {
     assert!(message.starts_with("--set unroll.length=1.5: invalid type: floating point"), "{message}");
     let message = refused("name.first=x");
     assert!(message.starts_with("--set name.first=x: invalid type: map"), "{message}");
+}
+
+// Names and differences
+
+#[test]
+fn a_field_is_known_by_the_end_of_its_name_where_no_other_ends_like_it() {
+    for (name, field) in [
+        ("network.latent.beta", "network.latent.beta"),
+        ("latent.beta", "network.latent.beta"),
+        ("beta", "network.latent.beta"),
+        ("clips.0.weight", "clips.0.weight"),
+        ("latent.initial_std", "network.latent.initial_std"),
+    ] {
+        assert_eq!(find_field("sweep.toml", name).unwrap(), field);
+    }
+}
+
+#[test]
+fn the_end_of_several_names_is_refused_with_all_of_them() {
+    assert_eq!(
+        find_field("sweep.toml", "initial_std").unwrap_err().to_string(),
+        "sweep.toml: `initial_std` could be `network.initial_std` or `network.latent.initial_std`: write one of them"
+    );
+}
+
+#[test]
+fn the_end_of_no_name_is_refused_with_the_nearest() {
+    for (name, nearest) in [("latent.bata", "network.latent.beta"), ("epsilon_etaa", "vmpo.epsilon_eta")] {
+        assert_eq!(
+            find_field("sweep.toml", name).unwrap_err().to_string(),
+            format!("sweep.toml: unknown field `{name}`; did you mean `{nearest}`?")
+        );
+    }
+}
+
+#[test]
+fn experiments_differ_by_name_and_both_values() {
+    let [ours, theirs] = ["1e-3", "0.5"].map(|beta| set(&[&format!("network.latent.beta={beta}")]).unwrap());
+    assert_eq!(ours.difference(&ours).unwrap(), None);
+    let expected = Difference { field: "network.latent.beta".into(), ours: "0.001".into(), theirs: "0.5".into() };
+    assert_eq!(ours.difference(&theirs).unwrap(), Some(expected));
+    let theirs = ours.clone().with_clips(&["builtin:run".into()]);
+    assert_eq!(ours.difference(&theirs).unwrap().unwrap().field, "clips");
 }
 
 // Values

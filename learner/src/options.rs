@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context as _, Result};
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use comic_experiment::{ClipSource, Experiment, LowLevelName};
+use comic_experiment::{Experiment, LowLevelName};
 
 /// Learns reusable motor skills from the experience that comic-actor processes stream to it.
 #[derive(Debug, Parser)]
@@ -54,12 +54,9 @@ impl Document {
     /// # Errors
     /// Names the file, field and remedy.
     pub fn resolve(&self) -> Result<Experiment> {
-        let mut experiment = comic_experiment::resolve(&self.preset, &self.overrides)
+        let experiment = comic_experiment::resolve(&self.preset, &self.overrides)
             .with_context(|| format!("the experiment `{}` is not usable", self.preset))?;
-        if !self.clips.is_empty() {
-            experiment.clips = self.clips.iter().map(|source| ClipSource::parse(source)).collect();
-        }
-        Ok(experiment)
+        Ok(experiment.with_clips(&self.clips))
     }
 }
 

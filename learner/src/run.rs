@@ -9,7 +9,7 @@ use std::time::Duration;
 use anyhow::{Context as _, Result, anyhow, bail};
 use bytes::Bytes;
 use comic_clips::Catalogue;
-use comic_experiment::{Experiment, InitialPose, TaskSpec};
+use comic_experiment::{Difference, Experiment, InitialPose, TaskSpec};
 use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
 use comic_replay::{Batcher, Config, Ledger, Phase};
@@ -164,23 +164,22 @@ fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shar
 /// A run goes on only as the experiment it was; how long, how often and with how many threads may change.
 fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot) -> Result<()> {
     let then = Experiment::from_toml("experiment.toml of the checkpoint", snapshot.text("experiment.toml")?)?;
-    let comparable = |experiment: &Experiment| {
-        let mut experiment = experiment.clone();
-        experiment.budget = then.budget.clone();
-        experiment.learner = then.learner.clone();
-        experiment.actor = then.actor.clone();
-        experiment.to_toml()
+    let now = Experiment {
+        budget: then.budget.clone(),
+        learner: then.learner.clone(),
+        actor: then.actor.clone(),
+        ..now.clone()
     };
-    let (now, then) = (comparable(now)?, then.to_toml()?);
-    if let Some((new, old)) = now.lines().zip(then.lines()).find(|(new, old)| new != old) {
+    if let Some(Difference { field, ours, theirs }) = then.difference(&now)? {
         return Err(Misuse(format!(
-            "it was made with `{old}` where the experiment now says `{new}`: give another --run, or the old value"
+            "it was made with `{field} = {ours}` where the experiment now says `{theirs}`: give another --run, or the \
+             old value"
         ))
         .into());
     }
     let clips: TaskSpec = serde_json::from_slice(snapshot.part("task.json")?)?;
-    if now != then || clips != *spec {
-        return Err(Misuse("it was made by an experiment with other clips or fields: give another --run".into()).into());
+    if clips != *spec {
+        return Err(Misuse("it was made when the same sources held other clips: give another --run".into()).into());
     }
     Ok(())
 }

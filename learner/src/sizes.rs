@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn joint_training_shares_the_low_level_and_doubles_the_rest() {
+    fn joint_training_shares_the_low_level_and_adds_the_rest() {
         let of = |preset: &str| count(&comic_experiment::resolve(preset, &[]).unwrap()).unwrap();
         let (alone, joint) = (of("tracking-mlp"), of("joint-get-up"));
         assert_eq!(alone["low level"], joint["low level"]);

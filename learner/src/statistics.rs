@@ -10,6 +10,8 @@ use tch::{Kind, Tensor};
 /// Of proprioception, which every task shares, and of each task's own observation.
 #[derive(Debug)]
 pub struct ObservationStatistics {
+    /// Rows of the batches seen, whatever stands in them.
+    rows: f64,
     proprioception: Statistics,
     /// By the task's name.
     tasks: Vec<(String, Statistics)>,
@@ -20,25 +22,34 @@ impl ObservationStatistics {
     pub fn new(spec: &TaskSpec) -> Self {
         let of_task = |name: &String| (name.clone(), Statistics::new(spec.task as i64));
         Self {
+            rows: 0.0,
             proprioception: Statistics::new(spec.proprioception as i64),
             tasks: spec.tasks.iter().map(|task| of_task(&task.name)).collect(),
         }
     }
 
-    /// Rows seen.
-    pub fn count(&self) -> f64 {
-        self.proprioception.count()
+    /// Rows of the batches seen. A count of rows, not of steps: the difference is one row in an unroll, and padding.
+    pub fn rows(&self) -> f64 {
+        self.rows
+    }
+
+    /// Whether there is nothing yet by which one of these tasks could be normalised.
+    pub fn lacks(&self, tasks: &[usize]) -> bool {
+        tasks.iter().any(|task| self.tasks.get(*task).is_some_and(|(_, statistics)| statistics.count() == 0.0))
     }
 
     /// Adds the observations of a batch whose unrolls are of these tasks.
     ///
-    /// A row that begins an episode counts only where a step follows it: the others may be padding.
+    /// Where there are several tasks, a row that begins an episode counts only if a step follows it: the others may be
+    /// padding.
     pub fn absorb(&mut self, batch: &Batch, tasks: &[usize]) {
         let length = batch.layout.shape().length;
         let (valid, first) = (batch.f32(Field::Valid), batch.f32(Field::First));
+        let alone = self.tasks.len() == 1;
         let is_seen = |unroll: usize, t: usize| {
-            first[unroll * (length + 1) + t] == 0.0 || (t < length && valid[unroll * length + t] == 1.0)
+            alone || first[unroll * (length + 1) + t] == 0.0 || (t < length && valid[unroll * length + t] == 1.0)
         };
+        self.rows += first.len() as f64;
         let observations =
             |field: Field| Tensor::from_slice(batch.f32(field)).reshape([-1, batch.layout.width(field) as i64]);
         let (proprioception, task) = (observations(Field::Proprioception), observations(Field::Task));
@@ -74,7 +85,8 @@ impl ObservationStatistics {
 
     /// As tensors, for a checkpoint.
     pub fn state(&self) -> Vec<(String, Tensor)> {
-        self.named().flat_map(|(name, statistics)| statistics.state(&name)).collect()
+        let rows = (ROWS.to_string(), Tensor::from(self.rows));
+        std::iter::once(rows).chain(self.named().flat_map(|(name, statistics)| statistics.state(&name))).collect()
     }
 
     /// Restores what [`state`](Self::state) gave, and takes it out of `tensors`.
@@ -83,6 +95,8 @@ impl ObservationStatistics {
     /// When a tensor is missing or of another shape.
     pub fn restore(&mut self, tensors: &mut Vec<(String, Tensor)>) -> Result<()> {
         let find = |wanted: &str| tensors.iter().find(|(name, _)| name == wanted).map(|(_, tensor)| tensor.copy());
+        let rows = find(ROWS).and_then(|rows| f64::try_from(rows).ok());
+        self.rows = rows.with_context(|| format!("the checkpoint has no {ROWS}"))?;
         let named = std::iter::once((PROPRIOCEPTION.to_string(), &mut self.proprioception))
             .chain(self.tasks.iter_mut().map(|(task, statistics)| (of_task(task), statistics)));
         for (name, statistics) in named {
@@ -100,6 +114,7 @@ impl ObservationStatistics {
 
 /// How the names of statistics begin in a checkpoint.
 const PREFIX: &str = "statistics.";
+const ROWS: &str = "statistics.rows";
 const PROPRIOCEPTION: &str = "statistics.proprioception";
 
 fn of_task(task: &str) -> String {
@@ -165,5 +180,102 @@ impl Statistics {
         }
         *self = Self { count, sum, squares };
         Some(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use comic_experiment::{TaskPart, resolve};
+    use comic_proto::v1::UnrollHeader;
+    use comic_proto::{UnrollBuffer, UnrollLayout, UnrollShape};
+
+    use super::*;
+
+    /// Two tasks of one clip each.
+    fn spec() -> TaskSpec {
+        let part = |name: &str| TaskPart {
+            name: name.into(),
+            observation: 1,
+            clips: 1,
+            max_reward: 1.0,
+            demonstrated: name == "tracking",
+        };
+        TaskSpec {
+            proprioception: 1,
+            task: 1,
+            action: 1,
+            reward_terms: vec!["reward".into()],
+            clips: vec!["walk".into(), "get-up".into()],
+            tasks: vec![part("tracking"), part("get-up")],
+            ..TaskSpec::default()
+        }
+    }
+
+    /// Unrolls of three steps: tracking's observations are 1, 2, 3, 2; getting up's 10 and 30, and then padding.
+    fn batch(spec: &TaskSpec) -> Batch {
+        let mut experiment = resolve("tracking-mlp", &["unroll.length=3".into()]).unwrap();
+        experiment.network.latent.size = 1;
+        let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, &experiment)));
+        let unroll = |observations: [f32; 4], clip: u32, padded: bool| {
+            let mut unroll = UnrollBuffer::new(&layout);
+            for (t, observation) in observations.into_iter().enumerate() {
+                unroll.row_mut(Field::Proprioception, t)[0] = observation;
+                unroll.row_mut(Field::Task, t)[0] = observation;
+                unroll.set_clip(t, clip);
+            }
+            unroll.row_mut(Field::Valid, 0)[0] = 1.0;
+            for t in 1..3 {
+                unroll.row_mut(Field::Valid, t)[0] = if padded { 0.0 } else { 1.0 };
+                unroll.row_mut(Field::First, t + 1)[0] = if padded { 1.0 } else { 0.0 };
+            }
+            (UnrollHeader::default(), unroll.into_bytes())
+        };
+        let unrolls = [unroll([1.0, 2.0, 3.0, 2.0], 0, false), unroll([10.0, 30.0, 99.0, 99.0], 1, true)];
+        Batch::assemble(layout.clone(), unrolls).unwrap()
+    }
+
+    #[test]
+    fn every_task_has_its_own_mean_and_padding_counts_nowhere() {
+        let spec = spec();
+        let mut statistics = ObservationStatistics::new(&spec);
+        assert!(statistics.lacks(&[1]));
+        statistics.absorb(&batch(&spec), &[0, 1]);
+        let normaliser = statistics.to_normaliser().unwrap();
+        assert_eq!(normaliser.task_mean, [2.0, 20.0]);
+        assert!((normaliser.proprioception_mean[0] - 8.0).abs() < 1e-5, "{normaliser:?}");
+        assert_eq!(statistics.rows(), 8.0, "rows are counted whatever stands in them");
+        assert!(!statistics.lacks(&[0, 1]));
+    }
+
+    #[test]
+    fn a_checkpoint_brings_them_back() {
+        let spec = spec();
+        let mut statistics = ObservationStatistics::new(&spec);
+        statistics.absorb(&batch(&spec), &[0, 1]);
+        let mut state = statistics.state();
+        state.push(("policy".into(), Tensor::from(1.0)));
+        let mut restored = ObservationStatistics::new(&spec);
+        restored.restore(&mut state).unwrap();
+        assert_eq!(restored.to_normaliser().unwrap(), statistics.to_normaliser().unwrap());
+        assert_eq!((restored.rows(), state.len()), (8.0, 1), "what is somebody else's is left");
+        let error = restored.restore(&mut Vec::new()).unwrap_err().to_string();
+        assert!(error.contains("statistics.rows"), "{error}");
+    }
+
+    #[test]
+    fn the_metrics_count_every_tasks_steps_and_padding() {
+        let (spec, run) = (spec(), tempfile::tempdir().unwrap());
+        let mut metrics = crate::metrics::Metrics::open(run.path(), &spec).unwrap();
+        assert_eq!(metrics.count_steps(&batch(&spec), &[0, 1]), 4);
+        let position = crate::metrics::Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
+        let line = metrics.write(position, serde_json::Value::Null, serde_json::Map::new()).unwrap();
+        let line: serde_json::Value = serde_json::from_str(&line).unwrap();
+        assert_eq!(line["tasks"]["tracking"]["environment_steps"], 3);
+        assert_eq!(line["tasks"]["get-up"]["environment_steps"], 1);
+        // Its second row is the episode's last observation, and no padding.
+        assert_eq!(line["tasks"]["get-up"]["padding_share"], 1.0 / 3.0);
+        assert_eq!(line["tasks"]["tracking"]["padding_share"], 0.0);
     }
 }

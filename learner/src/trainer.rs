@@ -184,12 +184,12 @@ impl Trainer {
     /// One batch: gradient steps on it, its books, and new parameters when they are due.
     fn learn(&mut self, batch: Batch) -> Result<()> {
         let tensors = self.tensors(&batch)?;
-        if self.normalises_still() {
-            let unseen = self.statistics.count() == 0.0;
+        let unseen = self.normalises() && self.statistics.lacks(&tasks_of_unrolls(&batch, &self.spec));
+        if unseen || self.normalises_still() {
             self.absorb(&batch);
             self.set_normaliser()?;
             if unseen {
-                // Numbers of any size would teach the networks nothing: the first batch only sets the scale.
+                // Numbers of any size would teach the networks nothing: a task's first batch only sets the scale.
                 // What was made before acts on another scale.
                 self.oldest = self.progress.version + 1;
                 self.publish(Behaviour::Policy)?;
@@ -311,9 +311,12 @@ impl Trainer {
         self.publisher.publish(version, behaviour, self.target.clone());
     }
 
+    fn normalises(&self) -> bool {
+        self.experiment.network.normaliser_steps > 0
+    }
+
     fn normalises_still(&self) -> bool {
-        // A count of rows, not of steps: the difference is one row in an unroll.
-        self.statistics.count() < self.experiment.network.normaliser_steps as f64
+        self.statistics.rows() < self.experiment.network.normaliser_steps as f64
     }
 
     pub(crate) fn absorb(&mut self, batch: &Batch) {

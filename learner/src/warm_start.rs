@@ -50,7 +50,14 @@ impl Trainer {
         while (demonstrations.len() as u64) < wanted {
             match self.next_batch()? {
                 Wait::Batch(batch) => {
-                    demonstrations.push(self.tensors(&batch)?);
+                    let tensors = self.tensors(&batch)?;
+                    // What has no reference has nothing to demonstrate: holding still is no example.
+                    let shows = |task: &usize| self.spec.tasks.get(*task).is_some_and(|task| task.demonstrated);
+                    let shown: Vec<usize> =
+                        (0..batch.unrolls).filter(|unroll| tensors.tasks().get(*unroll).is_some_and(shows)).collect();
+                    if !shown.is_empty() {
+                        demonstrations.push(tensors.select(&shown));
+                    }
                     self.absorb(&batch);
                     self.metrics.absorb(batch.headers(), 0);
                     self.book(batch);

@@ -6,7 +6,7 @@ mod vmpo_support;
 
 use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives};
 use comic_learner::vmpo::{MinibatchTensors, VmpoLearner};
-use comic_networks::{Memory, Routing};
+use comic_networks::{Memory, NormaliserStatistics, Routing};
 use tch::Tensor;
 use vmpo_support::{LENGTH, Numbers, Unrolls, difference, joint_spec, learner_of, state};
 
@@ -46,7 +46,7 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
     }
     for (row, observation) in unrolls.task.chunks_exact_mut(WIDTHS.0).enumerate() {
         if TASKS[row / (LENGTH + 1)] == 1 {
-            observation[WIDTHS.1..].fill(0.0);
+            observation[..WIDTHS.0 - WIDTHS.1].fill(0.0);
         }
     }
     // Unroll 1 ends its episode in row 4, and the next one's is another task's.
@@ -118,6 +118,35 @@ fn acting_step_by_step_is_learning_on_the_whole_unroll() {
             assert!(kl.abs() < 1e-5, "{}: {metrics:?}", experiment.network.low_level);
         }
     }
+}
+
+#[test]
+fn every_tasks_observations_are_normalised_by_its_own_statistics() {
+    let mut experiment = vmpo_support::experiment();
+    experiment.network.normaliser_steps = 1;
+    let statistics = |second: f32| NormaliserStatistics {
+        proprioception_mean: vec![0.1; 5],
+        proprioception_std: vec![0.8; 5],
+        task_mean: [[0.2; 4], [second; 4]].concat(),
+        task_std: [[0.5; 4], [2.0; 4]].concat(),
+    };
+    let mut learner = learner(&experiment);
+    learner.set_normaliser(&statistics(-0.3)).unwrap();
+    let unrolls = unrolls(&learner, &experiment, 7);
+    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_metrics();
+    assert!(metrics.kl_mean.abs() < 1e-5, "acting and learning take the same ones: {metrics:?}");
+    let mut other = self::learner(&experiment);
+    other.set_normaliser(&statistics(0.9)).unwrap();
+    let of_tracking = |learner: &VmpoLearner| {
+        let changed = self::unrolls(learner, &experiment, 7);
+        let width = changed.mean.len() / COUNT;
+        (changed.mean[..width].to_vec(), changed.mean[width..2 * width].to_vec())
+    };
+    let mut same = self::learner(&experiment);
+    same.set_normaliser(&statistics(-0.3)).unwrap();
+    let ((first, second), (first_moved, second_moved)) = (of_tracking(&same), of_tracking(&other));
+    assert_eq!(first, first_moved, "getting up's statistics are nothing to tracking");
+    assert_ne!(second, second_moved);
 }
 
 #[test]

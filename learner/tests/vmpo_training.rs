@@ -87,7 +87,7 @@ fn a_state_holds_everything_that_is_trained() {
         assert!(names.contains(&format!("policy.{name}")));
         assert_eq!(names.contains(&format!("adam.first.policy.{name}")), tensor.requires_grad(), "{name}");
     }
-    assert!(names.iter().any(|name| name == "value.clip_embedding"));
+    assert!(names.iter().any(|name| name == "value.tracking.clip_embedding"));
 }
 
 /// A task of one step: the nearer the action to a target, the higher the reward.

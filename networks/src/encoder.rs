@@ -7,7 +7,7 @@ use crate::DiagonalGaussian;
 use crate::layers::{GaussianHeadConfig, Mlp, Torso, gaussian, linear};
 use crate::routing::{PerTask, Routing};
 
-/// q(z_t | x_t, s_t, z_{t−1}), one for each task: `[s, z_{t−1}, x]` → torso → mean and σ of z, with an optional linear path
+/// q(z_t | x_t, s_t, z_{t−1}), one for each task: `[x, s, z_{t−1}]` → torso → mean and σ of z, with an optional linear path
 /// from input to output whose weights start at 0 (CoMic supplement 2.1).
 ///
 /// Without a bottleneck, which mixture and product may do without, it gives the K weights' logits in z's place and knows
@@ -62,7 +62,7 @@ impl Encoder {
         Self { networks: PerTask::new(networks.collect()), head }
     }
 
-    /// `input [N, P+Z+X]`, `noise [N, Z]`.
+    /// `input [N, X+P+Z]`, `noise [N, Z]`.
     pub(crate) fn forward(&self, input: &Tensor, noise: &Tensor, routing: &Routing) -> Encoded {
         let output = self.networks.forward(input, routing);
         match self.head {

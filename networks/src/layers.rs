@@ -36,17 +36,14 @@ pub(crate) struct Torso {
 impl Torso {
     /// `sizes` holds at least one entry; the experiment file's check refuses an empty list.
     pub(crate) fn new(path: &nn::Path, input: i64, sizes: &[usize]) -> Self {
-        let mut width = input;
-        let layers = sizes
-            .iter()
-            .enumerate()
-            .map(|(index, size)| {
-                let layer = linear(&(path / "layers" / index), width, *size as i64, 1.0);
-                width = *size as i64;
-                layer
-            })
-            .collect();
         let first = sizes.first().map_or(input, |size| *size as i64);
+        let mut width = first;
+        let mut layers = Vec::new();
+        for (index, size) in sizes.iter().enumerate().skip(1) {
+            layers.push(linear(&(path / "layers" / index), width, *size as i64, 1.0));
+            width = *size as i64;
+        }
+        layers.insert(0, linear(&(path / "layers" / 0), input, first, 1.0));
         let norm = path / "norm";
         let norm =
             [norm.var("weight", &[first], nn::Init::Const(1.0)), norm.var("bias", &[first], nn::Init::Const(0.0))];
@@ -63,12 +60,8 @@ impl Torso {
     /// The activations overwrite their inputs: neither the layer norm nor a linear layer needs its own output to
     /// differentiate itself, and a fresh 16 MB tensor a layer costs more than the arithmetic.
     pub(crate) fn forward(&self, input: &Tensor) -> Tensor {
-        let mut layers = self.layers.iter();
-        let mut hidden = match layers.next() {
-            Some(first) => self.normalise(&input.apply(first)).tanh_(),
-            None => input.shallow_clone(),
-        };
-        for layer in layers {
+        let mut hidden = self.normalise(&input.apply(&self.layers[0])).tanh_();
+        for layer in &self.layers[1..] {
             hidden = hidden.apply(layer).elu_();
         }
         hidden
@@ -79,28 +72,17 @@ impl Torso {
         hidden.layer_norm(weight.size(), Some(weight), Some(bias), LAYER_NORM_EPSILON, true)
     }
 
-    fn parameters(&self) -> Vec<Tensor> {
-        let layers = self.layers.iter().flat_map(of_linear);
-        layers.chain(self.norm.iter().map(Tensor::shallow_clone)).collect()
-    }
-
-    fn with(&self, parameters: &mut impl Iterator<Item = Tensor>) -> Option<Self> {
-        let layers = self.layers.iter().map(|layer| with_linear(layer, parameters)).collect::<Option<_>>()?;
-        Some(Self { layers, norm: [parameters.next()?, parameters.next()?], output: self.output })
+    fn map(&self, replace: &mut impl FnMut(&Tensor) -> Tensor) -> Self {
+        let layers = self.layers.iter().map(|layer| map_linear(layer, replace)).collect();
+        Self { layers, norm: self.norm.each_ref().map(replace), output: self.output }
     }
 }
 
 /// PyTorch's own.
 const LAYER_NORM_EPSILON: f64 = 1e-5;
 
-fn of_linear(layer: &nn::Linear) -> Vec<Tensor> {
-    std::iter::once(&layer.ws).chain(&layer.bs).map(Tensor::shallow_clone).collect()
-}
-
-fn with_linear(layer: &nn::Linear, parameters: &mut impl Iterator<Item = Tensor>) -> Option<nn::Linear> {
-    let ws = parameters.next()?;
-    let bs = if layer.bs.is_some() { Some(parameters.next()?) } else { None };
-    Some(nn::Linear { ws, bs })
+fn map_linear(layer: &nn::Linear, replace: &mut impl FnMut(&Tensor) -> Tensor) -> nn::Linear {
+    nn::Linear { ws: replace(&layer.ws), bs: layer.bs.as_ref().map(replace) }
 }
 
 /// Hidden layers and a linear output, perhaps with a linear path from input to output beside them.
@@ -133,19 +115,25 @@ impl Mlp {
 
     /// Its parameters, in an order of its own.
     pub(crate) fn parameters(&self) -> Vec<Tensor> {
-        let mut parameters = self.torso.parameters();
-        parameters.extend(of_linear(&self.head));
-        parameters.extend(self.linear_path.as_ref().map(Tensor::shallow_clone));
+        let mut parameters = Vec::new();
+        let _ = self.map(&mut |parameter| {
+            parameters.push(parameter.shallow_clone());
+            parameter.shallow_clone()
+        });
         parameters
     }
 
-    /// The same network of other parameters, in the same order; none when they are too few.
-    pub(crate) fn with(&self, parameters: impl IntoIterator<Item = Tensor>) -> Option<Self> {
+    /// The same network of other parameters, in the order of [`parameters`](Self::parameters); where they are too few its
+    /// own stay.
+    pub(crate) fn with(&self, parameters: Vec<Tensor>) -> Self {
         let mut parameters = parameters.into_iter();
-        let torso = self.torso.with(&mut parameters)?;
-        let head = with_linear(&self.head, &mut parameters)?;
-        let linear_path = if self.linear_path.is_some() { Some(parameters.next()?) } else { None };
-        Some(Self { torso, head, linear_path })
+        self.map(&mut |own| parameters.next().unwrap_or_else(|| own.shallow_clone()))
+    }
+
+    fn map(&self, replace: &mut impl FnMut(&Tensor) -> Tensor) -> Self {
+        let torso = self.torso.map(replace);
+        let head = map_linear(&self.head, replace);
+        Self { torso, head, linear_path: self.linear_path.as_ref().map(replace) }
     }
 }
 

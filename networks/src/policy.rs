@@ -85,7 +85,7 @@ impl Policy {
         memory: Memory<'_>,
     ) -> Acting {
         let NormalisedObservation { proprioception, task, routing } = observation;
-        let input = rows(&Tensor::cat(&[proprioception, previous_latent, task], -1));
+        let input = rows(&Tensor::cat(&[task, proprioception, previous_latent], -1));
         let encoded = self.encoder.forward(&input, &rows(latent_noise), routing);
         let input = low_level::Input { intent: &encoded.intent, proprioception: &rows(proprioception), memory };
         let low_level::Output { action, state } = self.low_level.act(&input);

@@ -7,7 +7,7 @@
 //! ([`Routing::grouped`]). A learner's shapes must not depend on the mix, or a compiler of graphs would compile every one
 //! ([`Routing::blocked`]): its unrolls are sorted by task into blocks of one task each, a few more than they would fill,
 //! and every block is multiplied with the weights of its own task, gathered by index. With blocks of an eighth of the batch
-//! and two tasks this is ninth eighths of the products, where every network over every unroll would be twice of them.
+//! and two tasks this is nine eighths of the products, where every network over every unroll would be twice of them.
 
 use tch::{Device, Tensor};
 
@@ -122,7 +122,7 @@ fn indices(values: impl IntoIterator<Item = usize>, device: Device) -> Tensor {
     Tensor::from_slice(&values).to_device(device)
 }
 
-/// One network for each task, of the same sizes but for the input: a task's network reads the first entries of it, as many
+/// One network for each task, of the same sizes but for the input: a task's network reads the last entries of it, as many
 /// as it is wide.
 #[derive(Debug)]
 pub(crate) struct PerTask {
@@ -139,7 +139,7 @@ impl PerTask {
     pub(crate) fn forward(&self, input: &Tensor, routing: &Routing) -> Tensor {
         match (&self.networks[..], &routing.0) {
             ([network], _) => network.forward(input),
-            (networks, None) => networks[0].forward(&input.narrow(1, 0, networks[0].input())),
+            (networks, None) => networks[0].forward(&own(&networks[0], input)),
             (networks, Some(routed)) => match &routed.way {
                 Way::Groups(groups) => by_group(networks, groups, input),
                 Way::Blocks(blocks) => by_block(networks, blocks, input),
@@ -148,11 +148,17 @@ impl PerTask {
     }
 }
 
+/// What the network reads of an input.
+fn own(network: &Mlp, input: &Tensor) -> Tensor {
+    let width = network.input();
+    input.narrow(1, input.size()[1] - width, width)
+}
+
 /// Each task's rows through its own network.
 fn by_group(networks: &[Mlp], groups: &[Tensor], input: &Tensor) -> Tensor {
     let present = || networks.iter().zip(groups).filter(|(_, rows)| rows.numel() > 0);
     let outputs: Vec<Tensor> = present()
-        .map(|(network, rows)| network.forward(&input.index_select(0, rows).narrow(1, 0, network.input())))
+        .map(|(network, rows)| network.forward(&own(network, &input.index_select(0, rows))))
         .collect();
     let rows: Vec<&Tensor> = present().map(|(_, rows)| rows).collect();
     // Sorted by task, and back.
@@ -175,18 +181,18 @@ fn by_block(networks: &[Mlp], blocks: &Blocks, input: &Tensor) -> Tensor {
     let outputs: Vec<Tensor> = of_blocks
         .into_iter()
         .zip(sorted.unbind(0))
-        .filter_map(|(parameters, rows)| Some(networks[0].with(parameters)?.forward(&rows)))
+        .map(|(parameters, rows)| networks[0].with(parameters).forward(&rows))
         .collect();
     let output = Tensor::cat(&outputs, 0);
     let width = output.size()[1];
     output.reshape([count * blocks.size, -1]).index_select(0, &blocks.places).reshape([-1, width])
 }
 
-/// The same parameter of every task, `[tasks, …]`: narrow ones are filled up with zeros, for inputs that are zero.
+/// The same parameter of every task, `[tasks, …]`: narrow ones are filled up with zeros in front, for inputs that are zero there.
 fn stack(same: &[&Tensor]) -> Tensor {
     let width = |tensor: &Tensor| tensor.size().last().copied().unwrap_or(1);
     let widest = same.iter().map(|tensor| width(tensor)).max().unwrap_or(1);
-    let filled: Vec<Tensor> = same.iter().map(|tensor| tensor.constant_pad_nd([0, widest - width(tensor)])).collect();
+    let filled: Vec<Tensor> = same.iter().map(|tensor| tensor.constant_pad_nd([widest - width(tensor), 0])).collect();
     Tensor::stack(&filled, 0)
 }
 
@@ -248,17 +254,17 @@ mod tests {
         let per_task = networks(&store);
         let (tasks, steps) = ([0, 1, 1, 0, 1, 0, 0, 1, 1, 1, 0], 3);
         let input = Tensor::randn([11 * steps, 5], (Kind::Float, Device::Cpu));
-        // What is beyond a task's own width is zero in a batch.
+        // What is in front of a task's own width is zero in a batch.
         for (unroll, task) in tasks.iter().enumerate() {
             if *task == 1 {
-                let _ = input.narrow(0, unroll as i64 * steps, steps).narrow(1, 3, 2).zero_();
+                let _ = input.narrow(0, unroll as i64 * steps, steps).narrow(1, 0, 2).zero_();
             }
         }
         let blocked = per_task.forward(&input, &Routing::blocked(&tasks, 2, Device::Cpu));
         for (unroll, task) in tasks.iter().enumerate() {
             let own = |tensor: &Tensor| tensor.narrow(0, unroll as i64 * steps, steps);
             let network = &per_task.networks[*task];
-            let expected = network.forward(&own(&input).narrow(1, 0, network.input()));
+            let expected = network.forward(&super::own(network, &own(&input)));
             assert!((own(&blocked) - &expected).abs().max().double_value(&[]) < 1e-6, "unroll {unroll}");
         }
         // Whoever acts has a row for each environment.
@@ -274,7 +280,7 @@ mod tests {
         let per_task = networks(&store);
         let input = Tensor::randn([4, 5], (Kind::Float, Device::Cpu));
         let output = per_task.forward(&input, &Routing::grouped(&[1, 1, 1, 1], 2));
-        let expected = per_task.networks[1].forward(&input.narrow(1, 0, 3));
+        let expected = per_task.networks[1].forward(&input.narrow(1, 2, 3));
         assert_eq!((output - expected).abs().max().double_value(&[]), 0.0);
     }
 }

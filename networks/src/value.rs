@@ -8,7 +8,7 @@ use crate::layers::{Mlp, Torso, linear, rows};
 use crate::lstm::{LstmStack, Memory};
 use crate::routing::PerTask;
 
-/// V(x_t, s_t, clip), one for each task: `[s, clip embedding, x]` → torso → one output per reward term (CoMic supplement).
+/// V(x_t, s_t, clip), one for each task: `[x, s, clip embedding]` → torso → one output per reward term (CoMic supplement).
 /// A recurrent one has LSTM layers after the torso, which begin empty at an unroll's first row and are emptied where an
 /// episode begins; joint training knows none.
 ///
@@ -36,16 +36,20 @@ impl Value {
         let (mut embeddings, mut networks) = (Vec::new(), Vec::new());
         for task in &spec.tasks {
             let path = store / task.name.as_str();
-            let size = [task.clips.max(1) as i64, width];
-            embeddings.push(path.var("clip_embedding", &size, nn::Init::Randn { mean: 0.0, stdev }));
+            let mut embedding = || {
+                let size = [task.clips.max(1) as i64, width];
+                embeddings.push(path.var("clip_embedding", &size, nn::Init::Randn { mean: 0.0, stdev }));
+            };
             let input = (spec.proprioception + task.observation + seen) as i64 + width;
             let torso = Torso::new(&path, input, &config.value);
             if !config.value_lstm.is_empty() {
                 let lstm = LstmStack::new(&path, torso.output(), &config.value_lstm);
                 let head = linear(&(&path / "head"), lstm.output(), terms, 1.0);
+                embedding();
                 return Self { embeddings, body: Body::Recurrent { torso, lstm, head } };
             }
             let head = linear(&(&path / "head"), torso.output(), terms, 1.0);
+            embedding();
             networks.push(Mlp::new(torso, head, None));
         }
         Self { embeddings, body: Body::FeedForward(PerTask::new(networks)) }
@@ -57,7 +61,7 @@ impl Value {
         let NormalisedObservation { proprioception, task, routing } = observation;
         // Clips are numbered through, task by task.
         let embedded = Tensor::embedding(&Tensor::cat(&self.embeddings, 0), clip, -1, false, false);
-        let input = rows(&Tensor::cat(&[proprioception, &embedded, task], -1));
+        let input = rows(&Tensor::cat(&[task, proprioception, &embedded], -1));
         let (unrolls, steps) = (clip.size()[0], clip.size()[1]);
         let values = match &self.body {
             Body::FeedForward(networks) => networks.forward(&input, routing),

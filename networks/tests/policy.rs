@@ -19,7 +19,7 @@ fn spec() -> TaskSpec {
         reward_terms: vec!["a".into(), "b".into()],
         image: 0,
         clips: vec!["x".into(), "y".into(), "z".into()],
-        tasks: vec![TaskPart { name: "tracking".into(), observation: 11, clips: 3, max_reward: 1.0 }],
+        tasks: vec![TaskPart { name: "tracking".into(), observation: 11, clips: 3, max_reward: 1.0, demonstrated: true }],
     }
 }
 
@@ -104,7 +104,7 @@ fn the_actions_log_probability_sends_its_gradient_into_the_encoder() {
     let (store, policy) = policy(&network(), 1, &[0.0; 3]);
     let action = Tensor::ones([ROWS, 3], (Kind::Float, Device::Cpu));
     act(&policy).action.log_prob(&action).sum(Kind::Float).backward();
-    for name in ["encoder.layers.0.weight", "encoder.head.weight", "encoder.linear_path", "low_level.head.bias"] {
+    for name in ["encoder.tracking.layers.0.weight", "encoder.tracking.head.weight", "encoder.tracking.linear_path", "low_level.head.bias"] {
         let variables = store.variables();
         assert!(variables[name].grad().abs().max().double_value(&[]) > 0.0, "{name}");
     }
@@ -120,7 +120,7 @@ fn the_mean_starts_at_the_pose_and_both_deviations_at_their_initial_values() {
     assert_eq!(acting.action.mean, pose);
     assert!((&acting.action.std - 0.1).abs().max().double_value(&[]) < 1e-6);
     // The encoder's head is not scaled down; without its weights the latent's deviation is the initial one too.
-    let mut weights = store.variables().remove("encoder.head.weight").unwrap();
+    let mut weights = store.variables().remove("encoder.tracking.head.weight").unwrap();
     let _ = tch::no_grad(|| weights.zero_());
     assert!((act(&policy).posterior.std - 0.3).abs().max().double_value(&[]) < 1e-6);
     store.freeze();

@@ -176,7 +176,7 @@ pub fn validate(
     check_range(layout, payload, Field::First, "0 or 1", |value| value == 0.0 || value == 1.0)?;
     check_weights(layout, payload)?;
     check_boundaries(layout, payload)?;
-    check_clips(layout, payload, expected.clips)
+    check_clips(layout, header, payload, expected.clips)
 }
 
 fn check_header(layout: &UnrollLayout, header: &UnrollHeader, expected: &Expected<'_>) -> Result<(), Invalid> {
@@ -279,7 +279,12 @@ fn check_boundaries(layout: &UnrollLayout, payload: &[u8]) -> Result<(), Invalid
     }
 }
 
-fn check_clips(layout: &UnrollLayout, payload: &[u8], clips: &[usize]) -> Result<(), Invalid> {
+fn check_clips(
+    layout: &UnrollLayout,
+    header: &UnrollHeader,
+    payload: &[u8],
+    clips: &[usize],
+) -> Result<(), Invalid> {
     let rows = || field(layout, payload, Field::Clip).enumerate();
     let total: usize = clips.iter().sum();
     if let Some((row, clip)) = rows().find(|(_, clip)| *clip as usize >= total) {
@@ -287,14 +292,16 @@ fn check_clips(layout: &UnrollLayout, payload: &[u8], clips: &[usize]) -> Result
     }
     // The clips of the task that the first row's clip is one of.
     let first = rows().next().map_or(0, |(_, clip)| clip as usize);
-    let mut end = 0;
-    let own = clips.iter().map(|clips| {
-        end += clips;
-        end - clips..end
+    let ranges = clips.iter().scan(0, |end, clips| {
+        *end += clips;
+        Some(*end - clips..*end)
     });
-    let own = own.into_iter().find(|own| own.contains(&first)).unwrap_or(0..total);
-    match rows().find(|(_, clip)| !own.contains(&(*clip as usize))) {
-        Some((row, clip)) => Err(Invalid::Task { clip, row }),
-        None => Ok(()),
+    let own = ranges.into_iter().find(|own| own.contains(&first)).unwrap_or(0..total);
+    if let Some((row, clip)) = rows().find(|(_, clip)| !own.contains(&(*clip as usize))) {
+        return Err(Invalid::Task { clip, row });
     }
+    if header.episodes.iter().any(|episode| !own.contains(&(episode.clip as usize))) {
+        return Err(Invalid::Episode { problem: "its clip is of another task than the unroll" });
+    }
+    Ok(())
 }

@@ -85,11 +85,14 @@ fn an_unroll_may_begin_in_the_middle_of_an_episode_or_with_its_first_observation
 
 #[test]
 fn an_unroll_is_of_one_task() {
-    assert_eq!(
-        payload_refusal(|unroll| (0..5).for_each(|t| unroll.set_clip(t, 3))),
-        None,
-        "the second task's one clip"
-    );
+    let second = |episode: u32| {
+        let (mut header, mut unroll) = (header(), unroll());
+        (0..5).for_each(|t| unroll.set_clip(t, 3));
+        header.episodes[0].clip = episode;
+        refusal(&header, &unroll)
+    };
+    assert_eq!(second(3), None, "the second task's one clip");
+    assert!(matches!(second(1), Some(Invalid::Episode { .. })), "an episode of the first task's");
     assert_eq!(payload_refusal(|unroll| unroll.set_clip(4, 3)), Some(Invalid::Task { clip: 3, row: 4 }));
     assert_eq!(payload_refusal(|unroll| unroll.set_clip(0, 3)), Some(Invalid::Task { clip: 1, row: 1 }));
     assert_eq!(payload_refusal(|unroll| unroll.set_clip(4, 4)), Some(Invalid::Clip { clip: 4, row: 4, clips: 4 }));

@@ -125,9 +125,9 @@ impl Environment for JointEnvironment {
     }
 
     fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
-        let (observed, rest) = task.split_at_mut(self.observed());
-        self.current().observe(proprioception, observed);
+        let (rest, observed) = task.split_at_mut(self.task.spec.task.saturating_sub(self.observed()));
         rest.fill(0.0);
+        self.current().observe(proprioception, observed);
     }
 
     fn draw(&mut self, image: &mut [u8]) -> Result<(), Error> {
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn each_task_is_what_it_is_alone_its_observation_first_and_its_reward_in_one_term() {
+    fn each_task_is_what_it_is_alone_its_observation_last_and_its_reward_in_one_term() {
         let together = experiment(BOTH);
         let joint = build(&together);
         let mut environment = Arc::clone(&joint).environment(1).unwrap();
@@ -239,7 +239,9 @@ mod tests {
                 };
                 let (mut expected, found) =
                     (observed(own.as_ref(), alone.spec().task), observed(environment.as_ref(), joint.spec().task));
-                expected.1.resize(joint.spec().task, 0.0);
+                let mut filled = vec![0.0; joint.spec().task - expected.1.len()];
+                filled.append(&mut expected.1);
+                expected.1 = filled;
                 assert_eq!(found, expected, "{name}");
                 let (expected, found) = (own.step(&action), environment.step(&action));
                 assert_eq!((found.reward(), found.discount), (expected.reward(), expected.discount), "{name}");

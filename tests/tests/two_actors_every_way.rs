@@ -3,12 +3,13 @@
 //! was remembered in flight.
 
 use anyhow::{Result, ensure};
+use comic_proto::v1::Status;
 use comic_tests::steps::{
     LIMIT, SMALL, kill_and_restart_the_learner, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on,
 };
 use comic_tests::system::System;
 
-async fn two_actors_learn(overrides: &[&str]) -> Result<()> {
+async fn two_actors_learn(overrides: &[&str], check: fn(&Status) -> Option<()>) -> Result<()> {
     let arguments = overrides.iter().flat_map(|field| ["--set", *field]);
     let mut system = System::new(&SMALL.into_iter().chain(arguments).collect::<Vec<_>>())?;
     let begun = system.start_learner(LIMIT).await?;
@@ -18,6 +19,7 @@ async fn two_actors_learn(overrides: &[&str]) -> Result<()> {
     }
     trains_on(&mut system, "the actors' unrolls are trained on").await?;
     parameters_arrive(&mut system, "the actors act with new parameters").await?;
+    system.until("the metrics say so", LIMIT, check).await?;
     let resumed = kill_and_restart_the_learner(&mut system).await?;
     ensure!(resumed.learner_epoch > begun.learner_epoch, "a restarted learner lives in a new epoch");
     for actor in &mut actors {
@@ -32,22 +34,31 @@ async fn two_actors_learn(overrides: &[&str]) -> Result<()> {
 
 #[tokio::test]
 async fn with_an_lstm_and_a_recurrent_value_function() -> Result<()> {
-    two_actors_learn(&["network.low_level=lstm", "network.lstm.units=[12, 8]", "network.value_lstm=[8]"]).await
+    two_actors_learn(&["network.low_level=lstm", "network.lstm.units=[12, 8]", "network.value_lstm=[8]"], |_| Some(())).await
 }
 
 #[tokio::test]
 async fn with_a_mixture_of_primitives() -> Result<()> {
-    two_actors_learn(&["network.low_level=mixture", "network.primitives.torso=[32]", "network.primitives.hidden=16"])
-        .await
+    let sizes = ["network.primitives.torso=[32]", "network.primitives.hidden=16"];
+    two_actors_learn(&[&["network.low_level=mixture"][..], &sizes].concat(), |_| Some(())).await
 }
 
 #[tokio::test]
 async fn with_a_product_of_primitives_and_no_bottleneck() -> Result<()> {
     let sizes = ["network.primitives.torso=[32]", "network.primitives.hidden=16", "network.latent.size=0"];
-    two_actors_learn(&[&["network.low_level=product"][..], &sizes].concat()).await
+    two_actors_learn(&[&["network.low_level=product"][..], &sizes].concat(), |_| Some(())).await
 }
 
 #[tokio::test]
 async fn with_two_tasks() -> Result<()> {
-    two_actors_learn(&[r#"joint=[{task="get-up", probability=0.3}]"#, "get_up.lying_share=0"]).await
+    let overrides = [r#"joint=[{task="get-up", probability=0.3}]"#, "get_up.lying_share=0"];
+    two_actors_learn(&overrides, |status| {
+        let metrics: serde_json::Value = serde_json::from_str(&status.metrics_json).ok()?;
+        let of = |task: &str, name: &str| metrics["tasks"][task][name].as_f64().unwrap_or_default();
+        let both = ["tracking", "get-up"];
+        let trained = both.iter().all(|task| of(task, "environment_steps") > 0.0 && of(task, "unrolls") > 0.0);
+        let padded = both.iter().any(|task| of(task, "padding_share") > 0.0);
+        (trained && padded).then_some(())
+    })
+    .await
 }

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use comic_clips::Catalogue;
-use comic_experiment::{ClipSource, Experiment};
+use comic_experiment::Experiment;
 use comic_proto::v1::EvaluationReport;
 use comic_tasks::{Simulated, Task};
 
@@ -33,6 +33,7 @@ With --json one object goes to standard output:
     reward_per_step    reward per survived step / most a step pays, 1.45 in tracking
     fraction_survived  mean of steps / steps left in the clip at the episode's start
     reward_terms       each reward term's mean per step, by name
+  tasks          in joint training the same for each task, over the episodes of all its clips
   overall        the same over all episodes; its clip is \"overall\"";
 
 /// Evaluates a policy: return, normalised reward, fraction of the clip survived and reward terms, per clip.
@@ -109,16 +110,14 @@ impl Evaluate {
 
     /// The report, and what became of the film.
     fn evaluate(&self, subject: Subject) -> Result<(Report, Result<(), Error>), Error> {
-        let Subject { mut experiment, parameters, .. } = subject;
+        let Subject { experiment, parameters, .. } = subject;
         if let Some(out) = &self.video {
             Format::of(out)?;
             self.look.suits(experiment.task)?;
         }
         // A policy that was never trained starts from the pose of its own clips, whatever it is evaluated on.
         let own = if self.untrained { Some(Catalogue::open(&experiment.clips)?) } else { None };
-        if !self.clips.is_empty() {
-            experiment.clips = self.clips.iter().map(|source| ClipSource::parse(source)).collect();
-        }
+        let experiment = experiment.with_clips(&self.clips);
         let catalogue = Catalogue::open(&experiment.clips)?;
         let task = comic_tasks::build(&experiment, &catalogue)?;
         let options = Options {

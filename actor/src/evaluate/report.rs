@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use comic_experiment::TaskSpec;
+use comic_experiment::{TaskPart, TaskSpec};
 use comic_tasks::MAX_REWARD_TERMS;
 use serde::{Deserialize, Serialize};
 
@@ -33,6 +33,9 @@ pub struct Report {
     pub seed: u64,
     /// One for each clip that has a start, in the clips' order.
     pub clips: Vec<ClipReport>,
+    /// In joint training one for each task, in the tasks' order, over the episodes of all its clips.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub tasks: Vec<ClipReport>,
     /// Over all episodes of all clips.
     pub overall: ClipReport,
 }
@@ -74,8 +77,14 @@ impl Report {
             })
             .filter(|clip| clip.episodes > 0)
             .collect();
+        let of_task = |(index, task): (usize, &TaskPart)| {
+            let own: Vec<Finished> = finished.iter().filter(|e| spec.task_of(e.clip) == index).copied().collect();
+            ClipReport::new(&task.name, spec, &own)
+        };
+        let several = spec.tasks.len() > 1;
+        let tasks = spec.tasks.iter().enumerate().filter(|_| several).map(of_task).collect();
         let overall = ClipReport::new("overall", spec, finished);
-        Self { deterministic: options.deterministic, seed: options.seed, clips, overall }
+        Self { deterministic: options.deterministic, seed: options.seed, clips, tasks, overall }
     }
 }
 
@@ -112,8 +121,6 @@ fn ratio(sum: f64, count: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use comic_experiment::TaskPart;
-
     use super::*;
 
     fn spec() -> TaskSpec {
@@ -124,7 +131,7 @@ mod tests {
             reward_terms: vec!["pose".into(), "velocity".into()],
             image: 0,
             clips: vec!["walk".into(), "run".into(), "unused".into()],
-            tasks: vec![TaskPart { name: "tracking".into(), observation: 1, clips: 3, max_reward: 1.45 }],
+            tasks: vec![TaskPart { name: "tracking".into(), observation: 1, clips: 3, max_reward: 1.45, demonstrated: true }],
         }
     }
 
@@ -154,6 +161,18 @@ mod tests {
 
         assert_eq!((report.overall.clip.as_str(), report.overall.episodes), ("overall", 3));
         close(report.overall.normalised_reward, (0.3 + 1.0 + 1.0) / 3.0);
+    }
+
+    #[test]
+    fn several_tasks_have_a_row_each_relative_to_what_each_can_pay() {
+        let mut spec = spec();
+        spec.tasks[0].clips = 2;
+        spec.tasks.push(TaskPart { name: "get-up".into(), max_reward: 1.0, clips: 1, ..spec.tasks[0].clone() });
+        let finished = [episode(0, 10, 10, 14.5, 0.0), episode(1, 10, 10, 0.0, 0.0), episode(2, 10, 10, 5.0, 0.0)];
+        let report = Report::new(&spec, &finished, &Options::default());
+        let rows: Vec<_> = report.tasks.iter().map(|row| (row.clip.as_str(), row.episodes, row.normalised_reward)).collect();
+        assert_eq!(rows, [("tracking", 2, 0.5), ("get-up", 1, 0.5)]);
+        assert!(Report::new(&self::spec(), &finished[..2], &Options::default()).tasks.is_empty(), "one task is the whole");
     }
 
     #[test]

@@ -11,6 +11,10 @@ impl fmt::Display for Report {
         let terms: Vec<&str> = self.overall.reward_terms.keys().map(String::as_str).collect();
         let mut rows = vec![header(&terms)];
         rows.extend(self.clips.iter().map(row));
+        // A task of one clip has its row already.
+        if self.clips.len() > self.tasks.len() {
+            rows.extend(self.tasks.iter().map(row));
+        }
         // With one clip the two are the same.
         if self.clips.len() != 1 {
             rows.push(row(&self.overall));

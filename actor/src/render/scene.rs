@@ -104,7 +104,8 @@ impl Scene {
         }
         Err(Error::Usage(format!(
             "{origin}: its task is {}, not {}: name that one with --task, or another checkpoint or preset",
-            experiment.task, self.task
+            experiment.tasks().iter().map(|(task, _)| task.name()).collect::<Vec<_>>().join(" and "),
+            self.task
         )))
     }
 

@@ -80,13 +80,19 @@ fn learner(threads: u16, arguments: &[String]) -> Result<()> {
         let of_rounds =
             |part: fn(&Figure) -> f64| median(ours.iter().filter_map(|round| round.get(index)).map(part).collect());
         let (value, floor) = (of_rounds(|figure| figure.value), of_rounds(|figure| figure.floor));
-        lines.push(Figure { value, floor, ratio: value / floor, ..figure.clone() });
+        let mut line = Figure { value, floor, ratio: value / floor, ..figure.clone() };
+        for (name, number) in &mut line.rest {
+            let rounds = ours.iter().filter_map(|round| round.get(index)?.rest.get(name)?.as_f64()).collect();
+            *number = median(rounds).into();
+        }
+        lines.push(line);
     }
     if compares {
         let update = lines.iter().find(|figure| figure.figure == "learner.update");
         let update = update.context("comic-learner bench printed no learner.update")?.clone();
         let floor = median(theirs);
-        lines.push(Figure { figure: "learner.pytorch".into(), floor, ratio: update.value / floor, ..update });
+        let rest = serde_json::Map::new();
+        lines.push(Figure { figure: "learner.pytorch".into(), floor, ratio: update.value / floor, rest, ..update });
     }
     show(&lines)
 }

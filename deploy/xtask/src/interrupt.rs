@@ -10,7 +10,7 @@ use signal_hook::low_level::emulate_default_handler;
 
 /// How often this program has been asked to stop. While one lives the signals count and do not kill; when the last
 /// clone is gone they kill again.
-#[derive(Clone)]
+#[derive(Clone, Default)]
 pub(crate) struct Interrupt(Arc<AtomicUsize>);
 
 impl Interrupt {
@@ -28,6 +28,12 @@ impl Interrupt {
             }
         });
         Ok(Self(count))
+    }
+
+    /// Asks this program to stop, as a signal does.
+    #[cfg(test)]
+    pub(crate) fn request(&self) {
+        self.0.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Requests to stop so far.

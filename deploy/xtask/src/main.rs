@@ -4,6 +4,7 @@
 //! - [`setup`] fills `.deps` with the native libraries; everything else calls it first.
 //! - [`check`] runs the tests and the linters.
 //! - [`train`] runs one learner and its actors on this machine and shows what they do.
+//! - [`sweep`] does so with some of an experiment's fields varied, and compares.
 //! - [`bench`] and [`python`] make the figures of the README, [`plot`] its curves.
 //!
 //! This program runs before there is a libtorch or a MuJoCo, so it links neither.
@@ -15,6 +16,7 @@ mod plot;
 mod progress;
 mod python;
 mod setup;
+mod sweep;
 mod train;
 mod workspace;
 
@@ -40,6 +42,8 @@ enum Command {
     Lint,
     /// Set up, build, and train with one learner and its actors on this machine
     Train(train::Options),
+    /// Train an experiment with some of its fields varied, with several seeds, and compare
+    Sweep(sweep::Options),
     /// Measure; one JSON line per figure
     Bench(bench::Options),
     /// Draw the curves of runs, or of ../shared/baselines, as one picture
@@ -64,6 +68,7 @@ fn main() -> ExitCode {
         Command::Test(options) => check::test(&options),
         Command::Lint => check::lint(),
         Command::Train(options) => train::run(options),
+        Command::Sweep(options) => sweep::run(options),
         Command::Bench(options) => bench::run(&options),
         Command::Plot { metrics, quantity, out } => plot::run(&metrics, quantity, &out),
         Command::Fixtures(options) => python::fixtures(&options),

@@ -1,13 +1,17 @@
-//! Curves of runs as one picture: over wall-clock time and over environment steps.
+//! Learning curves as pictures: runs side by side over wall-clock time and environment steps, or groups of runs as mean
+//! and range over environment steps.
 
-use std::ops::Range;
+mod panel;
+mod pool;
+
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail};
-use plotters::coord::Shift;
 use plotters::prelude::*;
 
-use crate::train::metrics::Line;
+use crate::train::metrics::{self, Line};
+use panel::{Series, panel};
+use pool::pool;
 
 /// Points a window of smoothing is made of; lines come every few seconds and episodes are short and many.
 const SMOOTHED_OVER: usize = 5;
@@ -19,7 +23,7 @@ pub(crate) enum Quantity {
     EpisodeReturn,
     /// Return / (the most a step pays × the steps that were left).
     NormalisedReward,
-    /// Reward per survived step.
+    /// Reward per survived step / the most a step pays.
     RewardPerStep,
 }
 
@@ -41,132 +45,133 @@ impl Quantity {
     }
 }
 
-/// One run's curve: (minutes, million environment steps, value).
-struct Curve {
+/// A file of metrics and what its curve is called.
+pub(crate) struct Source {
     label: String,
-    points: Vec<(f64, f64, f64)>,
+    path: PathBuf,
 }
 
-/// Draws the runs whose metrics are named by `FILE` or `LABEL=FILE` into `out`.
+impl Source {
+    /// A run's metrics are called after its directory, other files by their own name.
+    pub(crate) fn of(path: PathBuf) -> Self {
+        let metrics = path.file_stem().is_some_and(|stem| stem == "metrics");
+        let named = if metrics { path.parent().and_then(Path::file_name) } else { path.file_stem() };
+        Self { label: named.unwrap_or(path.as_os_str()).to_string_lossy().into_owned(), path }
+    }
+
+    /// `FILE` or `LABEL=FILE`; a file that is there is no label, since a sweep's runs have `=` in their names.
+    fn parse(argument: &str) -> Self {
+        match argument.split_once('=') {
+            Some((label, path)) if !Path::new(argument).exists() => Self { label: label.to_owned(), path: path.into() },
+            _ => Self::of(argument.into()),
+        }
+    }
+}
+
+/// Where a run stood, and what it was worth there.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Point {
+    minutes: f64,
+    /// Environment steps, millions.
+    steps: f64,
+    value: f64,
+}
+
+/// `cargo xtask plot`.
 pub(crate) fn run(metrics: &[String], quantity: Quantity, out: &Path) -> Result<()> {
-    let curves: Vec<Curve> = metrics.iter().map(|argument| read(argument, quantity)).collect::<Result<_>>()?;
-    let root = SVGBackend::new(out, (1000, 400)).into_drawing_area();
-    draw(&root, &curves, quantity)
-        .and_then(|()| root.present().map_err(|error| anyhow!("{error}")))
-        .with_context(|| format!("cannot draw {}", out.display()))?;
+    let sources: Vec<Source> = metrics.iter().map(|argument| Source::parse(argument)).collect();
+    draw_runs(&sources, quantity, out)?;
     eprintln!("drew {}", out.display());
     Ok(())
 }
 
-fn read(argument: &str, quantity: Quantity) -> Result<Curve> {
-    let (label, path) = match argument.split_once('=') {
-        Some((label, path)) => (label.to_owned(), PathBuf::from(path)),
-        None => (name_of(Path::new(argument)), PathBuf::from(argument)),
+/// Draws a curve for each run, over wall-clock time and over environment steps.
+pub(crate) fn draw_runs(sources: &[Source], quantity: Quantity, out: &Path) -> Result<()> {
+    let curves = sources.iter().map(|source| read(&source.path, quantity)).collect::<Result<Vec<_>>>()?;
+    let series = |x: fn(&Point) -> f64| -> Vec<Series> {
+        let line = |points: &Vec<Point>| points.iter().map(|point| (x(point), point.value)).collect();
+        let named = sources.iter().zip(&curves);
+        named.map(|(source, points)| Series::line(source.label.clone(), line(points))).collect()
     };
-    let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
-    let mut points = Vec::new();
-    for (number, line) in text.lines().enumerate() {
-        let line: Line = serde_json::from_str(line)
-            .with_context(|| format!("{}:{}: no line of metrics", path.display(), number + 1))?;
+    let panels = [
+        ("minutes of wall clock", series(|point| point.minutes)),
+        ("million environment steps", series(|point| point.steps)),
+    ];
+    draw(&panels, quantity, out)
+}
+
+/// Draws each group of runs as their mean over environment steps, with a band from the least to the most of them.
+pub(crate) fn draw_groups(groups: &[(String, Vec<PathBuf>)], quantity: Quantity, out: &Path) -> Result<()> {
+    let series = groups.iter().map(|(label, runs)| {
+        let curves = runs.iter().map(|path| read(path, quantity)).collect::<Result<Vec<_>>>()?;
+        Ok(pool(label.clone(), &curves))
+    });
+    draw(&[("million environment steps", series.collect::<Result<Vec<_>>>()?)], quantity, out)
+}
+
+fn read(path: &Path, quantity: Quantity) -> Result<Vec<Point>> {
+    let mut points: Vec<Point> = Vec::new();
+    for line in metrics::read(path)? {
         if let Some(value) = quantity.of(&line) {
-            points.push((line.seconds / 60.0, line.environment_steps as f64 / 1e6, value));
+            let steps = line.environment_steps as f64 / 1e6;
+            // A run that was killed does again what it did after its last checkpoint: the newer line holds.
+            points.truncate(points.partition_point(|point| point.steps < steps));
+            points.push(Point { minutes: line.seconds / 60.0, steps, value });
         }
     }
     if points.is_empty() {
         bail!("{} holds no finished episode yet", path.display());
     }
-    Ok(Curve { label, points: smooth(&points) })
-}
-
-/// A run's metrics are called after its directory, other files by their own name.
-fn name_of(path: &Path) -> String {
-    let named = if path.file_stem().is_some_and(|stem| stem == "metrics") { path.parent() } else { Some(path) };
-    named.and_then(Path::file_stem).unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+    Ok(smooth(&points))
 }
 
 /// The mean of each point and the few before it.
-fn smooth(points: &[(f64, f64, f64)]) -> Vec<(f64, f64, f64)> {
-    (0..points.len())
-        .map(|index| {
-            let window = &points[(index + 1).saturating_sub(SMOOTHED_OVER)..=index];
-            let mean = window.iter().map(|point| point.2).sum::<f64>() / window.len() as f64;
-            (points[index].0, points[index].1, mean)
-        })
-        .collect()
+fn smooth(points: &[Point]) -> Vec<Point> {
+    let mean = |window: &[Point]| window.iter().map(|point| point.value).sum::<f64>() / window.len() as f64;
+    let smoothed = points.iter().enumerate().map(|(index, point)| {
+        let window = &points[(index + 1).saturating_sub(SMOOTHED_OVER)..=index];
+        Point { value: mean(window), ..*point }
+    });
+    smoothed.collect()
 }
 
-fn draw<B: DrawingBackend>(area: &DrawingArea<B, Shift>, curves: &[Curve], quantity: Quantity) -> Result<()> {
-    area.fill(&WHITE).map_err(|error| anyhow!("{error}"))?;
-    let halves = area.split_evenly((1, 2));
-    let [left, right] = halves.as_slice() else { return Err(anyhow!("the picture cannot be halved")) };
-    panel(left, curves, "minutes of wall clock", quantity.label(), |point| point.0)?;
-    panel(right, curves, "million environment steps", quantity.label(), |point| point.1)
-}
-
-fn panel<B: DrawingBackend>(
-    area: &DrawingArea<B, Shift>,
-    curves: &[Curve],
-    x_label: &str,
-    y_label: &str,
-    x: impl Fn(&(f64, f64, f64)) -> f64 + Copy,
-) -> Result<()> {
-    let points = || curves.iter().flat_map(|curve| &curve.points);
-    let x_range = 0.0..points().map(x).fold(1e-6, f64::max);
-    let y_range = range_of(points().map(|point| point.2));
-    let failed = |error: String| anyhow!(error);
-    let mut chart = ChartBuilder::on(area)
-        .margin(12)
-        .x_label_area_size(36)
-        .y_label_area_size(48)
-        .build_cartesian_2d(x_range, y_range)
-        .map_err(|error| failed(error.to_string()))?;
-    chart
-        .configure_mesh()
-        .x_desc(x_label)
-        .y_desc(y_label)
-        .light_line_style(TRANSPARENT)
-        .draw()
-        .map_err(|error| failed(error.to_string()))?;
-    for (index, curve) in curves.iter().enumerate() {
-        let colour = Palette99::pick(index).to_rgba();
-        let line = LineSeries::new(curve.points.iter().map(|point| (x(point), point.2)), colour.stroke_width(2));
-        chart
-            .draw_series(line)
-            .map_err(|error| failed(error.to_string()))?
-            .label(&curve.label)
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
-    }
-    chart
-        .configure_series_labels()
-        .position(SeriesLabelPosition::LowerRight)
-        .background_style(WHITE.mix(0.8))
-        .draw()
-        .map_err(|error| failed(error.to_string()))
-}
-
-/// From 0, or below it, to a little above the largest value.
-fn range_of(values: impl Iterator<Item = f64> + Clone) -> Range<f64> {
-    let low = values.clone().fold(0.0, f64::min);
-    let high = values.fold(low + 1e-6, f64::max);
-    low..high + 0.05 * (high - low)
+/// Panels side by side, each with what is written along its x axis.
+fn draw(panels: &[(&str, Vec<Series>)], quantity: Quantity, out: &Path) -> Result<()> {
+    let root = SVGBackend::new(out, (1000, 400)).into_drawing_area();
+    let drawn = || -> Result<()> {
+        root.fill(&WHITE).map_err(|error| anyhow!("{error}"))?;
+        for (area, (x_label, series)) in root.split_evenly((1, panels.len())).iter().zip(panels) {
+            panel(area, series, x_label, quantity.label())?;
+        }
+        root.present().map_err(|error| anyhow!("{error}"))
+    };
+    drawn().with_context(|| format!("cannot draw {}", out.display()))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    /// A file with lines of environment steps and returns, in a directory of its own.
+    fn metrics(directory: &Path, name: &str, lines: &[(u64, f64)]) -> PathBuf {
+        let path = directory.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        let line = |(steps, value): &(u64, f64)| {
+            format!("{{\"seconds\":{steps},\"environment_steps\":{steps},\"episode_return\":{value}}}\n")
+        };
+        std::fs::write(&path, lines.iter().map(line).collect::<String>()).unwrap();
+        path
+    }
+
     #[test]
     fn a_run_and_a_baseline_are_drawn_into_one_picture_with_both_axes_and_names() {
         let directory = tempfile::tempdir().unwrap();
-        let run = directory.path().join("walk-1");
-        std::fs::create_dir(&run).unwrap();
-        let ours = "{\"seconds\":60,\"environment_steps\":1000000,\"episode_return\":2.0}\n";
-        std::fs::write(run.join("metrics.jsonl"), ours.repeat(3)).unwrap();
+        let run = metrics(directory.path(), "walk-1/metrics.jsonl", &[(1_000_000, 2.0), (2_000_000, 2.5)]);
         let baseline = directory.path().join("sb3.jsonl");
         std::fs::write(&baseline, "{\"seconds\": 30, \"env_steps\": 8030, \"episode_return\": 1.0}\n").unwrap();
         let out = directory.path().join("curve.svg");
-        let metrics = [run.join("metrics.jsonl").display().to_string(), format!("PPO={}", baseline.display())];
-        super::run(&metrics, Quantity::EpisodeReturn, &out).unwrap();
+        let arguments = [run.display().to_string(), format!("PPO={}", baseline.display())];
+        super::run(&arguments, Quantity::EpisodeReturn, &out).unwrap();
         let picture = std::fs::read_to_string(out).unwrap();
         for text in ["walk-1", "PPO", "minutes of wall clock", "million environment steps"] {
             assert!(picture.contains(text), "{text} is missing");
@@ -174,19 +179,45 @@ mod tests {
     }
 
     #[test]
-    fn smoothing_keeps_a_constant_and_never_looks_ahead() {
-        let constant = smooth(&[(0.0, 0.0, 2.0); 9]);
-        assert!(constant.iter().all(|point| point.2 == 2.0));
-        let step = smooth(&[(0.0, 0.0, 0.0), (1.0, 1.0, 0.0), (2.0, 2.0, 3.0)]);
-        assert_eq!(step.iter().map(|point| point.2).collect::<Vec<_>>(), [0.0, 0.0, 1.0]);
+    fn groups_of_runs_are_drawn_as_lines_with_bands_and_names() {
+        let directory = tempfile::tempdir().unwrap();
+        let runs = [1.0, 2.0].map(|value| {
+            metrics(directory.path(), &format!("{value}/metrics.jsonl"), &[(1, value), (1_000_000, value)])
+        });
+        let out = directory.path().join("curves.svg");
+        draw_groups(&[("beta=0".into(), runs.to_vec())], Quantity::EpisodeReturn, &out).unwrap();
+        let picture = std::fs::read_to_string(out).unwrap();
+        for part in ["beta=0", "million environment steps", "<polygon"] {
+            assert!(picture.contains(part), "{part} is missing");
+        }
+        assert!(!picture.contains("wall clock"));
     }
 
     #[test]
-    fn a_file_that_is_no_metrics_is_refused_by_line() {
+    fn a_run_in_a_directory_with_an_equals_sign_is_no_labelled_file() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("metrics.jsonl");
-        std::fs::write(&path, "{}\nnonsense\n").unwrap();
-        let error = read(&path.display().to_string(), Quantity::EpisodeReturn).err().unwrap();
-        assert!(format!("{error:#}").contains("metrics.jsonl:2"), "{error:#}");
+        let run = metrics(directory.path(), "beta=1e-4,seed=2/metrics.jsonl", &[(1, 1.0)]);
+        let source = Source::parse(&run.display().to_string());
+        assert_eq!((source.label.as_str(), source.path), ("beta=1e-4,seed=2", run));
+    }
+
+    #[test]
+    fn what_was_done_again_after_a_crash_is_drawn_once() {
+        let directory = tempfile::tempdir().unwrap();
+        let lines = [(1_000_000, 1.0), (2_000_000, 7.0), (3_000_000, 7.0), (2_000_000, 1.0), (4_000_000, 1.0)];
+        let points = read(&metrics(directory.path(), "metrics.jsonl", &lines), Quantity::EpisodeReturn).unwrap();
+        assert_eq!(
+            points.iter().map(|point| (point.steps, point.value)).collect::<Vec<_>>(),
+            [(1.0, 1.0), (2.0, 1.0), (4.0, 1.0)]
+        );
+    }
+
+    #[test]
+    fn smoothing_keeps_a_constant_and_never_looks_ahead() {
+        let points = |values: &[f64]| -> Vec<Point> {
+            values.iter().map(|value| Point { minutes: 0.0, steps: 0.0, value: *value }).collect()
+        };
+        assert_eq!(smooth(&points(&[2.0; 9])), points(&[2.0; 9]));
+        assert_eq!(smooth(&points(&[0.0, 0.0, 3.0])), points(&[0.0, 0.0, 1.0]));
     }
 }

@@ -162,6 +162,11 @@ impl MinibatchTensors {
         }
     }
 
+    /// The task of each unroll, `[B]`.
+    pub fn tasks(&self) -> &[usize] {
+        &self.tasks
+    }
+
     /// z_{t−1} as the next step will take it, `[B, T, Z]`.
     pub fn previous_latent(&self) -> &Tensor {
         &self.previous_latent

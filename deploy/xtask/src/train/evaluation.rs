@@ -9,64 +9,75 @@ use anyhow::{Context, Result, bail};
 use serde::{Deserialize, Serialize};
 
 use super::Job;
+use super::display::Display;
 use crate::interrupt::Interrupt;
 use crate::workspace;
 
 /// What `comic-actor evaluate --json` prints, as far as the table shows it.
 #[derive(Clone, Debug, Deserialize, Serialize)]
-struct Evaluation {
+pub(crate) struct Evaluation {
     clips: Vec<ClipEvaluation>,
-    overall: ClipEvaluation,
+    pub(crate) overall: ClipEvaluation,
 }
 
 /// Means over the episodes of one clip, or of all.
 #[derive(Clone, Debug, Deserialize, Serialize)]
-struct ClipEvaluation {
+pub(crate) struct ClipEvaluation {
     clip: String,
     episodes: u64,
+    /// Steps.
+    pub(crate) length_mean: f64,
     return_mean: f64,
     /// Return / (the most a step pays × the steps that were left at the episode's start).
-    normalised_reward: f64,
+    pub(crate) normalised_reward: f64,
     /// Reward per survived step / the most a step pays.
-    reward_per_step: f64,
+    pub(crate) reward_per_step: f64,
     fraction_survived: f64,
     /// Per survived step.
     reward_terms: BTreeMap<String, f64>,
 }
 
-/// Evaluates the run's policies without noise, prints them side by side and keeps them in `evaluation.json`.
-pub(super) fn compare(job: &Job, interrupt: &Interrupt) -> Result<()> {
+/// The file in a run's directory that holds what its policies were worth.
+const FILE: &str = "evaluation.json";
+
+/// Evaluates the run's policies without noise and keeps them in `evaluation.json`, each with its name.
+pub(super) fn compare(job: &Job, display: &mut Display, interrupt: &Interrupt) -> Result<Vec<(String, Evaluation)>> {
+    let directory = job.path();
     let policies = job.directory.policies();
     if policies.is_empty() {
-        eprintln!("nothing to compare: the run ended before its first checkpoint");
-        return Ok(());
+        bail!("nothing to evaluate: the run in {} ended before its first checkpoint", directory.display());
     }
     let asked_before = interrupt.count();
-    let mut columns = Vec::new();
+    let mut evaluations = Vec::new();
     for (name, checkpoint) in policies {
-        eprintln!("evaluating the {name} policy ({})", checkpoint.display());
-        let evaluation = evaluate(&checkpoint, job.episodes);
+        display.event("evaluating", &[("policy", name.into()), ("checkpoint", checkpoint.display().to_string())]);
+        let evaluation = evaluate(&checkpoint, job.episodes, display.stderr(job.directory.log("evaluation"))?);
         if interrupt.count() > asked_before {
-            bail!("interrupted during the evaluation; the run is kept in {}", job.directory.path().display());
+            bail!("interrupted during the evaluation; the run is kept in {}", directory.display());
         }
-        columns.push((name, evaluation?));
+        evaluations.push((name.to_owned(), evaluation?));
     }
-    let path = job.directory.path().join("evaluation.json");
-    let record: BTreeMap<_, _> = columns.iter().cloned().collect();
+    let path = directory.join(FILE);
+    let record: BTreeMap<_, _> = evaluations.iter().cloned().collect();
     fs::write(&path, serde_json::to_vec_pretty(&record)?)
         .with_context(|| format!("cannot write {}", path.display()))?;
-    println!("{}", table(&columns));
-    println!("kept in {}", job.directory.path().display());
-    Ok(())
+    Ok(evaluations)
 }
 
-fn evaluate(checkpoint: &Path, episodes: Option<u32>) -> Result<Evaluation> {
+/// What [`compare`] kept of a run, by the policies' names.
+pub(crate) fn read(directory: &Path) -> Result<BTreeMap<String, Evaluation>> {
+    let path = directory.join(FILE);
+    let text = fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+    serde_json::from_slice(&text).with_context(|| format!("{} is no evaluation", path.display()))
+}
+
+fn evaluate(checkpoint: &Path, episodes: Option<u32>, stderr: Stdio) -> Result<Evaluation> {
     let mut command = Command::new(workspace::program("comic-actor")?);
     command.args(["evaluate", "--deterministic", "--json", "--checkpoint"]).arg(checkpoint);
     if let Some(episodes) = episodes {
         command.arg("--episodes").arg(episodes.to_string());
     }
-    let output = command.stdin(Stdio::null()).stderr(Stdio::inherit()).output();
+    let output = command.stdin(Stdio::null()).stderr(stderr).output();
     let output = output.with_context(|| format!("cannot start {}", workspace::describe(&command)))?;
     if !output.status.success() {
         bail!("{} ended with {}", workspace::describe(&command), output.status);
@@ -83,7 +94,7 @@ impl Evaluation {
 }
 
 /// One block of rows per clip, one column per policy.
-fn table(columns: &[(&str, Evaluation)]) -> String {
+pub(super) fn table(columns: &[(String, Evaluation)]) -> String {
     let mut text = String::from("\nWhat was learnt (policies without noise)\n");
     let Some((_, first)) = columns.first() else { return text };
     // One clip is all clips.
@@ -103,6 +114,7 @@ fn table(columns: &[(&str, Evaluation)]) -> String {
             text.push('\n');
         };
         row("return", &|clip| Some(clip.return_mean));
+        row("episode length", &|clip| Some(clip.length_mean));
         row("normalised reward", &|clip| Some(clip.normalised_reward));
         row("reward per step / most", &|clip| Some(clip.reward_per_step));
         row("fraction survived", &|clip| Some(clip.fraction_survived));
@@ -121,6 +133,7 @@ mod tests {
         ClipEvaluation {
             clip: clip.into(),
             episodes: 3,
+            length_mean: 40.0,
             return_mean: 1.0,
             normalised_reward,
             reward_per_step: 0.5,
@@ -138,8 +151,8 @@ mod tests {
 
     #[test]
     fn the_table_has_a_block_per_clip_and_a_column_per_policy() {
-        let table =
-            table(&[("untrained", evaluation(&["CMU_007_01"], 0.03)), ("trained", evaluation(&["CMU_007_01"], 0.41))]);
+        let columns = [("untrained", 0.03), ("trained", 0.41)];
+        let table = table(&columns.map(|(name, reward)| (name.to_owned(), evaluation(&["CMU_007_01"], reward))));
         assert!(table.contains("CMU_007_01                       untrained       trained\n"), "{table}");
         assert!(table.contains("  normalised reward                  0.030         0.410\n"), "{table}");
         assert!(table.contains("  com, per step                      0.010         0.010\n"), "{table}");
@@ -148,7 +161,7 @@ mod tests {
 
     #[test]
     fn several_clips_are_summed_up() {
-        let table = table(&[("trained", evaluation(&["walk", "run"], 0.5))]);
+        let table = table(&[("trained".to_owned(), evaluation(&["walk", "run"], 0.5))]);
         for block in ["\nwalk ", "\nrun ", "\noverall "] {
             assert!(table.contains(block), "{table}");
         }

@@ -1,7 +1,9 @@
 //! One line of `metrics.jsonl`, as the learner writes it; baselines' lines are read too.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
+use anyhow::{Context, Result};
 use serde::Deserialize;
 
 /// What a run's curve and display need of a line. A share of nothing is absent.
@@ -15,7 +17,7 @@ pub(crate) struct Line {
     pub(crate) updates: u64,
     pub(crate) version: u64,
     pub(crate) steps_per_second: Option<f64>,
-    /// Reward per survived step, not divided by its maximum.
+    /// Reward per survived step / the most a step pays.
     pub(crate) reward_per_step: Option<f64>,
     /// Steps.
     #[serde(alias = "length")]
@@ -29,6 +31,22 @@ pub(crate) struct Line {
     pub(crate) books: Option<Books>,
     /// Whatever the learner minimises, by name.
     pub(crate) losses: BTreeMap<String, serde_json::Value>,
+}
+
+impl Line {
+    /// KL of the latent to its prior, nats a step, in the newest update.
+    pub(crate) fn latent_kl(&self) -> Option<f64> {
+        self.losses.get("latent_kl")?.as_f64()
+    }
+}
+
+/// Every line of a file of metrics.
+pub(crate) fn read(path: &Path) -> Result<Vec<Line>> {
+    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let line = |(number, line)| {
+        serde_json::from_str(line).with_context(|| format!("{}:{}: no line of metrics", path.display(), number + 1))
+    };
+    text.lines().enumerate().map(line).collect()
 }
 
 /// produced = trained + dropped + in flight.
@@ -49,13 +67,23 @@ mod tests {
     fn a_learners_line_is_read_with_its_absent_shares() {
         let line: Line = serde_json::from_str(
             r#"{"seconds":5.0,"environment_steps":4096,"updates":1,"version":1,"episode_length":null,
-                "reward_terms":{"com":null},"losses":{"policy":0.1},
+                "reward_terms":{"com":null},"losses":{"latent_kl":4.5},
                 "books":{"produced":3,"trained":2,"dropped":{"stale":1},"in_flight":0}}"#,
         )
         .unwrap();
         assert_eq!(line.environment_steps, 4096);
         assert!(line.episode_length.is_none());
+        assert_eq!(line.latent_kl(), Some(4.5));
         assert_eq!(line.books.unwrap().dropped["stale"], 1);
+    }
+
+    #[test]
+    fn a_file_that_is_no_metrics_is_refused_by_line() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("metrics.jsonl");
+        std::fs::write(&path, "{}\nnonsense\n").unwrap();
+        let error = read(&path).unwrap_err();
+        assert!(format!("{error:#}").contains("metrics.jsonl:2"), "{error:#}");
     }
 
     #[test]

@@ -1,14 +1,15 @@
 //! `cargo xtask train`: one learner and its actors on this machine, watched to the end, and what was learnt.
 
-mod display;
-mod evaluation;
+pub(crate) mod display;
+pub(crate) mod evaluation;
 pub(crate) mod metrics;
 mod process;
 mod run_directory;
 mod supervisor;
 
 use std::net::TcpListener;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU16, Ordering};
 
 use anyhow::{Context, Result, bail};
 use comic_experiment::Experiment;
@@ -16,6 +17,7 @@ use comic_experiment::Experiment;
 use crate::interrupt::Interrupt;
 use crate::{plot, setup, workspace};
 use display::Display;
+use evaluation::Evaluation;
 use run_directory::RunDirectory;
 use supervisor::Supervisor;
 
@@ -23,35 +25,35 @@ use supervisor::Supervisor;
 pub(crate) struct Options {
     /// A preset's name or the path of an experiment file
     #[arg(long, default_value = "quickstart", value_name = "NAME|FILE")]
-    preset: String,
+    pub(crate) preset: String,
     /// Clips to track instead of the experiment's: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP
     #[arg(long, num_args = 1.., value_name = "SOURCE")]
-    clips: Vec<String>,
+    pub(crate) clips: Vec<String>,
     /// Override any field of the experiment, for instance --set vmpo.epsilon_eta=0.2
     #[arg(long = "set", value_name = "FIELD=VALUE")]
-    overrides: Vec<String>,
+    pub(crate) overrides: Vec<String>,
     /// Actor processes
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..=1024))]
-    actors: u16,
+    pub(crate) actors: u16,
     /// Directory of the run [default: runs/PRESET-1, -2, …]
     #[arg(long, value_name = "DIR")]
-    run: Option<PathBuf>,
+    pub(crate) run: Option<PathBuf>,
     /// The learner's port [default: the first free one from 7070 on]
     #[arg(long, value_parser = clap::value_parser!(u16).range(1..))]
-    port: Option<u16>,
+    pub(crate) port: Option<u16>,
     /// Minutes to train, instead of the experiment's budget
     #[arg(long)]
-    minutes: Option<f64>,
+    pub(crate) minutes: Option<f64>,
     /// Episodes of each clip in the evaluations at the end [default: every start frame once]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    episodes: Option<u32>,
+    pub(crate) episodes: Option<u32>,
     /// Go on with a run: the one named by --run, or else the preset's newest
     #[arg(long)]
-    resume: bool,
+    pub(crate) resume: bool,
 }
 
-/// What the learner is started with.
-struct Job {
+/// One run: what its learner is started with, and where it keeps what it makes.
+pub(crate) struct Job {
     experiment: Experiment,
     /// `--preset`, `--clips` and `--set` as the learner takes them.
     document: Vec<String>,
@@ -64,40 +66,31 @@ struct Job {
 /// Trains, and prints what was learnt.
 pub(crate) fn run(options: Options) -> Result<()> {
     let job = Job::new(options)?;
-    setup::run(&setup::Options::default())?;
-    workspace::build()?;
+    prepare()?;
     let interrupt = Interrupt::install()?;
-    job.directory.make()?;
-    // Chosen only now: the build takes minutes, and a port that was free before it may be taken.
-    let port = job.port.map_or_else(free_port, Ok)?;
     let mut display = Display::new(&job.experiment.budget);
-    display.event("starting", &[("run", job.directory.path().display().to_string()), ("port", port.to_string())]);
-    let outcome = Supervisor::start(&job, port, &mut display, &interrupt).and_then(|mut supervisor| {
-        let outcome = supervisor.watch(&mut display, &interrupt);
-        supervisor.stop(&mut display);
-        outcome
-    });
+    let outcome = job.train(&mut display, &interrupt);
     display.finish();
-    let metrics = job.directory.metrics();
-    if metrics.exists() {
-        let curve = job.directory.path().join("curve.svg");
-        match plot::run(&[metrics.display().to_string()], plot::Quantity::EpisodeReturn, &curve) {
-            Ok(()) => {}
-            Err(error) => eprintln!("no curve: {error:#}"),
-        }
-    }
     outcome?;
-    evaluation::compare(&job, &interrupt)
+    let evaluations = job.evaluate(&mut display, &interrupt)?;
+    println!("{}\nkept in {}", evaluation::table(&evaluations), job.path().display());
+    Ok(())
+}
+
+/// Sets up and builds.
+pub(crate) fn prepare() -> Result<()> {
+    setup::run(&setup::Options::default())?;
+    workspace::build()
 }
 
 impl Job {
-    fn new(options: Options) -> Result<Self> {
+    /// Resolves the experiment, so that a wrong field is refused before anything is fetched or built.
+    pub(crate) fn new(options: Options) -> Result<Self> {
         let mut overrides = options.overrides;
         if let Some(minutes) = options.minutes {
             overrides.push(format!("budget.minutes={minutes:?}"));
         }
-        // Resolved here too, so that a wrong field is refused before anything is fetched or built.
-        let experiment = comic_experiment::resolve(&options.preset, &overrides)?;
+        let experiment = comic_experiment::resolve(&options.preset, &overrides)?.with_clips(&options.clips);
         let directory = RunDirectory::choose(options.run, &experiment.name, options.resume)?;
         let mut document = vec!["--preset".to_owned(), absolute_if_file(&options.preset)?];
         for setting in &overrides {
@@ -116,6 +109,48 @@ impl Job {
             directory,
         })
     }
+
+    /// What is learnt.
+    pub(crate) fn experiment(&self) -> &Experiment {
+        &self.experiment
+    }
+
+    /// The run's directory.
+    pub(crate) fn path(&self) -> &Path {
+        self.directory.path()
+    }
+
+    /// The run's metrics, once there are any.
+    pub(crate) fn metrics(&self) -> PathBuf {
+        self.directory.metrics()
+    }
+
+    /// Trains until the budget is spent or somebody asks to stop, and draws the curve.
+    pub(crate) fn train(&self, display: &mut Display, interrupt: &Interrupt) -> Result<()> {
+        self.directory.make()?;
+        // Chosen only now: the build takes minutes, and a port that was free before it may be taken.
+        let port = self.port.map_or_else(free_port, Ok)?;
+        display.event("starting", &[("directory", self.path().display().to_string()), ("port", port.to_string())]);
+        let outcome = Supervisor::start(self, port, display, interrupt).and_then(|mut supervisor| {
+            let outcome = supervisor.watch(display, interrupt);
+            supervisor.stop(display);
+            outcome
+        });
+        let metrics = self.metrics();
+        if metrics.exists() {
+            let curve = self.path().join("curve.svg");
+            match plot::draw_runs(&[plot::Source::of(metrics)], plot::Quantity::EpisodeReturn, &curve) {
+                Ok(()) => display.event("drew", &[("curve", curve.display().to_string())]),
+                Err(error) => display.event("no curve", &[("reason", format!("{error:#}"))]),
+            }
+        }
+        outcome
+    }
+
+    /// Evaluates the run's policies without noise and keeps what was found in `evaluation.json`.
+    pub(crate) fn evaluate(&self, display: &mut Display, interrupt: &Interrupt) -> Result<Vec<(String, Evaluation)>> {
+        evaluation::compare(self, display, interrupt)
+    }
 }
 
 fn absolute_if_file(preset: &str) -> Result<String> {
@@ -126,13 +161,29 @@ fn absolute_if_file(preset: &str) -> Result<String> {
     Ok(path.display().to_string())
 }
 
-/// The first free port from 7070 on. All are below 32768: a listening port inside the ephemeral range can meet a TCP
-/// self-connect.
+/// The first free port from 7070 on that this program has not taken yet: runs side by side choose before their learners
+/// listen. All are below 32768: a listening port inside the ephemeral range can meet a TCP self-connect.
 fn free_port() -> Result<u16> {
-    for port in 7070..7170 {
+    static TAKEN: AtomicU16 = AtomicU16::new(0);
+    for _ in 0..PORTS {
+        let port = 7070 + TAKEN.fetch_add(1, Ordering::Relaxed) % PORTS;
         if TcpListener::bind(("127.0.0.1", port)).is_ok() {
             return Ok(port);
         }
     }
-    bail!("no port from 7070 to 7169 is free; name one by --port")
+    bail!("no port from 7070 to {} is free; name one by --port", 7070 + PORTS - 1)
+}
+
+/// Ports that are tried.
+const PORTS: u16 = 100;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runs_side_by_side_get_ports_of_their_own() {
+        let ports: std::collections::BTreeSet<u16> = (0..5).map(|_| free_port().unwrap()).collect();
+        assert_eq!(ports.len(), 5);
+    }
 }

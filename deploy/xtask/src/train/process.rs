@@ -2,6 +2,7 @@
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom};
+use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
@@ -9,7 +10,8 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result};
 use rustix::process::{Pid, Signal, kill_process};
 
-/// A running learner or actor. It stays in this program's process group, so a closed terminal reaches it too.
+/// A running learner or actor. A terminal's Ctrl-C does not reach it: this program passes on every request to stop, and a
+/// learner that is asked twice leaves without its last checkpoint.
 pub(super) struct Process {
     pub(super) name: String,
     log: PathBuf,
@@ -23,13 +25,13 @@ impl Process {
     /// Starts `command`; both its outputs are appended to `log`.
     pub(super) fn start(name: impl Into<String>, command: &mut Command, log: PathBuf) -> Result<Self> {
         let name = name.into();
-        let output = OpenOptions::new().create(true).append(true).open(&log);
-        let output = output.with_context(|| format!("cannot write {}", log.display()))?;
+        let output = append(&log)?;
         let log_start = output.metadata().map_or(0, |metadata| metadata.len());
         let child = command
             .stdin(Stdio::null())
             .stdout(output.try_clone().context("cannot share a log")?)
             .stderr(output)
+            .process_group(0)
             .spawn()
             .with_context(|| format!("cannot start {name} ({})", Path::new(command.get_program()).display()))?;
         Ok(Self { name, log, log_start, child, started: Instant::now() })
@@ -93,6 +95,12 @@ impl Drop for Process {
             self.wait(Duration::from_secs(10));
         }
     }
+}
+
+/// A log to write to, after whatever it holds.
+pub(super) fn append(log: &Path) -> Result<File> {
+    let file = OpenOptions::new().create(true).append(true).open(log);
+    file.with_context(|| format!("cannot write {}", log.display()))
 }
 
 /// Reads a file that grows, line by line.

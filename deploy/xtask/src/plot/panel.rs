@@ -1,0 +1,78 @@
+//! One panel of a picture: axes, lines with their bands, names.
+
+use std::ops::Range;
+
+use anyhow::{Result, anyhow};
+use plotters::coord::Shift;
+use plotters::prelude::*;
+
+/// A line with a name, and the band around it.
+pub(super) struct Series {
+    pub(super) label: String,
+    /// (x, y).
+    pub(super) line: Vec<(f64, f64)>,
+    /// (x, lower edge, upper edge); none where the line stands alone.
+    pub(super) band: Vec<(f64, f64, f64)>,
+}
+
+impl Series {
+    /// A line without a band.
+    pub(super) fn line(label: String, line: Vec<(f64, f64)>) -> Self {
+        Self { label, line, band: Vec::new() }
+    }
+
+    /// The band's outline: along its upper edge and back along its lower one.
+    fn outline(&self) -> Vec<(f64, f64)> {
+        let upper = self.band.iter().map(|(x, _, high)| (*x, *high));
+        upper.chain(self.band.iter().rev().map(|(x, low, _)| (*x, *low))).collect()
+    }
+}
+
+/// Draws `series`, each in a colour of its own.
+pub(super) fn panel<B: DrawingBackend>(
+    area: &DrawingArea<B, Shift>,
+    series: &[Series],
+    x_label: &str,
+    y_label: &str,
+) -> Result<()> {
+    let outlines: Vec<_> = series.iter().map(Series::outline).collect();
+    let points = || series.iter().map(|series| &series.line).chain(&outlines).flatten();
+    let x_range = 0.0..points().map(|point| point.0).fold(1e-6, f64::max);
+    let y_range = range_of(points().map(|point| point.1));
+    let failed = |error: String| anyhow!(error);
+    let mut chart = ChartBuilder::on(area)
+        .margin(12)
+        .x_label_area_size(36)
+        .y_label_area_size(48)
+        .build_cartesian_2d(x_range, y_range)
+        .map_err(|error| failed(error.to_string()))?;
+    chart
+        .configure_mesh()
+        .x_desc(x_label)
+        .y_desc(y_label)
+        .light_line_style(TRANSPARENT)
+        .draw()
+        .map_err(|error| failed(error.to_string()))?;
+    for (index, (series, outline)) in series.iter().zip(outlines).enumerate() {
+        let colour = Palette99::pick(index).to_rgba();
+        chart.draw_series([Polygon::new(outline, colour.mix(0.2))]).map_err(|error| failed(error.to_string()))?;
+        chart
+            .draw_series(LineSeries::new(series.line.iter().copied(), colour.stroke_width(2)))
+            .map_err(|error| failed(error.to_string()))?
+            .label(&series.label)
+            .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
+    }
+    chart
+        .configure_series_labels()
+        .position(SeriesLabelPosition::LowerRight)
+        .background_style(WHITE.mix(0.8))
+        .draw()
+        .map_err(|error| failed(error.to_string()))
+}
+
+/// From 0, or below it, to a little above the largest value.
+fn range_of(values: impl Iterator<Item = f64> + Clone) -> Range<f64> {
+    let low = values.clone().fold(0.0, f64::min);
+    let high = values.fold(low + 1e-6, f64::max);
+    low..high + 0.05 * (high - low)
+}

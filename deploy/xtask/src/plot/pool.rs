@@ -1,0 +1,69 @@
+//! Several runs of the same experiment as one curve: their mean, and a band from the least to the most of them.
+
+use super::Point;
+use super::panel::Series;
+
+/// Places at which runs are compared, whose own lines come at different steps.
+const SAMPLES: usize = 200;
+
+/// Mean and range of `curves` over environment steps, wherever all of them are. Each is sorted by steps.
+pub(super) fn pool(label: String, curves: &[Vec<Point>]) -> Series {
+    let from = curves.iter().filter_map(|curve| curve.first()).map(|point| point.steps).fold(0.0, f64::max);
+    let to = curves.iter().filter_map(|curve| curve.last()).map(|point| point.steps).fold(f64::INFINITY, f64::min);
+    let mut series = Series::line(label, Vec::new());
+    if from > to || to.is_infinite() {
+        return series;
+    }
+    for sample in 0..=SAMPLES {
+        let steps = from + (to - from) * sample as f64 / SAMPLES as f64;
+        let values: Vec<f64> = curves.iter().filter_map(|curve| at(curve, steps)).collect();
+        series.line.push((steps, values.iter().sum::<f64>() / values.len() as f64));
+        if curves.len() > 1 {
+            let least = values.iter().copied().fold(f64::INFINITY, f64::min);
+            series.band.push((steps, least, values.iter().copied().fold(f64::NEG_INFINITY, f64::max)));
+        }
+    }
+    series
+}
+
+/// The value between a curve's two points around `steps`; its first or last one beyond them.
+fn at(curve: &[Point], steps: f64) -> Option<f64> {
+    let next = curve.partition_point(|point| point.steps < steps);
+    match (next.checked_sub(1).and_then(|before| curve.get(before)), curve.get(next)) {
+        (Some(before), Some(after)) => {
+            let share = (steps - before.steps) / (after.steps - before.steps);
+            Some(before.value + share * (after.value - before.value))
+        }
+        (before, after) => before.or(after).map(|point| point.value),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn curve(points: &[(f64, f64)]) -> Vec<Point> {
+        points.iter().map(|(steps, value)| Point { minutes: 0.0, steps: *steps, value: *value }).collect()
+    }
+
+    #[test]
+    fn runs_are_compared_where_all_of_them_are_and_between_their_points() {
+        let series =
+            pool("β".into(), &[curve(&[(0.0, 0.0), (4.0, 4.0)]), curve(&[(1.0, 3.0), (2.0, 4.0), (3.0, 5.0)])]);
+        assert_eq!((series.line[0], series.band[0]), ((1.0, 2.0), (1.0, 1.0, 3.0)));
+        assert_eq!((series.line[SAMPLES], series.band[SAMPLES]), ((3.0, 4.0), (3.0, 3.0, 5.0)));
+    }
+
+    #[test]
+    fn one_run_is_a_line_without_a_band() {
+        let series = pool("β".into(), &[curve(&[(0.0, 1.0), (1.0, 2.0)])]);
+        assert_eq!((series.line[0], series.line[SAMPLES]), ((0.0, 1.0), (1.0, 2.0)));
+        assert!(series.band.is_empty());
+    }
+
+    #[test]
+    fn runs_that_never_were_at_the_same_step_make_no_line() {
+        assert!(pool("β".into(), &[curve(&[(0.0, 1.0)]), curve(&[(1.0, 1.0)])]).line.is_empty());
+        assert!(pool("β".into(), &[]).line.is_empty());
+    }
+}

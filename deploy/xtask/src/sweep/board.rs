@@ -1,0 +1,52 @@
+//! How far a sweep is: a bar, and a row for each run that goes on. Nothing where no terminal is: there each run says by
+//! itself what becomes of it.
+
+use std::time::Duration;
+
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+
+use super::plan::Run;
+use crate::progress::on_terminal;
+use crate::train::display::Display;
+
+pub(super) struct Board(Option<Bars>);
+
+struct Bars {
+    rows: MultiProgress,
+    runs: ProgressBar,
+}
+
+impl Board {
+    /// For `total` runs, of which some are finished.
+    pub(super) fn new(total: usize, finished: usize) -> Self {
+        Self(on_terminal().then(|| {
+            let rows = MultiProgress::new();
+            let runs = rows.add(ProgressBar::new(total as u64).with_position(finished as u64));
+            if let Ok(style) = ProgressStyle::with_template("{elapsed_precise} {wide_bar} {pos} of {len} runs") {
+                runs.set_style(style);
+            }
+            runs.enable_steady_tick(Duration::from_millis(500));
+            Bars { rows, runs }
+        }))
+    }
+
+    /// Where a person sees `run`.
+    pub(super) fn display(&self, run: &Run) -> Display {
+        let row = self.0.as_ref().map(|bars| bars.rows.insert_before(&bars.runs, ProgressBar::new(0)));
+        Display::beside_others(&run.name, &run.job.experiment().budget, row)
+    }
+
+    /// One more run is finished.
+    pub(super) fn count(&self) {
+        if let Some(bars) = &self.0 {
+            bars.runs.inc(1);
+        }
+    }
+
+    /// Leaves the bar standing as it is.
+    pub(super) fn finish(&self) {
+        if let Some(bars) = &self.0 {
+            bars.runs.abandon();
+        }
+    }
+}

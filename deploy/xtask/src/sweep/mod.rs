@@ -1,0 +1,303 @@
+//! `cargo xtask sweep`: an experiment with some of its fields varied, run by run, and what each value was worth.
+
+mod board;
+mod document;
+mod plan;
+mod table;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::sync_channel;
+use std::thread;
+
+use anyhow::{Context, Result, bail};
+
+use crate::interrupt::Interrupt;
+use crate::train::display::Display;
+use crate::{plot, train, workspace};
+use board::Board;
+use document::Document;
+use plan::{Point, Run};
+use table::{Outcome, Row};
+
+#[derive(clap::Args)]
+pub(crate) struct Options {
+    /// What is varied; docs/sweeps has examples
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    /// Directory of the runs, tables and curves [default: runs/sweep-FILE]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+}
+
+/// Trains and evaluates what is not there yet, and prints the table.
+pub(crate) fn run(options: Options) -> Result<()> {
+    let name = options.file.file_stem().unwrap_or_default().to_string_lossy();
+    let out = options.out.unwrap_or_else(|| workspace::root().join("runs").join(format!("sweep-{name}")));
+    let sweep = Sweep::plan(&options.file, &out)?;
+    train::prepare()?;
+    let interrupt = Interrupt::install()?;
+    let ended = sweep.run(&interrupt, |run, display| {
+        run.job.train(display, &interrupt)?;
+        if interrupt.requested() {
+            bail!("interrupted");
+        }
+        run.job.evaluate(display, &interrupt).map(drop)
+    });
+    println!("\n{}\nkept in {}", table::markdown(&sweep.rows()), sweep.directory.display());
+    ended
+}
+
+/// Every run there is to be, and where.
+struct Sweep {
+    directory: PathBuf,
+    /// Runs at once.
+    parallel: usize,
+    points: Vec<Point>,
+    runs: Vec<Run>,
+}
+
+impl Sweep {
+    /// Reads the file, and refuses whatever one of its runs would be refused for.
+    fn plan(file: &Path, out: &Path) -> Result<Self> {
+        let document = Document::read(file)?;
+        let directory = std::path::absolute(out).with_context(|| format!("no such path: {}", out.display()))?;
+        let points = plan::points(&document);
+        let runs = plan::runs(&document, &points, &directory).with_context(|| file.display().to_string())?;
+        Ok(Self { directory, parallel: document.parallel.get(), points, runs })
+    }
+
+    /// Has `train` make every run that is not finished, some at once, and sums up after each of them. One that fails does
+    /// not stop the others; a request to stop does.
+    fn run(&self, interrupt: &Interrupt, train: impl Fn(&Run, &mut Display) -> Result<()> + Sync) -> Result<()> {
+        let left: Vec<&Run> = self.runs.iter().filter(|run| !run.finished()).collect();
+        let board = Board::new(self.runs.len(), self.runs.len() - left.len());
+        let next = AtomicUsize::new(0);
+        let mut failed = Vec::new();
+        thread::scope(|scope| {
+            let (report, reports) = sync_channel(1);
+            for _ in 0..self.parallel.min(left.len()) {
+                let report = report.clone();
+                let (left, next, board, train) = (&left, &next, &board, &train);
+                scope.spawn(move || {
+                    while !interrupt.requested()
+                        && let Some(run) = left.get(next.fetch_add(1, Ordering::Relaxed))
+                    {
+                        let mut display = board.display(run);
+                        let outcome = train(run, &mut display).and_then(|()| run.outcome());
+                        show(display, &outcome, interrupt.requested());
+                        // Who receives it stays until every sender is gone.
+                        let _ = report.send((run, outcome.is_ok()));
+                    }
+                });
+            }
+            drop(report);
+            for (run, finished) in reports {
+                if finished {
+                    board.count();
+                } else {
+                    failed.push(run.name.as_str());
+                }
+                // Whatever keeps it from that will keep it at the end too, and is reported there.
+                let _ = self.sum_up();
+            }
+        });
+        board.finish();
+        self.sum_up()?;
+        let finished = self.runs.iter().filter(|run| run.finished()).count();
+        if interrupt.requested() {
+            bail!("interrupted; {finished} of {} runs are finished, the same command goes on", self.runs.len());
+        }
+        if !failed.is_empty() {
+            bail!(
+                "{} of {} runs failed ({}); the same command tries them again, and their logs are in {}",
+                failed.len(),
+                self.runs.len(),
+                failed.join("; "),
+                self.directory.display()
+            );
+        }
+        Ok(())
+    }
+
+    fn rows(&self) -> Vec<Row<'_>> {
+        Row::all(&self.points, &self.runs)
+    }
+
+    /// Writes both tables and the picture of the runs that are finished.
+    fn sum_up(&self) -> Result<()> {
+        let rows = self.rows();
+        let write = |name: &str, text: String| {
+            let path = self.directory.join(name);
+            fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
+        };
+        fs::create_dir_all(&self.directory).with_context(|| format!("cannot make {}", self.directory.display()))?;
+        write("table.md", table::markdown(&rows))?;
+        write("table.json", serde_json::to_string_pretty(&table::json(&rows))?)?;
+        let groups: Vec<_> = self
+            .points
+            .iter()
+            .enumerate()
+            .map(|(index, point)| {
+                let runs = self.runs.iter().filter(|run| run.point == index && run.finished());
+                (point.name(), runs.map(|run| run.job.metrics()).collect())
+            })
+            .collect();
+        plot::draw_groups(&groups, plot::Quantity::NormalisedReward, &self.directory.join("curves.svg"))
+    }
+}
+
+/// How a run ended, where a person looks.
+fn show(display: Display, outcome: &Result<Outcome>, interrupted: bool) {
+    match outcome {
+        Ok(outcome) => {
+            display.conclude("finished", &[("normalised reward", format!("{:.3}", outcome.normalised_reward))]);
+        }
+        Err(_) if interrupted => display.conclude("stopped", &[]),
+        Err(error) => display.conclude("failed", &[("reason", format!("{error:#}"))]),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::{Barrier, Mutex};
+
+    use serde_json::json;
+
+    use super::*;
+
+    /// A directory with a sweep over two values and two seeds, and who was trained in it.
+    struct Bench {
+        directory: tempfile::TempDir,
+        trained: Mutex<Vec<String>>,
+    }
+
+    const ALL: [&str; 4] = ["beta=0,seed=1", "beta=0,seed=2", "beta=1e-4,seed=1", "beta=1e-4,seed=2"];
+
+    impl Bench {
+        fn new() -> Self {
+            let bench = Self { directory: tempfile::tempdir().unwrap(), trained: Mutex::default() };
+            bench.write("preset = \"quickstart\"\nseeds = [1, 2]\n[grid]\n\"latent.beta\" = [0, 1e-4]\n");
+            bench
+        }
+
+        fn write(&self, text: &str) {
+            fs::write(self.directory.path().join("sweep.toml"), text).unwrap();
+        }
+
+        fn plan(&self) -> Result<Sweep> {
+            Sweep::plan(&self.directory.path().join("sweep.toml"), &self.directory.path().join("out"))
+        }
+
+        /// Leaves in the run's directory what training does.
+        fn train(&self, run: &Run) -> Result<()> {
+            self.begin(run);
+            let overall = json!({
+                "clip": "overall", "episodes": 1, "length_mean": 30.0, "return_mean": 1.0, "normalised_reward": run.seed,
+                "reward_per_step": 0.5, "fraction_survived": 1.0, "reward_terms": {},
+            });
+            let evaluation = json!({ "trained": { "clips": [], "overall": overall } }).to_string();
+            fs::write(run.job.path().join("evaluation.json"), evaluation)?;
+            Ok(())
+        }
+
+        /// Leaves in the run's directory what training does until it is interrupted.
+        fn begin(&self, run: &Run) {
+            self.trained.lock().unwrap().push(run.name.clone());
+            fs::create_dir_all(run.job.path().join("checkpoints")).unwrap();
+            let experiment = run.job.experiment().to_toml().unwrap();
+            fs::write(run.job.path().join("experiment.toml"), experiment).unwrap();
+            let line = json!({ "seconds": 60, "environment_steps": 1000, "normalised_reward": 0.5 }).to_string();
+            fs::write(run.job.path().join("metrics.jsonl"), line + "\n").unwrap();
+        }
+
+        /// Who was trained since the last call.
+        fn trained(&self) -> Vec<String> {
+            let mut names = std::mem::take(&mut *self.trained.lock().unwrap());
+            names.sort();
+            names
+        }
+
+        fn out(&self, name: &str) -> String {
+            fs::read_to_string(self.directory.path().join("out").join(name)).unwrap()
+        }
+    }
+
+    #[test]
+    fn the_sweeps_in_the_docs_are_sweeps() {
+        let files = fs::read_dir(workspace::root().join("docs/sweeps")).unwrap();
+        for file in files.map(|file| file.unwrap().path()) {
+            Sweep::plan(&file, tempfile::tempdir().unwrap().path()).unwrap();
+        }
+    }
+
+    #[test]
+    fn every_run_is_trained_once_and_summed_up() {
+        let bench = Bench::new();
+        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
+        assert_eq!(bench.trained(), ALL);
+        assert!(bench.out("table.md").contains("| 1e-4 | 1, 2 | 1.500 (1.000–2.000) | 0.500 |"));
+        let table: serde_json::Value = serde_json::from_str(&bench.out("table.json")).unwrap();
+        assert_eq!(table[1]["normalised_reward"]["mean"], 1.5);
+        assert!(bench.out("curves.svg").contains("beta=1e-4"));
+    }
+
+    #[test]
+    fn what_is_finished_is_not_trained_again() {
+        let bench = Bench::new();
+        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
+        bench.trained();
+        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
+        assert!(bench.trained().is_empty());
+    }
+
+    #[test]
+    fn a_run_that_fails_does_not_stop_the_others_and_is_tried_again() {
+        let bench = Bench::new();
+        let train = |run: &Run, _: &mut Display| if run.name == ALL[1] { bail!("diverged") } else { bench.train(run) };
+        let error = bench.plan().unwrap().run(&Interrupt::default(), train).unwrap_err().to_string();
+        assert!(error.starts_with("1 of 4 runs failed (beta=0,seed=2)"), "{error}");
+        assert_eq!(bench.trained().len(), 3);
+        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
+        assert_eq!(bench.trained(), [ALL[1]]);
+    }
+
+    #[test]
+    fn an_interrupted_sweep_begins_no_other_run_and_goes_on_with_the_one_it_left() {
+        let bench = Bench::new();
+        let interrupt = Interrupt::default();
+        let train = |run: &Run, _: &mut Display| {
+            bench.begin(run);
+            interrupt.request();
+            bail!("interrupted")
+        };
+        let error = bench.plan().unwrap().run(&interrupt, train).unwrap_err().to_string();
+        assert_eq!(error, "interrupted; 0 of 4 runs are finished, the same command goes on");
+        assert_eq!(bench.trained(), [ALL[0]]);
+        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
+        assert_eq!(bench.trained(), ALL);
+    }
+
+    #[test]
+    fn as_many_runs_as_the_file_says_go_on_at_once() {
+        let bench = Bench::new();
+        bench.write("preset = \"quickstart\"\nparallel = 2\nseeds = [1, 2]");
+        let both = Barrier::new(2);
+        let train = |run: &Run, _: &mut Display| {
+            both.wait();
+            bench.train(run)
+        };
+        bench.plan().unwrap().run(&Interrupt::default(), train).unwrap();
+        assert_eq!(bench.trained(), ["seed=1", "seed=2"]);
+    }
+
+    #[test]
+    fn a_file_that_was_changed_under_its_runs_is_refused() {
+        let bench = Bench::new();
+        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
+        bench.write("preset = \"quickstart\"\n[set]\nbudget.minutes = 1\n[grid]\n\"latent.beta\" = [0]\n");
+        let error = format!("{:#}", bench.plan().err().unwrap());
+        assert!(error.contains("sweep.toml: beta=0,seed=1: ") && error.contains("budget.minutes"), "{error}");
+    }
+}
