@@ -131,7 +131,13 @@ mod tests {
             reward_terms: vec!["pose".into(), "velocity".into()],
             image: 0,
             clips: vec!["walk".into(), "run".into(), "unused".into()],
-            tasks: vec![TaskPart { name: "tracking".into(), observation: 1, clips: 3, max_reward: 1.45, demonstrated: true }],
+            tasks: vec![TaskPart {
+                name: "tracking".into(),
+                observation: 1,
+                clips: 3,
+                max_reward: 1.45,
+                demonstrated: true,
+            }],
         }
     }
 
@@ -170,9 +176,13 @@ mod tests {
         spec.tasks.push(TaskPart { name: "get-up".into(), max_reward: 1.0, clips: 1, ..spec.tasks[0].clone() });
         let finished = [episode(0, 10, 10, 14.5, 0.0), episode(1, 10, 10, 0.0, 0.0), episode(2, 10, 10, 5.0, 0.0)];
         let report = Report::new(&spec, &finished, &Options::default());
-        let rows: Vec<_> = report.tasks.iter().map(|row| (row.clip.as_str(), row.episodes, row.normalised_reward)).collect();
+        let rows: Vec<_> =
+            report.tasks.iter().map(|row| (row.clip.as_str(), row.episodes, row.normalised_reward)).collect();
         assert_eq!(rows, [("tracking", 2, 0.5), ("get-up", 1, 0.5)]);
-        assert!(Report::new(&self::spec(), &finished[..2], &Options::default()).tasks.is_empty(), "one task is the whole");
+        assert!(
+            Report::new(&self::spec(), &finished[..2], &Options::default()).tasks.is_empty(),
+            "one task is the whole"
+        );
     }
 
     #[test]
