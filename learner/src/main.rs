@@ -4,7 +4,7 @@ use std::io::IsTerminal as _;
 use std::process::ExitCode;
 
 use clap::Parser as _;
-use comic_learner::options::{Command, LogFormat, Options};
+use comic_learner::options::{Command, LogFormat, Misuse, Options};
 use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
@@ -22,6 +22,10 @@ fn main() -> ExitCode {
         Some(Command::Bench { threads, repeats, low_level }) => {
             comic_learner::bench::run(*threads, *repeats, *low_level)
         }
+        Some(Command::Status(status)) => status.run(),
+        Some(Command::Health(health)) => return health.run(),
+        Some(Command::Certs(certs)) => certs.run(),
+        Some(Command::Metrics) => comic_learner::telemetry::print_reference(),
         None => comic_learner::run::run(&options),
     };
     match ended {
@@ -32,7 +36,8 @@ fn main() -> ExitCode {
             let configuration = error.chain().any(|cause| {
                 cause.is::<comic_experiment::Error>()
                     || cause.is::<comic_clips::Error>()
-                    || cause.is::<comic_learner::run::Misuse>()
+                    || cause.is::<comic_proto::AccessError>()
+                    || cause.is::<Misuse>()
             });
             ExitCode::from(if configuration { 2 } else { 1 })
         }

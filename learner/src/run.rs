@@ -18,8 +18,10 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
 
 use crate::checkpoint::{Snapshot, Store};
-use crate::options::Options;
+use crate::options::{Misuse, Options};
+use crate::probes;
 use crate::publish::Publisher;
+use crate::security::Security;
 use crate::service::{self, Shared};
 use crate::trainer::{Ending, Setup, Trainer};
 
@@ -50,20 +52,27 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     let mut interrupt = signal(SignalKind::interrupt())?;
     let mut terminate = signal(SignalKind::terminate())?;
     let mut hangup = signal(SignalKind::hangup())?;
-    let address = SocketAddr::new(options.address, options.port);
-    let listener = TcpListener::bind(address)
-        .await
-        .with_context(|| format!("cannot listen on {address}: choose another --port, or 0 for any free one"))?;
+    let security = Security::new(&options.security, options.address)?;
+    let listener = listen(options, "port", options.port).await?;
+    let metrics = match options.metrics_port {
+        Some(port) => Some(listen(options, "metrics-port", port).await?),
+        None => None,
+    };
     let _lock = Store::open(&options.run, experiment.learner.checkpoints_kept)?.lock()?;
-    let (setup, shared) = prepare(options, experiment)?;
+    let (setup, shared) = prepare(options, experiment, security)?;
     let (batcher, publisher, epoch) = (setup.batcher.clone(), setup.publisher.clone(), setup.epoch);
     let mut training = start_trainer(setup)?;
     let (stop_serving, stopped) = oneshot::channel::<()>();
     let address = listener.local_addr()?;
+    let mut listening =
+        serde_json::json!({ "listening": address.to_string(), "learner_epoch": epoch, "run": options.run });
+    if let Some(metrics) = metrics {
+        listening["metrics"] = metrics.local_addr()?.to_string().into();
+        tokio::spawn(probes::serve(metrics, shared.clone()));
+    }
     let serving = tokio::spawn(service::serve(listener, shared, async {
         let _ = stopped.await;
     }));
-    let listening = serde_json::json!({ "listening": address.to_string(), "learner_epoch": epoch, "run": options.run });
     // Nobody has to read it.
     let _ = writeln!(std::io::stdout(), "{listening}");
     tracing::info!(%address, epoch, run = %options.run.display(), "serving");
@@ -103,6 +112,13 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     Ok(())
 }
 
+async fn listen(options: &Options, flag: &str, port: u16) -> Result<TcpListener> {
+    let address = SocketAddr::new(options.address, port);
+    TcpListener::bind(address)
+        .await
+        .with_context(|| format!("cannot listen on {address}: choose another --{flag}, or 0 for any free one"))
+}
+
 type Training = oneshot::Receiver<Result<Ending>>;
 
 fn start_trainer(setup: Setup) -> Result<Training> {
@@ -117,11 +133,11 @@ fn start_trainer(setup: Setup) -> Result<Training> {
     Ok(training)
 }
 
-fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shared>)> {
+fn prepare(options: &Options, experiment: Experiment, security: Security) -> Result<(Setup, Arc<Shared>)> {
     let catalogue = Catalogue::open(&experiment.clips)?;
     let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
     let spec = TaskSpec::new(&experiment, names)
-        .map_err(|name| Misuse(format!("tracking.observations: the tracking task has no observation `{name}`")))?;
+        .map_err(|name| Misuse::new(format!("tracking.observations: the tracking task has no observation `{name}`")))?;
     let pose = match experiment.network.initial_pose {
         InitialPose::MidRange => vec![0.0; spec.action],
         InitialPose::ReferenceMean => catalogue.mean_action()?.iter().map(|action| *action as f32).collect(),
@@ -150,6 +166,9 @@ fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shar
     let batcher = Batcher::new(layout, config, Phase { epoch, ..Phase::default() }, ledger);
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {
+        run: options.run.clone(),
+        security,
+        limits: options.limits.clone(),
         experiment: experiment.clone(),
         spec: spec.clone(),
         assets: catalogue.assets()?,
@@ -173,19 +192,14 @@ fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot)
     };
     let (now, then) = (comparable(now)?, then.to_toml()?);
     if let Some((new, old)) = now.lines().zip(then.lines()).find(|(new, old)| new != old) {
-        return Err(Misuse(format!(
+        return Err(Misuse::new(format!(
             "it was made with `{old}` where the experiment now says `{new}`: give another --run, or the old value"
         ))
         .into());
     }
     let clips: TaskSpec = serde_json::from_slice(snapshot.part("task.json")?)?;
     if now != then || clips != *spec {
-        return Err(Misuse("it was made by an experiment with other clips or fields: give another --run".into()).into());
+        return Err(Misuse::new("it was made by an experiment with other clips or fields: give another --run").into());
     }
     Ok(())
 }
-
-/// A configuration that is wrong and stays wrong, however often it is tried.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct Misuse(String);

@@ -127,7 +127,7 @@ impl Trainer {
             losses: Map::new(),
             oldest: 0,
             metrics: Metrics::open(&run, &spec)?,
-            writer: Writer::start(store)?,
+            writer: Writer::start(store, shared.telemetry.clone())?,
             checkpointed: Instant::now(),
             experiment,
             spec,
@@ -183,6 +183,7 @@ impl Trainer {
 
     /// One batch: gradient steps on it, its books, and new parameters when they are due.
     fn learn(&mut self, batch: Batch) -> Result<()> {
+        let began = Instant::now();
         let tensors = self.tensors(&batch)?;
         if self.normalises_still() {
             let unseen = self.statistics[0].count() == 0.0;
@@ -208,11 +209,13 @@ impl Trainer {
         self.progress.updates += 1;
         self.metrics.count_update();
         self.metrics.absorb(batch.headers(), self.progress.version);
+        let ages = batch.headers().iter().map(|header| self.progress.version.saturating_sub(header.version)).collect();
         // Published before the batch goes back: whoever waits for its room goes on with these parameters.
         if self.progress.updates.is_multiple_of(self.experiment.vmpo.target_period) {
             self.publish(Behaviour::Policy)?;
         }
         self.book(batch);
+        self.shared.telemetry.count_update(began.elapsed(), ages);
         self.after_update()
     }
 }
@@ -284,6 +287,7 @@ impl Trainer {
         let steps = batch.f32(Field::Valid).iter().filter(|valid| **valid > 0.5).count() as u64;
         self.progress.environment_steps += steps;
         self.metrics.count_steps(steps);
+        self.shared.telemetry.environment_steps.inc_by(steps);
         self.batcher.trained(batch);
     }
 

@@ -2,12 +2,11 @@
 
 use std::sync::Arc;
 
-use comic_proto::v1::learner_client::LearnerClient;
+use comic_proto::Client;
 use comic_proto::v1::{UnrollAck, UnrollMessage, WatchRequest};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::Channel;
 
 use super::connection::{Link, describe};
 use super::{Assembled, Assembler, Limits, Outbox};
@@ -84,7 +83,7 @@ impl Exchange<'_> {
 }
 
 async fn send(
-    mut client: LearnerClient<Channel>,
+    mut client: Client,
     outbound: mpsc::Receiver<UnrollMessage>,
     acked: mpsc::Sender<UnrollAck>,
 ) -> Ended {
@@ -106,7 +105,7 @@ async fn send(
 }
 
 async fn watch(
-    mut client: LearnerClient<Channel>,
+    mut client: Client,
     request: WatchRequest,
     mut assembler: Assembler,
     mailbox: Arc<Mailbox>,
