@@ -1,8 +1,10 @@
 //! What the whole-system tests share.
 //!
 //! # Layout
+//! - [`certificates`] makes certificates, expired ones too.
 //! - [`repository`] looks at the workspace's own files and dependencies.
 //! - [`system`] runs a learner and actors as a user would: real programs, real sockets, one directory for the run.
 
+pub mod certificates;
 pub mod repository;
 pub mod system;
