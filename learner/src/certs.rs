@@ -17,8 +17,10 @@ use crate::options::Misuse;
 /// Makes an authority and certificates for a learner and its actors, or, where DIR holds an authority, renews the
 /// certificates by it: a learner and actors that run take them up by themselves.
 #[derive(Clone, Debug, Args)]
-#[command(after_help = "DIR then holds ca.pem, server.pem and client.pem, each with its -key.pem, readable by their owner alone.\n\
-    The authority's key is kept beside them: this is for development, not for an authority that others rely on.")]
+#[command(
+    after_help = "DIR then holds ca.pem, server.pem and client.pem, each with its -key.pem, readable by their owner alone.\n\
+    The authority's key is kept beside them: this is for development, not for an authority that others rely on."
+)]
 pub struct Certs {
     /// Where they are put.
     #[arg(long, value_name = "DIR")]
@@ -71,7 +73,8 @@ impl Certs {
                 text.map_err(|error| Misuse::new(format!("half an authority: cannot read {}: {error}", path.display())))
             };
             let (certificate, key) = (read(&certificate)?, read(&key)?);
-            let unusable = |error| Misuse::new(format!("the authority in {} cannot be used: {error}", self.out.display()));
+            let unusable =
+                |error| Misuse::new(format!("the authority in {} cannot be used: {error}", self.out.display()));
             let key = KeyPair::from_pem(&key).map_err(unusable)?;
             return Ok(Issuer::from_ca_cert_pem(&certificate, key).map_err(unusable)?);
         }
@@ -87,9 +90,10 @@ impl Certs {
 
     fn write(&self, name: &str, certificate: &str, key: &KeyPair) -> Result<()> {
         // The key first: a learner that looks in between finds two that do not fit, and keeps what it has.
-        for (file, mode, text) in
-            [(format!("{name}-key.pem"), 0o600, key.serialize_pem()), (format!("{name}.pem"), 0o644, certificate.into())]
-        {
+        for (file, mode, text) in [
+            (format!("{name}-key.pem"), 0o600, key.serialize_pem()),
+            (format!("{name}.pem"), 0o644, certificate.into()),
+        ] {
             let path = self.out.join(file);
             let mut open = OpenOptions::new();
             let file = open.create(true).write(true).truncate(true).mode(mode).open(&path);

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail};
 use clap::Args;
-use comic_proto::Access;
+use comic_proto::{Access, chain};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
@@ -43,7 +43,8 @@ impl Health {
     }
 
     fn ask(&self) -> Result<()> {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start tokio")?;
+        let runtime =
+            tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start tokio")?;
         runtime.block_on(async {
             let limit = Duration::from_secs(self.timeout);
             tokio::time::timeout(limit, self.check()).await.with_context(|| format!("no answer in {limit:?}"))?
@@ -53,7 +54,8 @@ impl Health {
     async fn check(&self) -> Result<()> {
         let channel = self.access.endpoint(&self.learner)?.connect().await?;
         let request = HealthCheckRequest { service: "comic.v1.Learner".into() };
-        let answer = HealthClient::new(channel).check(request).await?.into_inner();
+        let answer = HealthClient::new(channel).check(request).await;
+        let answer = answer.map_err(|status| anyhow::Error::msg(chain(&status)))?.into_inner();
         match answer.status() {
             ServingStatus::Serving => Ok(()),
             other => bail!("{} is {}", self.learner, other.as_str_name()),

@@ -40,6 +40,9 @@ pub struct Options {
     /// resumed.
     #[arg(long, value_name = "DIR", default_value = "runs/default")]
     pub run: PathBuf,
+    /// Go on with a run whose experiment was another one, as far as its checkpoint fits.
+    #[arg(long)]
+    pub allow_changed: bool,
     /// Print the resolved experiment and leave.
     #[arg(long)]
     pub print: bool,

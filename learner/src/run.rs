@@ -1,5 +1,6 @@
 //! A learner's life: resume or begin, serve and train, end.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write as _;
 use std::net::SocketAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -145,7 +146,7 @@ fn prepare(options: &Options, experiment: Experiment, security: Security) -> Res
     let store = Store::open(&options.run, experiment.learner.checkpoints_kept)?;
     let resume = store.newest()?;
     if let Some((path, snapshot)) = &resume {
-        check_same_experiment(&experiment, &spec, snapshot)
+        check_same_experiment(&experiment, &spec, snapshot, options.allow_changed)
             .with_context(|| format!("{} cannot be resumed", options.run.display()))?;
         tracing::info!(checkpoint = %path.display(), "resuming");
     }
@@ -180,26 +181,99 @@ fn prepare(options: &Options, experiment: Experiment, security: Security) -> Res
     Ok((setup, shared))
 }
 
-/// A run goes on only as the experiment it was; how long, how often and with how many threads may change.
-fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot) -> Result<()> {
+/// A run goes on only as the experiment it was, unless it is allowed to change; how long, how often and with how many
+/// threads may always.
+fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot, allowed: bool) -> Result<()> {
     let then = Experiment::from_toml("experiment.toml of the checkpoint", snapshot.text("experiment.toml")?)?;
-    let comparable = |experiment: &Experiment| {
-        let mut experiment = experiment.clone();
-        experiment.budget = then.budget.clone();
-        experiment.learner = then.learner.clone();
-        experiment.actor = then.actor.clone();
-        experiment.to_toml()
+    let mut now = now.clone();
+    now.budget = then.budget.clone();
+    now.learner = then.learner.clone();
+    now.actor = then.actor.clone();
+    let mut changes = changes(&then, &now)?;
+    let task: TaskSpec = serde_json::from_slice(snapshot.part("task.json")?)?;
+    if changes.is_empty() && task != *spec {
+        changes.push("the clips, or what the task observes and pays, are others".into());
+    }
+    if changes.is_empty() {
+        return Ok(());
+    }
+    let changes = changes.join("; ");
+    if allowed {
+        tracing::warn!("the run goes on as another experiment: {changes}");
+        return Ok(());
+    }
+    Err(Misuse::new(format!(
+        "it was made by another experiment ({changes}): give another --run, the old values, or --allow-changed"
+    ))
+    .into())
+}
+
+/// Every field in which two experiments differ, with both values.
+fn changes(then: &Experiment, now: &Experiment) -> Result<Vec<String>> {
+    let fields = |experiment: &Experiment| -> Result<BTreeMap<String, String>> {
+        let mut fields = BTreeMap::new();
+        flatten("", toml::Value::try_from(experiment)?, &mut fields);
+        Ok(fields)
     };
-    let (now, then) = (comparable(now)?, then.to_toml()?);
-    if let Some((new, old)) = now.lines().zip(then.lines()).find(|(new, old)| new != old) {
-        return Err(Misuse::new(format!(
-            "it was made with `{old}` where the experiment now says `{new}`: give another --run, or the old value"
-        ))
-        .into());
+    let (then, now) = (fields(then)?, fields(now)?);
+    let names: BTreeSet<&String> = then.keys().chain(now.keys()).collect();
+    let absent = "nothing".to_owned();
+    let difference = |name: &String| {
+        let [then, now] = [&then, &now].map(|fields| fields.get(name).unwrap_or(&absent));
+        (then != now).then(|| format!("{name} was {then} and is {now}"))
+    };
+    Ok(names.into_iter().filter_map(difference).collect())
+}
+
+/// A document's fields by their dotted names.
+fn flatten(name: &str, value: toml::Value, fields: &mut BTreeMap<String, String>) {
+    let toml::Value::Table(table) = value else {
+        fields.insert(name.to_owned(), value.to_string());
+        return;
+    };
+    for (key, value) in table {
+        let name = if name.is_empty() { key } else { format!("{name}.{key}") };
+        flatten(&name, value, fields);
     }
-    let clips: TaskSpec = serde_json::from_slice(snapshot.part("task.json")?)?;
-    if now != then || clips != *spec {
-        return Err(Misuse::new("it was made by an experiment with other clips or fields: give another --run").into());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn resumed(change: impl FnOnce(&mut Experiment), allowed: bool) -> Result<()> {
+        let then = Experiment::default();
+        let spec = TaskSpec::new(&then, vec!["walk".into()]).unwrap();
+        let mut snapshot = Snapshot::default();
+        snapshot.parts.insert("experiment.toml".into(), then.to_toml()?.into_bytes());
+        snapshot.parts.insert("task.json".into(), serde_json::to_vec(&spec)?);
+        let mut now = then;
+        change(&mut now);
+        check_same_experiment(&now, &spec, &snapshot, allowed)
     }
-    Ok(())
+
+    #[test]
+    fn another_experiment_is_refused_with_every_field_that_differs() {
+        let change = |experiment: &mut Experiment| {
+            experiment.vmpo.lambda = 0.5;
+            experiment.network.latent.beta = 0.25;
+        };
+        let refused = resumed(change, false).unwrap_err();
+        assert!(refused.is::<Misuse>());
+        let said = refused.to_string();
+        for part in ["vmpo.lambda was", "is 0.5", "network.latent.beta was", "is 0.25", "--allow-changed"] {
+            assert!(said.contains(part), "no `{part}` in {said}");
+        }
+        assert!(resumed(change, true).is_ok());
+    }
+
+    #[test]
+    fn how_long_and_how_often_may_always_change() {
+        let change = |experiment: &mut Experiment| {
+            experiment.budget.minutes = 7.0;
+            experiment.learner.checkpoint_seconds = 8.0;
+            experiment.actor.threads = 9;
+        };
+        assert!(resumed(change, false).is_ok());
+    }
 }

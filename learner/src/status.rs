@@ -42,7 +42,8 @@ impl Status {
     /// # Errors
     /// A learner that does not answer; [`Misuse`] if it refuses the token or one side the other's certificate.
     pub fn run(&self) -> Result<()> {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start tokio")?;
+        let runtime =
+            tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start tokio")?;
         runtime.block_on(async {
             if !self.watch {
                 return print(&self.render(&self.ask().await?));

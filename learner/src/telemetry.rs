@@ -329,7 +329,6 @@ fn resident_bytes() -> u64 {
     kilobytes.unwrap_or_default() * 1024
 }
 
-
 /// Prints [`Telemetry::reference`].
 ///
 /// # Errors

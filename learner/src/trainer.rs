@@ -385,7 +385,7 @@ impl Trainer {
             return Ok(());
         }
         for evaluation in self.shared.take_evaluations() {
-            self.metrics.keep_evaluation(&evaluation)?;
+            self.metrics.keep_evaluation(&evaluation);
         }
         if self.metrics.has_news(&self.books()?) { self.write_metrics() } else { Ok(()) }
     }
@@ -404,9 +404,9 @@ impl Trainer {
         };
         let books = self.books()?;
         for evaluation in self.shared.take_evaluations() {
-            self.metrics.keep_evaluation(&evaluation)?;
+            self.metrics.keep_evaluation(&evaluation);
         }
-        let line = self.metrics.write(position, books, self.losses.clone())?;
+        let line = self.metrics.write(position, books, self.losses.clone());
         tracing::info!(target: "metrics", "{line}");
         self.shared.set_metrics(line);
         Ok(())

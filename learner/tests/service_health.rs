@@ -21,7 +21,7 @@ fn request(service: &str) -> HealthCheckRequest {
 #[tokio::test]
 async fn the_learner_serves_until_it_goes_down() {
     let mut world = World::start().await;
-    let mut health = HealthClient::connect(world.address.clone()).await.unwrap();
+    let mut health = HealthClient::new(world.channel().await);
     for service in ["", "comic.v1.Learner"] {
         assert_eq!(health.check(request(service)).await.unwrap().into_inner().status(), ServingStatus::Serving);
     }
@@ -36,7 +36,7 @@ async fn the_learner_serves_until_it_goes_down() {
 #[tokio::test]
 async fn reflection_names_the_services() {
     let world = World::start().await;
-    let mut reflection = ServerReflectionClient::connect(world.address.clone()).await.unwrap();
+    let mut reflection = ServerReflectionClient::new(world.channel().await);
     let request = ServerReflectionRequest {
         host: String::new(),
         message_request: Some(MessageRequest::ListServices(String::new())),

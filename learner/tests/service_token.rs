@@ -70,7 +70,7 @@ async fn the_health_check_needs_none() {
     let accepted = directory.path().join("accepted");
     std::fs::write(&accepted, "open-sesame").unwrap();
     let world = world(&accepted).await;
-    let mut health = HealthClient::connect(world.address.clone()).await.unwrap();
+    let mut health = HealthClient::new(world.channel().await);
     let request = || HealthCheckRequest { service: "comic.v1.Learner".into() };
     health.check(request()).await.unwrap();
     assert_eq!(health.watch(request()).await.unwrap_err().code(), Code::Unauthenticated, "a stream takes a place");

@@ -194,9 +194,16 @@ const DISTRUST: [AlertDescription; 9] = [
     AlertDescription::UnsupportedCertificate,
 ];
 
-/// An error and its sources as one line: the transport's own message is `transport error`.
+/// An error and its sources as one line: the transport's own message is `transport error`. Of a status its message is
+/// taken, which is for a person.
 pub fn chain(error: &(dyn Error + 'static)) -> String {
-    links(error).map(ToString::to_string).collect::<Vec<_>>().join(": ")
+    let said = |link: &(dyn Error + 'static)| match link.downcast_ref::<Status>() {
+        Some(status) => status.message().to_owned(),
+        None => link.to_string(),
+    };
+    let mut parts: Vec<String> = links(error).map(said).collect();
+    parts.dedup();
+    parts.join(": ")
 }
 
 fn links<'a>(error: &'a (dyn Error + 'static)) -> impl Iterator<Item = &'a (dyn Error + 'static)> {

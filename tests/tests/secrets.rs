@@ -26,7 +26,9 @@ async fn neither_tokens_nor_keys_are_logged() -> Result<()> {
     system.log_level = Some("trace".into());
     system.start_learner(LIMIT).await?;
     let access = system.access.clone();
-    let mut actor = system.start_actor_with(&access, |command| drop(command.env("RUST_LOG", "trace")))?;
+    let mut actor = system.start_actor_with(&access, |command| {
+        command.env("RUST_LOG", "trace");
+    })?;
     actor.until_log_holds("joined the learner", LIMIT).await?;
 
     let mut secrets = vec![TOKEN.to_owned()];

@@ -26,10 +26,15 @@ async fn a_running_learner_is_asked_how_it_is() -> Result<()> {
     system.access.token_file = Some(token);
     system.start_learner(LIMIT).await?;
     let _actor = system.start_actor()?;
-    system.until("an update", LIMIT, |status| (status.books?.trained > 0 && status.metrics_json.contains("updates")).then_some(())).await?;
+    system
+        .until("an update", LIMIT, |status| {
+            (status.books?.trained > 0 && status.metrics_json.contains("updates")).then_some(())
+        })
+        .await?;
 
     let answer = system.ask(&["status", "--json"])?;
-    let status: Value = serde_json::from_slice(&answer.stdout).context(String::from_utf8_lossy(&answer.stderr).into_owned())?;
+    let status: Value =
+        serde_json::from_slice(&answer.stdout).context(String::from_utf8_lossy(&answer.stderr).into_owned())?;
     ensure!(status["actors"]["alive"] == 1 && status["queue"]["capacity"].as_u64() > Some(0), "{status}");
     ensure!(status["books"]["trained"].as_u64() > Some(0), "{status}");
     ensure!(status["metrics"]["updates"].as_u64() > Some(0), "{status}");
@@ -40,7 +45,10 @@ async fn a_running_learner_is_asked_how_it_is() -> Result<()> {
     }
     ensure!(system.ask(&["health"])?.status.code() == Some(0), "it serves");
     let page = metrics(&system)?;
-    ensure!(page.contains("comic_actors{state=\"alive\"} 1\n") && page.contains("comic_update_seconds_count"), "{page}");
+    ensure!(
+        page.contains("comic_actors{state=\"alive\"} 1\n") && page.contains("comic_update_seconds_count"),
+        "{page}"
+    );
 
     let token = system.access.token_file.take();
     ensure!(system.ask(&["health"])?.status.code() == Some(0), "whether it serves is no secret");

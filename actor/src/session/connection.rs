@@ -141,13 +141,14 @@ impl Connector {
         let message = describe(status);
         // Who was let in once is configured rightly; a new process, or a renewed token, may be let in again.
         match (status.code(), self.actor) {
-            (Code::Unauthenticated, None) => Failure::Fatal(self.unwelcome(message)),
-            (Code::InvalidArgument | Code::FailedPrecondition | Code::Unimplemented | Code::PermissionDenied, actor) => {
-                Failure::Fatal(match actor {
-                    Some(actor) => Error::Dismissed { actor, message },
-                    None => Error::Refused { url: self.address.clone(), message },
-                })
-            }
+            (Code::Unauthenticated, None) => Failure::Fatal(self.unwelcome(status.message().to_string())),
+            (
+                Code::InvalidArgument | Code::FailedPrecondition | Code::Unimplemented | Code::PermissionDenied,
+                actor,
+            ) => Failure::Fatal(match actor {
+                Some(actor) => Error::Dismissed { actor, message },
+                None => Error::Refused { url: self.address.clone(), message },
+            }),
             _ if self.is_barred(status) => Failure::Fatal(self.unwelcome(chain(status))),
             _ => Failure::Lost(message),
         }

@@ -82,11 +82,7 @@ impl Exchange<'_> {
     }
 }
 
-async fn send(
-    mut client: Client,
-    outbound: mpsc::Receiver<UnrollMessage>,
-    acked: mpsc::Sender<UnrollAck>,
-) -> Ended {
+async fn send(mut client: Client, outbound: mpsc::Receiver<UnrollMessage>, acked: mpsc::Sender<UnrollAck>) -> Ended {
     let mut stream = match client.send_unrolls(ReceiverStream::new(outbound)).await {
         Ok(reply) => reply.into_inner(),
         Err(status) => return Ended::Lost(describe(&status)),
@@ -104,12 +100,7 @@ async fn send(
     }
 }
 
-async fn watch(
-    mut client: Client,
-    request: WatchRequest,
-    mut assembler: Assembler,
-    mailbox: Arc<Mailbox>,
-) -> Ended {
+async fn watch(mut client: Client, request: WatchRequest, mut assembler: Assembler, mailbox: Arc<Mailbox>) -> Ended {
     let mut stream = match client.watch_parameters(request).await {
         Ok(reply) => reply.into_inner(),
         Err(status) => return Ended::Lost(describe(&status)),

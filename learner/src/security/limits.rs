@@ -21,12 +21,7 @@ pub struct Limits {
 
 impl Default for Limits {
     fn default() -> Self {
-        Self {
-            max_actors: 4096,
-            max_connections_per_address: 1024,
-            max_requests: 16_384,
-            max_message_bytes: None,
-        }
+        Self { max_actors: 4096, max_connections_per_address: 1024, max_requests: 16_384, max_message_bytes: None }
     }
 }
 

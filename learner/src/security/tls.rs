@@ -69,7 +69,8 @@ fn configuration(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Se
 
 fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, Misuse> {
     let unusable = |error| Misuse::new(format!("the certificate {} cannot be read: {error}", path.display()));
-    let found: Vec<_> = CertificateDer::pem_file_iter(path).map_err(unusable)?.collect::<Result<_, _>>().map_err(unusable)?;
+    let found: Vec<_> =
+        CertificateDer::pem_file_iter(path).map_err(unusable)?.collect::<Result<_, _>>().map_err(unusable)?;
     if found.is_empty() {
         return Err(Misuse::new(format!("{} holds no certificate", path.display())));
     }

@@ -41,7 +41,9 @@ impl Admission {
         if !open && self.tokens.as_ref().is_some_and(|tokens| !tokens.accept(shown)) {
             self.telemetry.requests_refused.of("unauthenticated").inc();
             let what = if shown.is_none() { "a token, and none was sent" } else { "another token" };
-            return Err(Status::unauthenticated(format!("this learner wants {what}: see --token-file and COMIC_TOKEN")));
+            return Err(Status::unauthenticated(format!(
+                "this learner wants {what}: see --token-file and COMIC_TOKEN"
+            )));
         }
         let Ok(place) = self.places.clone().try_acquire_owned() else {
             self.telemetry.requests_refused.of("overloaded").inc();
@@ -114,10 +116,7 @@ impl http_body::Body for Held {
     type Data = Bytes;
     type Error = Status;
 
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
         Pin::new(&mut self.body).poll_frame(context)
     }
 

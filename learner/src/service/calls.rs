@@ -13,8 +13,8 @@ use futures::stream::{self, BoxStream, StreamExt as _};
 use serde::de::IgnoredAny;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::unrolls::UnrollStream;
 use super::roster::Presence;
+use super::unrolls::UnrollStream;
 use super::{Closing, Evaluation, Shared, assets, status};
 use crate::publish::Subscription;
 
@@ -111,7 +111,9 @@ impl Learner for Calls {
 type Watch = (Subscription, Closing, Presence);
 
 /// The next piece of the newest parameters. At the server's end only a farewell is still sent.
-async fn next_parameters((mut parameters, mut closing, present): Watch) -> Option<(Result<ParametersChunk, Status>, Watch)> {
+async fn next_parameters(
+    (mut parameters, mut closing, present): Watch,
+) -> Option<(Result<ParametersChunk, Status>, Watch)> {
     let chunk = if closing.has_begun() {
         parameters.farewell()?
     } else {

@@ -68,13 +68,10 @@ impl Roster {
     /// Lets an actor in, or says that there are too many; one that is in already always stays.
     pub(super) fn join(&self, incarnation: u64, now: Instant) -> bool {
         let mut actors = lock(&self.actors);
-        let heard = match actors.get_mut(&incarnation) {
-            Some(actor) if actor.is_present(now) => {
-                actor.heard = now;
-                return true;
-            }
-            _ => now,
-        };
+        if let Some(actor) = actors.get_mut(&incarnation).filter(|actor| actor.is_present(now)) {
+            actor.heard = now;
+            return true;
+        }
         if actors.values().filter(|actor| actor.is_present(now)).count() >= self.limit {
             return false;
         }
@@ -83,7 +80,8 @@ impl Roster {
         } else {
             actors.retain(|_, actor| actor.is_remembered(now));
         }
-        actors.insert(incarnation, Actor { streams: 0, waiting: 0, heard, gone: None });
+        let actor = actors.entry(incarnation).or_insert(Actor { streams: 0, waiting: 0, heard: now, gone: None });
+        (actor.heard, actor.gone) = (now, None);
         true
     }
 
@@ -96,12 +94,12 @@ impl Roster {
 
     /// Notes a stream of parameters, until what is returned is dropped. Who has not joined is not counted.
     pub(super) fn watch(self: &Arc<Self>, incarnation: u64) -> Presence {
-        Presence::new(self, incarnation, |actor| &mut actor.streams)
+        Presence::new(self, incarnation, Kind::Stream)
     }
 
     /// Notes an unroll that waits for a place, until what is returned is dropped.
     pub(super) fn wait(self: &Arc<Self>, incarnation: u64) -> Presence {
-        Presence::new(self, incarnation, |actor| &mut actor.waiting)
+        Presence::new(self, incarnation, Kind::Waiting)
     }
 
     pub(super) fn census(&self, now: Instant) -> Census {
@@ -123,27 +121,39 @@ impl Roster {
 pub(super) struct Presence {
     roster: Arc<Roster>,
     incarnation: u64,
-    count: fn(&mut Actor) -> &mut u32,
+    kind: Kind,
+}
+
+/// What is counted of an actor.
+#[derive(Clone, Copy, Debug)]
+enum Kind {
+    Stream,
+    Waiting,
 }
 
 impl Presence {
-    fn new(roster: &Arc<Roster>, incarnation: u64, count: fn(&mut Actor) -> &mut u32) -> Self {
-        if let Some(actor) = lock(&roster.actors).get_mut(&incarnation) {
-            *count(actor) += 1;
-            actor.gone = None;
+    fn new(roster: &Arc<Roster>, incarnation: u64, kind: Kind) -> Self {
+        match (lock(&roster.actors).get_mut(&incarnation), kind) {
+            (Some(actor), Kind::Stream) => (actor.streams, actor.gone) = (actor.streams + 1, None),
+            (Some(actor), Kind::Waiting) => actor.waiting += 1,
+            (None, _) => {}
         }
-        Self { roster: roster.clone(), incarnation, count }
+        Self { roster: roster.clone(), incarnation, kind }
     }
 }
 
 impl Drop for Presence {
     fn drop(&mut self) {
-        if let Some(actor) = lock(&self.roster.actors).get_mut(&self.incarnation) {
-            let count = (self.count)(actor);
-            *count = count.saturating_sub(1);
-            if actor.streams == 0 && actor.waiting == 0 {
-                actor.gone = Some(Instant::now());
+        // It may have joined only after this began: then this was not counted.
+        match (lock(&self.roster.actors).get_mut(&self.incarnation), self.kind) {
+            (Some(actor), Kind::Waiting) => actor.waiting = actor.waiting.saturating_sub(1),
+            (Some(actor), Kind::Stream) => {
+                actor.streams = actor.streams.saturating_sub(1);
+                if actor.streams == 0 {
+                    actor.gone = Some(Instant::now());
+                }
             }
+            (None, _) => {}
         }
     }
 }

@@ -97,6 +97,11 @@ impl World {
         Self { experiment, spec, batcher, publisher, shared, address, shutdown: Some(shutdown), server }
     }
 
+    /// A connection, for clients of other services than the learner's own.
+    pub(crate) async fn channel(&self) -> Channel {
+        Channel::from_shared(self.address.clone()).unwrap().connect().await.unwrap()
+    }
+
     /// A client on a connection of its own.
     pub(crate) async fn client(&self) -> LearnerClient<Channel> {
         LearnerClient::connect(self.address.clone()).await.unwrap()
