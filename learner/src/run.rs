@@ -14,6 +14,7 @@ use comic_experiment::{Experiment, InitialPose, TaskSpec};
 use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
 use comic_replay::{Batcher, Config, Ledger, Phase};
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
@@ -26,6 +27,8 @@ use crate::security::Security;
 use crate::service::{self, Shared};
 use crate::trainer::{Ending, Setup, Trainer};
 
+/// File descriptors for everything that is no connection to an actor.
+const OTHER_FILES: u64 = 256;
 /// How long actors are given to hear that the run is over.
 const FAREWELL: Duration = Duration::from_millis(1500);
 
@@ -54,6 +57,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut hangup = signal(SignalKind::hangup())?;
     let security = Security::new(&options.security, options.address)?;
+    allow_descriptors(options.limits.max_connections() as u64 + OTHER_FILES);
     let listener = listen(options, "port", options.port).await?;
     let metrics = match options.metrics_port {
         Some(port) => Some(listen(options, "metrics-port", port).await?),
@@ -111,6 +115,19 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
         Ending::Stopped => "stopped; start again with the same --run to go on",
     });
     Ok(())
+}
+
+/// A connection is a file descriptor, and systems give 1024 unless asked for more.
+fn allow_descriptors(wanted: u64) {
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    if current.is_none_or(|current| current >= wanted) {
+        return;
+    }
+    let allowed = maximum.map_or(wanted, |maximum| maximum.min(wanted));
+    let raised = setrlimit(Resource::Nofile, Rlimit { current: Some(allowed), maximum });
+    if raised.is_err() || allowed < wanted {
+        tracing::warn!(wanted, ?current, ?maximum, "too few file descriptors for --max-actors: raise `ulimit -n`");
+    }
 }
 
 async fn listen(options: &Options, flag: &str, port: u16) -> Result<TcpListener> {

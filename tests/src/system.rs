@@ -17,6 +17,8 @@ use tempfile::TempDir;
 
 /// How often a condition is looked at again.
 const POLL: Duration = Duration::from_millis(50);
+/// Variables that would say where the learner is and what to show it.
+const SETTINGS: [&str; 6] = ["COMIC_LEARNER", "COMIC_CA", "COMIC_CERT", "COMIC_KEY", "COMIC_TOKEN_FILE", "COMIC_TOKEN"];
 /// How long a status call may take.
 const CALL_LIMIT: Duration = Duration::from_secs(5);
 
@@ -158,6 +160,9 @@ impl System {
     pub fn ask(&self, command: &[&str]) -> Result<Output> {
         let mut asking = Command::new(program("comic-learner")?);
         asking.args(command).args(["--learner", &self.url()]).args(flags(&self.access));
+        for name in SETTINGS {
+            asking.env_remove(name);
+        }
         asking.output().context("cannot start comic-learner")
     }
 
@@ -169,6 +174,9 @@ impl System {
         let home = self.directory.path().join("home");
         fs::create_dir_all(&home).context("cannot make a home directory")?;
         command.env("HOME", &home).env("XDG_CACHE_HOME", home.join("cache")).env("NO_COLOR", "1");
+        for name in SETTINGS {
+            command.env_remove(name);
+        }
         if !command.get_envs().any(|(name, _)| name == "RUST_LOG") {
             command.env_remove("RUST_LOG");
         }

@@ -31,9 +31,9 @@ impl From<Status> for Failure {
     }
 }
 
-/// A status without its metadata.
+/// A status without its metadata, and what led to it.
 pub(super) fn describe(status: &Status) -> String {
-    format!("{}: {}", status.code(), status.message())
+    format!("{}: {}", status.code(), chain(status))
 }
 
 /// A connection that has joined.
