@@ -327,11 +327,11 @@ fn the_end_of_no_name_is_refused_with_the_nearest() {
 #[test]
 fn experiments_differ_by_name_and_both_values() {
     let [ours, theirs] = ["1e-3", "0.5"].map(|beta| set(&[&format!("network.latent.beta={beta}")]).unwrap());
-    assert_eq!(ours.difference(&ours).unwrap(), None);
+    assert_eq!(ours.differences(&ours).unwrap(), []);
     let expected = Difference { field: "network.latent.beta".into(), ours: "0.001".into(), theirs: "0.5".into() };
-    assert_eq!(ours.difference(&theirs).unwrap(), Some(expected));
+    assert_eq!(ours.differences(&theirs).unwrap(), [expected]);
     let theirs = ours.clone().with_clips(&["builtin:run".into()]);
-    assert_eq!(ours.difference(&theirs).unwrap().unwrap().field, "clips");
+    assert_eq!(ours.differences(&theirs).unwrap()[0].field, "clips");
 }
 
 // Values
