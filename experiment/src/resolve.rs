@@ -4,9 +4,7 @@ use std::path::Path;
 
 use toml::{Table, Value};
 
-use crate::{
-    ClipSource, Complement, Experiment, TaskName, check::check, fields::nearest, lines::line_of, presets,
-};
+use crate::{ClipSource, Complement, Experiment, TaskName, check::check, fields::nearest, lines::line_of, presets};
 
 /// Why a document is not an experiment.
 #[derive(Debug, thiserror::Error)]

@@ -107,7 +107,8 @@ fn joint_tasks_that_make_no_sense_are_refused() {
         let error = refused(joint, other);
         assert!(error.contains(field), "{joint}, {other}: {error}");
     }
-    resolve("quickstart", &[r#"joint=[{task="gaps", probability=0.5}]"#.into(), "gaps.corridor.vision=off".into()]).unwrap();
+    resolve("quickstart", &[r#"joint=[{task="gaps", probability=0.5}]"#.into(), "gaps.corridor.vision=off".into()])
+        .unwrap();
     let error = resolve("quickstart", &[r#"joint=[{task="get-up", probabilty=0.1}]"#.into()]).unwrap_err().to_string();
     assert!(error.contains("joint.0.probability"), "{error}");
 }
@@ -121,7 +122,10 @@ fn a_clip_belongs_to_the_task_it_was_listed_with() {
     let ball = &experiment.ball_catch;
     let most = 2.0 * ball.touch_reward + ball.standing_reward + ball.walking_reward;
     assert_eq!([0, 1, 2].map(|clip| spec.max_reward(clip)), [1.45, 1.45, most]);
-    assert_eq!((spec.reward_terms.len(), spec.task), (1, TaskSpec::tracking(&experiment.tracking, Vec::new()).unwrap().task));
+    assert_eq!(
+        (spec.reward_terms.len(), spec.task),
+        (1, TaskSpec::tracking(&experiment.tracking, Vec::new()).unwrap().task)
+    );
 }
 
 #[test]

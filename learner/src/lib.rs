@@ -7,6 +7,7 @@
 //!   it does before.
 //! - [`vmpo`] is the algorithm: losses, and the gradient step. [`adam`] is its optimiser.
 //! - `state` turns the trainer into a snapshot and back. [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
+//! - [`export`] makes a checkpoint's policy a file that others read.
 //! - [`metrics`] is what a person sees; [`sizes`] counts parameters.
 //!
 //! There is no MuJoCo here: whatever needs a simulator is done by actors.
@@ -14,6 +15,7 @@
 pub mod adam;
 pub mod bench;
 pub mod checkpoint;
+pub mod export;
 pub mod metrics;
 pub mod options;
 pub mod publish;

@@ -187,4 +187,4 @@ fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot)
 /// A configuration that is wrong and stays wrong, however often it is tried.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
-pub struct Misuse(String);
+pub struct Misuse(pub(crate) String);

@@ -269,7 +269,8 @@ mod tests {
         let (spec, run) = (spec(), tempfile::tempdir().unwrap());
         let mut metrics = crate::metrics::Metrics::open(run.path(), &spec).unwrap();
         assert_eq!(metrics.count_steps(&batch(&spec), &[0, 1]), 4);
-        let position = crate::metrics::Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
+        let position =
+            crate::metrics::Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
         let line = metrics.write(position, serde_json::Value::Null, serde_json::Map::new()).unwrap();
         let line: serde_json::Value = serde_json::from_str(&line).unwrap();
         assert_eq!(line["tasks"]["tracking"]["environment_steps"], 3);

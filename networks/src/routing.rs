@@ -157,9 +157,8 @@ fn own(network: &Mlp, input: &Tensor) -> Tensor {
 /// Each task's rows through its own network.
 fn by_group(networks: &[Mlp], groups: &[Tensor], input: &Tensor) -> Tensor {
     let present = || networks.iter().zip(groups).filter(|(_, rows)| rows.numel() > 0);
-    let outputs: Vec<Tensor> = present()
-        .map(|(network, rows)| network.forward(&own(network, &input.index_select(0, rows))))
-        .collect();
+    let outputs: Vec<Tensor> =
+        present().map(|(network, rows)| network.forward(&own(network, &input.index_select(0, rows)))).collect();
     let rows: Vec<&Tensor> = present().map(|(_, rows)| rows).collect();
     // Sorted by task, and back.
     Tensor::cat(&outputs, 0).index_select(0, &Tensor::cat(&rows, 0).argsort(0, false))

@@ -19,7 +19,13 @@ fn spec() -> TaskSpec {
         reward_terms: vec!["a".into(), "b".into()],
         image: 0,
         clips: vec!["x".into(), "y".into(), "z".into()],
-        tasks: vec![TaskPart { name: "tracking".into(), observation: 11, clips: 3, max_reward: 1.0, demonstrated: true }],
+        tasks: vec![TaskPart {
+            name: "tracking".into(),
+            observation: 11,
+            clips: 3,
+            max_reward: 1.0,
+            demonstrated: true,
+        }],
     }
 }
 
@@ -104,7 +110,12 @@ fn the_actions_log_probability_sends_its_gradient_into_the_encoder() {
     let (store, policy) = policy(&network(), 1, &[0.0; 3]);
     let action = Tensor::ones([ROWS, 3], (Kind::Float, Device::Cpu));
     act(&policy).action.log_prob(&action).sum(Kind::Float).backward();
-    for name in ["encoder.tracking.layers.0.weight", "encoder.tracking.head.weight", "encoder.tracking.linear_path", "low_level.head.bias"] {
+    for name in [
+        "encoder.tracking.layers.0.weight",
+        "encoder.tracking.head.weight",
+        "encoder.tracking.linear_path",
+        "low_level.head.bias",
+    ] {
         let variables = store.variables();
         assert!(variables[name].grad().abs().max().double_value(&[]) > 0.0, "{name}");
     }

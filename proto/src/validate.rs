@@ -279,12 +279,7 @@ fn check_boundaries(layout: &UnrollLayout, payload: &[u8]) -> Result<(), Invalid
     }
 }
 
-fn check_clips(
-    layout: &UnrollLayout,
-    header: &UnrollHeader,
-    payload: &[u8],
-    clips: &[usize],
-) -> Result<(), Invalid> {
+fn check_clips(layout: &UnrollLayout, header: &UnrollHeader, payload: &[u8], clips: &[usize]) -> Result<(), Invalid> {
     let rows = || field(layout, payload, Field::Clip).enumerate();
     let total: usize = clips.iter().sum();
     if let Some((row, clip)) = rows().find(|(_, clip)| *clip as usize >= total) {

@@ -34,7 +34,8 @@ async fn two_actors_learn(overrides: &[&str], check: fn(&Status) -> Option<()>) 
 
 #[tokio::test]
 async fn with_an_lstm_and_a_recurrent_value_function() -> Result<()> {
-    two_actors_learn(&["network.low_level=lstm", "network.lstm.units=[12, 8]", "network.value_lstm=[8]"], |_| Some(())).await
+    two_actors_learn(&["network.low_level=lstm", "network.lstm.units=[12, 8]", "network.value_lstm=[8]"], |_| Some(()))
+        .await
 }
 
 #[tokio::test]

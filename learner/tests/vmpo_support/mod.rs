@@ -27,7 +27,13 @@ pub(crate) fn spec() -> TaskSpec {
         reward_terms: vec!["near".into(), "far".into()],
         image: 0,
         clips: vec!["walk".into(), "run".into(), "jump".into()],
-        tasks: vec![TaskPart { name: "tracking".into(), observation: WIDTHS.task, clips: 3, max_reward: 1.0, demonstrated: true }],
+        tasks: vec![TaskPart {
+            name: "tracking".into(),
+            observation: WIDTHS.task,
+            clips: 3,
+            max_reward: 1.0,
+            demonstrated: true,
+        }],
     }
 }
 
