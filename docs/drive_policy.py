@@ -50,9 +50,7 @@ task = tracking.MultiClipMocapTracking(
     termination_error_threshold=settings["termination_threshold"],
     reward_type="comic",
 )
-environment = composer.Environment(
-    task, time_limit=settings["time_limit"], strip_singleton_obs_buffer_dim=True, recompile_mjcf_every_episode=False
-)
+environment = composer.Environment(task, time_limit=settings["time_limit"], strip_singleton_obs_buffer_dim=True)
 
 # The policy: three rows in, one row out, which is the action and what to remember.
 proprioception, observation, memory = spec["inputs"]

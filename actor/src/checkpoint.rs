@@ -177,4 +177,15 @@ mod tests {
         let empty = tempfile::tempdir().unwrap();
         assert!(read(empty.path()).unwrap_err().to_string().contains("no complete checkpoint"));
     }
+
+    #[test]
+    fn a_file_that_nobody_exported_is_refused_with_its_name() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("policy.safetensors");
+        for bytes in [&b""[..], b"not one", &[255; 64], b"\x02\0\0\0\0\0\0\0{}"] {
+            std::fs::write(&path, bytes).unwrap();
+            let error = read(&path).unwrap_err();
+            assert!(error.is_configuration() && error.to_string().contains("policy.safetensors"), "{error}");
+        }
+    }
 }

@@ -13,7 +13,7 @@ use serde_json::Value;
 /// Steps of each episode that are compared.
 const STEPS: usize = 20;
 /// Frames of the clip at which they start.
-const STARTS: [&str; 4] = ["0", "20", "40", "60"];
+const STARTS: [&str; 4] = ["0", "13", "37", "65"];
 /// Difference of a step's mean reward: two programs in double precision, a policy in single.
 const TOLERANCE: f64 = 1e-6;
 /// Enough for statistics of observations, and a policy that is not what it began as.
