@@ -1,13 +1,15 @@
 //! Reading what the learner wrote; writing is the learner's affair alone.
 //!
 //! A checkpoint is a directory whose `MANIFEST.json` maps each file's name to its SHA-256 (hexadecimal). Of its files
-//! two matter here: `experiment.toml` and `policy.safetensors`, the parameters of the online policy.
+//! two matter here: `experiment.toml` and `policy.safetensors`, the parameters of the online policy. A file that
+//! `comic-learner export` made of one is as good.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use comic_experiment::Experiment;
+use comic_networks::export::{Exported, Part};
 use sha2::{Digest as _, Sha256};
 
 use crate::Error;
@@ -17,12 +19,12 @@ const EXPERIMENT: &str = "experiment.toml";
 const PROGRESS: &str = "progress.json";
 const POLICY: &str = "policy.safetensors";
 /// What a path should have named.
-const WANTED: &str = "name a run's directory (runs/… of `cargo xtask train`), its `checkpoints`, or one of them";
+const WANTED: &str = "name a run's directory (runs/… of `cargo xtask train`), its `checkpoints`, one of them, or a file of `comic-learner export`";
 
 /// What acting needs of a checkpoint.
 #[derive(Clone, Debug)]
 pub struct Checkpoint {
-    /// The checkpoint's directory.
+    /// The checkpoint's directory, or the file.
     pub path: PathBuf,
     /// The experiment it belongs to.
     pub experiment: Experiment,
@@ -42,11 +44,15 @@ pub struct Position {
 }
 
 /// Reads the newest complete checkpoint that `path` names: a run directory (which holds `checkpoints/`), a directory of
-/// checkpoints (`checkpoint-NNNNNNNNNN`), or one checkpoint. Among several, a damaged one is passed over with a warning.
+/// checkpoints (`checkpoint-NNNNNNNNNN`), or one checkpoint; or reads the policy that was exported to a file of this name.
+/// Among several, a damaged one is passed over with a warning.
 ///
 /// # Errors
 /// [`Error::Checkpoint`] when there is none, or the one that was named is damaged.
 pub fn read(path: &Path) -> Result<Checkpoint, Error> {
+    if path.is_file() {
+        return read_exported(path);
+    }
     if path.join(MANIFEST).is_file() {
         return read_one(path);
     }
@@ -63,6 +69,16 @@ pub fn read(path: &Path) -> Result<Checkpoint, Error> {
         }
     }
     Err(refuse(path, format!("no complete checkpoint here; {WANTED}")))
+}
+
+fn read_exported(path: &Path) -> Result<Checkpoint, Error> {
+    let Exported { spec, experiment, bytes } = Exported::open(path).map_err(|error| refuse(path, error))?;
+    if !matches!(spec.part, Part::Policy(_)) {
+        let part = spec.part;
+        return Err(refuse(path, format!("{part} does not act for itself: export a policy, with --part policy")));
+    }
+    let position = Position { epoch: spec.source.epoch, version: spec.source.version };
+    Ok(Checkpoint { path: path.to_path_buf(), experiment, policy: bytes, position })
 }
 
 /// Numbered checkpoints, oldest first: the numbers are zero-padded.
@@ -160,5 +176,16 @@ mod tests {
     fn an_empty_directory_holds_none() {
         let empty = tempfile::tempdir().unwrap();
         assert!(read(empty.path()).unwrap_err().to_string().contains("no complete checkpoint"));
+    }
+
+    #[test]
+    fn a_file_that_nobody_exported_is_refused_with_its_name() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("policy.safetensors");
+        for bytes in [&b""[..], b"not one", &[255; 64], b"\x02\0\0\0\0\0\0\0{}"] {
+            std::fs::write(&path, bytes).unwrap();
+            let error = read(&path).unwrap_err();
+            assert!(error.is_configuration() && error.to_string().contains("policy.safetensors"), "{error}");
+        }
     }
 }

@@ -7,6 +7,7 @@
 pub mod command;
 mod delivery;
 mod report;
+mod rewards;
 mod rollout;
 mod table;
 
@@ -42,7 +43,7 @@ impl Default for Options {
     }
 }
 
-/// Evaluates over the starts of the clips of `task`; `sizes` are its experiment's.
+/// Rolls out the starts of the clips of `task` that the options choose; `sizes` are its experiment's.
 ///
 /// # Errors
 /// A failing forward pass, a start that the task does not have, or what the audience returns.
@@ -52,10 +53,9 @@ pub fn evaluate<F: ForwardPass>(
     sizes: ActingSizes,
     options: &Options,
     audience: &mut dyn Audience<Box<dyn Simulated>>,
-) -> Result<Report, Error> {
+) -> Result<Vec<Finished>, Error> {
     let starts = chosen(task.starts(), options);
-    let finished = roll_out(evaluated, task, sizes, &starts, options, audience)?;
-    Ok(Report::new(task.spec(), &finished, options))
+    roll_out(evaluated, task, sizes, &starts, options, audience)
 }
 
 /// Rolls out these starts, or as many as the audience wants to see.

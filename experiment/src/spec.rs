@@ -8,8 +8,20 @@ use crate::{Experiment, TaskName, Tracking, Vision};
 const BODIES: usize = 31;
 /// Hinges, and so actuators, of the CMU humanoid.
 pub const ACTION_SIZE: usize = 56;
-/// Proprioception (supplement 1.1, with MoCapAct's order): joints_pos 56, joints_vel 56, velocimeter 3, gyro 3,
-/// end_effectors_pos 12, world_zaxis 3, actuator_activation 56, touch 10, torque 6.
+/// Proprioception (supplement 1.1, with MoCapAct's order): what it is made of, by dm_control's names without `walker/`,
+/// and how many numbers each has.
+pub const PROPRIOCEPTION: [(&str, usize); 9] = [
+    ("joints_pos", ACTION_SIZE),
+    ("joints_vel", ACTION_SIZE),
+    ("sensors_velocimeter", 3),
+    ("sensors_gyro", 3),
+    ("end_effectors_pos", 12),
+    ("world_zaxis", 3),
+    ("actuator_activation", ACTION_SIZE),
+    ("sensors_touch", 10),
+    ("sensors_torque", 6),
+];
+/// Length of proprioception: all of [`PROPRIOCEPTION`].
 pub const PROPRIOCEPTION_SIZE: usize = 205;
 /// Reward terms of the tracking task, in the order of dm_control's sorted reward channels.
 pub const TRACKING_REWARD_TERMS: [&str; 5] =
@@ -78,6 +90,30 @@ impl Experiment {
         if vision == Vision::Off { 0 } else { IMAGE_SIZE * IMAGE_SIZE * 3 }
     }
 
+    /// What one of its tasks observes beside proprioception: names and sizes, in the order of the task observation
+    /// vector; tracking's names are dm_control's without `walker/`.
+    ///
+    /// # Errors
+    /// The name of an observation that the tracking task does not have.
+    pub fn observations(&self, task: TaskName) -> Result<Vec<(String, usize)>, String> {
+        let parts: &[(&str, usize)] = match task {
+            TaskName::Tracking => return tracking_observations(&self.tracking),
+            // In the root's frame, m.
+            TaskName::GoToTarget => &[("target", 3)],
+            // The root's height, m.
+            TaskName::Gaps | TaskName::Walls | TaskName::GetUp => &[("body_height", 1)],
+            // In the root's frame: m, m/s, rad/s, m, m.
+            TaskName::BallCatch => &[
+                ("ball_position", 3),
+                ("ball_velocity", 3),
+                ("ball_angular_velocity", 3),
+                ("ball_radius", 1),
+                ("target", 3),
+            ],
+        };
+        Ok(parts.iter().map(|(name, size)| ((*name).to_string(), *size)).collect())
+    }
+
     /// The most a step of the task can pay.
     fn max_reward(&self, task: TaskName) -> f64 {
         match task {
@@ -111,22 +147,18 @@ impl TaskSpec {
     /// # Errors
     /// The name of an observation that the tracking task does not have.
     pub fn of_task(experiment: &Experiment, task: TaskName, clips: Vec<String>) -> Result<Self, String> {
-        let plain = |observation, terms: &[&str]| {
-            let name = task.name().to_string();
-            let mut spec = Self::alone(name.clone(), observation, experiment.max_reward(task), terms, vec![name]);
-            spec.image = experiment.image_bytes(task);
-            spec
-        };
-        Ok(match task {
+        let terms: &[&str] = match task {
             TaskName::Tracking => return Self::tracking(&experiment.tracking, clips),
-            // The target in the root's frame.
-            TaskName::GoToTarget => plain(3, &GO_TO_TARGET_REWARD_TERMS),
-            // The root's height.
-            TaskName::Gaps | TaskName::Walls => plain(1, &CORRIDOR_REWARD_TERMS),
-            TaskName::GetUp => plain(1, &GET_UP_REWARD_TERMS),
-            // The ball's position, velocity and angular velocity in the root's frame, its radius; the target.
-            TaskName::BallCatch => plain(13, &BALL_CATCH_REWARD_TERMS),
-        })
+            TaskName::GoToTarget => &GO_TO_TARGET_REWARD_TERMS,
+            TaskName::Gaps | TaskName::Walls => &CORRIDOR_REWARD_TERMS,
+            TaskName::GetUp => &GET_UP_REWARD_TERMS,
+            TaskName::BallCatch => &BALL_CATCH_REWARD_TERMS,
+        };
+        let name = task.name().to_string();
+        let observation = total(&experiment.observations(task)?);
+        let mut spec = Self::alone(name.clone(), observation, experiment.max_reward(task), terms, vec![name]);
+        spec.image = experiment.image_bytes(task);
+        Ok(spec)
     }
 
     /// The tracking task over these clips.
@@ -134,11 +166,7 @@ impl TaskSpec {
     /// # Errors
     /// The name of an observation that the tracking task does not have.
     pub fn tracking(config: &Tracking, clips: Vec<String>) -> Result<Self, String> {
-        let steps = config.reference_steps.len();
-        let mut observation = 0;
-        for name in &config.observations {
-            observation += tracking_observation_size(name, steps).ok_or_else(|| name.clone())?;
-        }
+        let observation = total(&tracking_observations(config)?);
         let name = TaskName::Tracking.name().to_string();
         Ok(Self::alone(name, observation, TRACKING_MAX_REWARD, &TRACKING_REWARD_TERMS, clips))
     }
@@ -186,6 +214,16 @@ impl TaskSpec {
     }
 }
 
+fn total(parts: &[(String, usize)]) -> usize {
+    parts.iter().map(|(_, size)| size).sum()
+}
+
+fn tracking_observations(config: &Tracking) -> Result<Vec<(String, usize)>, String> {
+    let steps = config.reference_steps.len();
+    let sized = |name: &String| tracking_observation_size(name, steps).map(|size| (name.clone(), size));
+    config.observations.iter().map(|name| sized(name).ok_or_else(|| name.clone())).collect()
+}
+
 /// Every task observation the tracking task offers, by dm_control's name without `walker/`.
 pub const TRACKING_OBSERVATIONS: [&str; 14] = [
     "body_height",
@@ -219,4 +257,14 @@ pub fn tracking_observation_size(name: &str, steps: usize) -> Option<usize> {
         "reference_appendages_pos" => steps * 15,
         _ => return None,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn proprioception_is_as_long_as_its_parts() {
+        assert_eq!(PROPRIOCEPTION.iter().map(|(_, size)| size).sum::<usize>(), PROPRIOCEPTION_SIZE);
+    }
 }

@@ -147,7 +147,7 @@ impl Store {
     /// When the directory cannot be listed, or when there are checkpoints and none of them verifies: beginning anew
     /// beside them would be a loss nobody asked for.
     pub fn newest(&self) -> Result<Option<(PathBuf, Snapshot)>> {
-        let numbered = self.numbered()?;
+        let numbered = numbered(&self.directory)?;
         for path in numbered.iter().rev() {
             match read(path) {
                 Ok(snapshot) => return Ok(Some((path.clone(), snapshot))),
@@ -173,26 +173,9 @@ impl Store {
         self.directory.join(name.to_string()).is_dir()
     }
 
-    /// Numbered checkpoints, oldest first.
-    fn numbered(&self) -> Result<Vec<PathBuf>> {
-        let mut found = Vec::new();
-        for entry in
-            fs::read_dir(&self.directory).with_context(|| format!("cannot list {}", self.directory.display()))?
-        {
-            let path = entry?.path();
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            let digits = name.strip_prefix("checkpoint-").unwrap_or_default();
-            if digits.len() == 10 && digits.bytes().all(|byte| byte.is_ascii_digit()) && path.is_dir() {
-                found.push(path);
-            }
-        }
-        found.sort();
-        Ok(found)
-    }
-
     /// Keeps the newest few, and in any case the one just written.
     fn forget_oldest(&self, written: &Path) -> Result<()> {
-        let numbered = self.numbered()?;
+        let numbered = numbered(&self.directory)?;
         let oldest = &numbered[..numbered.len().saturating_sub(self.kept)];
         oldest.iter().filter(|path| *path != written).try_for_each(|path| remove_if_there(path))
     }
@@ -202,6 +185,41 @@ impl Store {
         fs::rename(temporary, path).with_context(|| format!("cannot put {} in place", path.display()))?;
         sync_directory(&self.directory)
     }
+}
+
+/// Numbered checkpoints, oldest first.
+fn numbered(directory: &Path) -> Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(directory).with_context(|| format!("cannot list {}", directory.display()))? {
+        let path = entry?.path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let digits = name.strip_prefix("checkpoint-").unwrap_or_default();
+        if digits.len() == 10 && digits.bytes().all(|byte| byte.is_ascii_digit()) && path.is_dir() {
+            found.push(path);
+        }
+    }
+    found.sort();
+    Ok(found)
+}
+
+/// The newest whole checkpoint that `path` names, and where it lies: a run's directory, its `checkpoints`, or one of them.
+/// Of several, a damaged one is passed over with a warning; nothing is changed.
+///
+/// # Errors
+/// When there is none, or the one that was named is damaged.
+pub fn find(path: &Path) -> Result<(PathBuf, Snapshot)> {
+    if path.join(MANIFEST).is_file() {
+        return Ok((path.to_path_buf(), read(path)?));
+    }
+    let below = path.join("checkpoints");
+    let directory = if below.is_dir() { below } else { path.to_path_buf() };
+    for path in numbered(&directory)?.into_iter().rev() {
+        match read(&path) {
+            Ok(snapshot) => return Ok((path, snapshot)),
+            Err(error) => tracing::warn!(checkpoint = %path.display(), "passed over a damaged checkpoint: {error:#}"),
+        }
+    }
+    bail!("no complete checkpoint in {}: name a run's directory, its `checkpoints`, or one of them", path.display())
 }
 
 /// Reads one checkpoint directory, verifying every part.

@@ -25,6 +25,7 @@ fn main() -> ExitCode {
             let subject = if *joint { Subject::Joint } else { Subject::LowLevel(*low_level) };
             comic_learner::bench::run(*threads, *repeats, subject)
         }
+        Some(Command::Export { checkpoint, part, out }) => comic_learner::export::run(checkpoint, *part, out),
         Some(Command::Sizes) => comic_learner::sizes::table()
             .and_then(|table| std::io::stdout().write_all(table.as_bytes()).context("cannot write to stdout")),
         Some(Command::Status(status)) => status.run(),

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Context as _, Result};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use comic_experiment::{Experiment, LowLevelName};
+use comic_networks::export::Part;
 
 use crate::certs::Certs;
 use crate::health::Health;
@@ -80,6 +81,18 @@ impl Document {
 /// What else than serving.
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    /// Write a checkpoint's policy, or a part of it, as a file that evaluations, transfer and other programs read.
+    Export {
+        /// A run's directory, its `checkpoints`, or one checkpoint; the newest complete one is taken.
+        #[arg(long, value_name = "DIR")]
+        checkpoint: PathBuf,
+        /// policy: everything that acts, of all tasks or of one (policy:TASK); encoder:TASK; or low-level.
+        #[arg(long)]
+        part: Part,
+        /// The file, .safetensors; .pt is a policy of one task as TorchScript.
+        #[arg(long, value_name = "FILE")]
+        out: PathBuf,
+    },
     /// Print how many parameters the networks of the paper's presets have.
     Sizes,
     /// Print the state of a running learner.

@@ -1,6 +1,6 @@
 //! Checkpoints are whole or not there, and a damaged one costs no more than itself.
 
-use comic_learner::checkpoint::{Name, Snapshot, Store, read};
+use comic_learner::checkpoint::{Name, Snapshot, Store, find, read};
 
 fn snapshot(content: &str) -> Snapshot {
     let mut snapshot = Snapshot::default();
@@ -28,6 +28,22 @@ fn a_damaged_one_is_skipped() {
     let complaint = format!("{:#}", read(&newest).unwrap_err());
     assert!(complaint.contains("part") && complaint.contains("SHA-256"), "{complaint}");
     assert_eq!(store.newest().unwrap().unwrap().1, snapshot("one"));
+}
+
+#[test]
+fn whoever_only_reads_passes_over_a_damaged_one_and_leaves_it_there() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 3).unwrap();
+    let older = store.write(Name::Updates(1), &snapshot("one")).unwrap();
+    let newest = store.write(Name::Updates(2), &snapshot("two")).unwrap();
+    assert_eq!(find(run.path()).unwrap(), (newest.clone(), snapshot("two")));
+    std::fs::write(newest.join("part"), "twø").unwrap();
+    for path in [run.path(), &run.path().join("checkpoints"), &older] {
+        assert_eq!(find(path).unwrap(), (older.clone(), snapshot("one")));
+    }
+    assert!(find(&newest).is_err() && newest.is_dir());
+    let empty = tempfile::tempdir().unwrap();
+    assert!(format!("{:#}", find(empty.path()).unwrap_err()).contains("name a run's directory"));
 }
 
 #[test]

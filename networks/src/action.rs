@@ -111,6 +111,18 @@ impl ActionDistribution {
         }
     }
 
+    /// The action without noise, `[N, A]`: the mean; of a mixture, that of the likeliest component.
+    pub fn mode(&self) -> Tensor {
+        match self {
+            Self::Gaussian(gaussian) => gaussian.mean.shallow_clone(),
+            Self::Mixture { log_weights, components } => {
+                let actions = components.mean.size()[2];
+                let likeliest = log_weights.argmax(-1, true).unsqueeze(-1).expand([-1, -1, actions], false);
+                components.mean.gather(1, &likeliest, false).squeeze_dim(1)
+            }
+        }
+    }
+
     /// The standard deviation, `[N, A]`; of a mixture, the components' own, averaged with their weights.
     pub fn std(&self) -> Tensor {
         match self {

@@ -55,6 +55,42 @@ pub enum Error {
         /// Entries given.
         found: usize,
     },
+    /// A file's description of itself cannot be used.
+    #[error("`{field}` of its metadata {problem}")]
+    Metadata {
+        /// Which part of it.
+        field: String,
+        /// What is wrong with it, and what helps.
+        problem: String,
+    },
+    /// A file's experiment cannot be used.
+    #[error("`experiment` of its metadata: {0}")]
+    Experiment(#[source] comic_experiment::Error),
+    /// A part of a task that the experiment does not have.
+    #[error("no task `{task}` was learnt; its tasks are {known}")]
+    NoTask {
+        /// The task asked for.
+        task: String,
+        /// The tasks there are.
+        known: String,
+    },
+    /// TorchScript of what cannot act for itself.
+    #[error("TorchScript takes a policy of one task, not `{part}`: export policy:TASK, where TASK is one of {tasks}")]
+    Script {
+        /// The part asked for.
+        part: String,
+        /// The tasks there are.
+        tasks: String,
+    },
+    /// A file that is longer than any policy.
+    #[error("it has more than {most} bytes: no policy is that long")]
+    Long {
+        /// Bytes there may be.
+        most: u64,
+    },
+    /// A file that cannot be read or written.
+    #[error("{0}")]
+    File(#[source] std::io::Error),
     /// libtorch refused an operation.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),

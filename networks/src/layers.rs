@@ -71,19 +71,10 @@ impl Torso {
         let [weight, bias] = &self.norm;
         hidden.layer_norm(weight.size(), Some(weight), Some(bias), LAYER_NORM_EPSILON, true)
     }
-
-    fn map(&self, replace: &mut impl FnMut(&Tensor) -> Tensor) -> Self {
-        let layers = self.layers.iter().map(|layer| map_linear(layer, replace)).collect();
-        Self { layers, norm: self.norm.each_ref().map(replace), output: self.output }
-    }
 }
 
 /// PyTorch's own.
 const LAYER_NORM_EPSILON: f64 = 1e-5;
-
-fn map_linear(layer: &nn::Linear, replace: &mut impl FnMut(&Tensor) -> Tensor) -> nn::Linear {
-    nn::Linear { ws: replace(&layer.ws), bs: layer.bs.as_ref().map(replace) }
-}
 
 /// Hidden layers and a linear output, perhaps with a linear path from input to output beside them.
 #[derive(Debug)]
@@ -111,29 +102,6 @@ impl Mlp {
             Some(weights) => output.addmm(input, &weights.tr()),
             None => output,
         }
-    }
-
-    /// Its parameters, in an order of its own.
-    pub(crate) fn parameters(&self) -> Vec<Tensor> {
-        let mut parameters = Vec::new();
-        let _ = self.map(&mut |parameter| {
-            parameters.push(parameter.shallow_clone());
-            parameter.shallow_clone()
-        });
-        parameters
-    }
-
-    /// The same network of other parameters, in the order of [`parameters`](Self::parameters); where they are too few its
-    /// own stay.
-    pub(crate) fn with(&self, parameters: Vec<Tensor>) -> Self {
-        let mut parameters = parameters.into_iter();
-        self.map(&mut |own| parameters.next().unwrap_or_else(|| own.shallow_clone()))
-    }
-
-    fn map(&self, replace: &mut impl FnMut(&Tensor) -> Tensor) -> Self {
-        let torso = self.torso.map(replace);
-        let head = map_linear(&self.head, replace);
-        Self { torso, head, linear_path: self.linear_path.as_ref().map(replace) }
     }
 }
 

@@ -8,7 +8,8 @@
 //! - [`Value`] is what only the learner needs. It lives in a parameter store of its own.
 //! - [`ActionDistribution`] is what a policy acts by, one Gaussian or a mixture; [`DiagonalGaussian`] is what it and the
 //!   latent are made of.
-//! - [`to_safetensors`] and [`from_safetensors`] carry a parameter store over a wire or onto a disk.
+//! - [`to_safetensors`] and [`from_safetensors`] carry a parameter store over a wire or onto a disk; [`export`] is policies
+//!   and parts of them as files that others read.
 //!
 //! Networks take float32 tensors of rows, `[N, ·]`, where a learner's N is unrolls × steps; what remembers takes
 //! `[B, T, ·]`. Sums over N depend in their last bits on N and on the number of threads; with both equal, acting and
@@ -20,6 +21,7 @@
 mod action;
 mod encoder;
 mod error;
+pub mod export;
 mod gaussian;
 mod layers;
 mod low_level;

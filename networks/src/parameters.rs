@@ -36,17 +36,21 @@ pub fn to_safetensors(store: &nn::VarStore) -> Result<Vec<u8>, Error> {
 /// # Errors
 /// What is wrong with the document, by the parameter's name; `store` is untouched then.
 pub fn from_safetensors(store: &mut nn::VarStore, bytes: &[u8]) -> Result<(), Error> {
+    set(&store.variables(), bytes)
+}
+
+/// As [`from_safetensors`], for these variables of a store.
+pub(crate) fn set(variables: &HashMap<String, Tensor>, bytes: &[u8]) -> Result<(), Error> {
     let document = SafeTensors::deserialize(bytes)?;
-    let variables = store.variables();
     if let Some(name) = document.names().into_iter().find(|name| !variables.contains_key(*name)) {
         return Err(Error::Unknown { name: name.to_string() });
     }
     let mut checked: HashMap<&str, Tensor> = HashMap::new();
-    for (name, variable) in &variables {
+    for (name, variable) in variables {
         let view = document.tensor(name).map_err(|_| Error::Missing { name: name.clone() })?;
         checked.insert(name, check(name, &variable.size(), &view)?);
     }
-    for (name, variable) in &variables {
+    for (name, variable) in variables {
         if let Some(values) = checked.get(name.as_str()) {
             tch::no_grad(|| variable.shallow_clone().f_copy_(values)).map(drop)?;
         }

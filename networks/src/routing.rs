@@ -4,10 +4,10 @@
 //! A [`Routing`] says which unroll is whose; [`PerTask`] is one network for each task.
 //!
 //! Whoever acts takes the rows of each task that is there, and leaves out the networks of those that are not
-//! ([`Routing::grouped`]). A learner's shapes must not depend on the mix, or a compiler of graphs would compile every one
-//! ([`Routing::blocked`]): its unrolls are sorted by task into blocks of one task each, a few more than they would fill,
-//! and every block is multiplied with the weights of its own task, gathered by index. With blocks of an eighth of the batch
-//! and two tasks this is nine eighths of the products, where every network over every unroll would be twice of them.
+//! ([`Routing::grouped`]). A learner's shapes must not depend on the mix, or memory would be cut anew for every one, and a
+//! compiler of graphs could not keep up ([`Routing::blocked`]): its unrolls are sorted by task into blocks of one task each,
+//! a few more than they would fill, and every block goes through its own task's network. With blocks of an eighth of the
+//! batch and two tasks this is nine eighths of the products, where every network over every unroll would be twice of them.
 
 use tch::{Device, Tensor};
 
@@ -38,8 +38,8 @@ struct Blocks {
     slots: Tensor,
     /// The slot of each unroll, `[B]` int64.
     places: Tensor,
-    /// The task of each block, `[blocks]` int64.
-    tasks: Tensor,
+    /// The task of each block.
+    tasks: Vec<usize>,
     /// Unrolls a block.
     size: i64,
 }
@@ -85,7 +85,7 @@ impl Routing {
         let blocks = Blocks {
             slots: indices(slots, device),
             places: indices(places, device),
-            tasks: indices(of_block, device),
+            tasks: of_block,
             size: size as i64,
         };
         Self(Some(Routed { tasks: indices(tasks.iter().copied(), device), way: Way::Blocks(blocks) }))
@@ -99,7 +99,7 @@ impl Routing {
                 Way::Blocks(Blocks { slots, places, tasks, size }) => Way::Blocks(Blocks {
                     slots: slots.shallow_clone(),
                     places: places.shallow_clone(),
-                    tasks: tasks.shallow_clone(),
+                    tasks: tasks.clone(),
                     size: *size,
                 }),
             };
@@ -164,35 +164,15 @@ fn by_group(networks: &[Mlp], groups: &[Tensor], input: &Tensor) -> Tensor {
     Tensor::cat(&outputs, 0).index_select(0, &Tensor::cat(&rows, 0).argsort(0, false))
 }
 
-/// Each block through its task's network; no shape depends on which that is.
+/// Each block through its task's network.
 fn by_block(networks: &[Mlp], blocks: &Blocks, input: &Tensor) -> Tensor {
-    let (unrolls, count) = (blocks.places.size()[0], blocks.tasks.size()[0]);
-    let sorted = input.reshape([unrolls, -1]).index_select(0, &blocks.slots).reshape([count, -1, input.size()[1]]);
-    let of_tasks: Vec<Vec<Tensor>> = networks.iter().map(Mlp::parameters).collect();
-    let mut of_blocks: Vec<Vec<Tensor>> = (0..count).map(|_| Vec::new()).collect();
-    for index in 0..of_tasks[0].len() {
-        let same: Vec<&Tensor> = of_tasks.iter().map(|parameters| &parameters[index]).collect();
-        let gathered = stack(&same).index_select(0, &blocks.tasks).unbind(0);
-        for (block, parameter) in of_blocks.iter_mut().zip(gathered) {
-            block.push(parameter);
-        }
-    }
-    let outputs: Vec<Tensor> = of_blocks
-        .into_iter()
-        .zip(sorted.unbind(0))
-        .map(|(parameters, rows)| networks[0].with(parameters).forward(&rows))
-        .collect();
+    let (unrolls, width, count) = (blocks.places.size()[0], input.size()[1], blocks.tasks.len() as i64);
+    let sorted = input.reshape([unrolls, -1]).index_select(0, &blocks.slots).reshape([count, -1, width]);
+    let of_block = |(task, rows): (&usize, Tensor)| networks[*task].forward(&own(&networks[*task], &rows));
+    let outputs: Vec<Tensor> = blocks.tasks.iter().zip(sorted.unbind(0)).map(of_block).collect();
     let output = Tensor::cat(&outputs, 0);
     let width = output.size()[1];
     output.reshape([count * blocks.size, -1]).index_select(0, &blocks.places).reshape([-1, width])
-}
-
-/// The same parameter of every task, `[tasks, …]`: narrow ones are filled up with zeros in front, for inputs that are zero there.
-fn stack(same: &[&Tensor]) -> Tensor {
-    let width = |tensor: &Tensor| tensor.size().last().copied().unwrap_or(1);
-    let widest = same.iter().map(|tensor| width(tensor)).max().unwrap_or(1);
-    let filled: Vec<Tensor> = same.iter().map(|tensor| tensor.constant_pad_nd([widest - width(tensor), 0])).collect();
-    Tensor::stack(&filled, 0)
 }
 
 #[cfg(test)]
@@ -220,8 +200,8 @@ mod tests {
         ) {
             let Blocks { slots, places, tasks: of_blocks, size } = blocks(&tasks, count);
             let even = blocks(&vec![0; tasks.len()], count);
-            prop_assert_eq!((slots.size(), of_blocks.size(), size), (even.slots.size(), even.tasks.size(), even.size));
-            let (slots, places, of_blocks) = (numbers(&slots), numbers(&places), numbers(&of_blocks));
+            prop_assert_eq!((slots.size(), of_blocks.len(), size), (even.slots.size(), even.tasks.len(), even.size));
+            let (slots, places) = (numbers(&slots), numbers(&places));
             for (unroll, task) in tasks.iter().enumerate() {
                 prop_assert_eq!(slots[places[unroll]], unroll);
                 prop_assert_eq!(of_blocks[places[unroll] / size as usize], *task);

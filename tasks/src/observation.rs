@@ -328,3 +328,14 @@ pub(crate) fn fill<T: Number>(out: &mut [T], values: impl IntoIterator<Item = f6
         *place = T::of(value);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::PROPRIOCEPTION;
+
+    #[test]
+    fn proprioception_is_in_the_order_that_exported_policies_name() {
+        let names = PROPRIOCEPTION.map(|one| one.name().strip_prefix("walker/").unwrap_or_default());
+        assert_eq!(names, comic_experiment::PROPRIOCEPTION.map(|(name, _)| name));
+    }
+}

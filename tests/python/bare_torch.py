@@ -7,8 +7,7 @@
 A plain `pip install torch==2.9.0` needs none of this. On Linux PyPI's only wheel of torch is the CUDA one; its
 libraries name cuDNN, cuBLAS, NCCL and others as needed. The CPU's paths call none of their functions, so empty
 libraries of those names beside torch's own are enough, as long as the functions are looked up when called and not at
-import: a script that is to run this way says `sys.setdlopenflags(os.RTLD_LAZY)` before `import torch`. Needs a C
-compiler. Libraries that the loader finds are left alone, and a second run does nothing.
+import, which a line in `bare_torch.pth` sees to whenever this Python starts. Needs a C compiler. Libraries that the loader finds are left alone, and a second run does nothing.
 """
 
 import importlib.util
@@ -28,7 +27,9 @@ def missing(folder):
 
 
 def main():
-    folder = pathlib.Path(importlib.util.find_spec("torch").origin).parent / "lib"
+    torch = pathlib.Path(importlib.util.find_spec("torch").origin).parent
+    torch.with_name("bare_torch.pth").write_text("import os, sys; sys.setdlopenflags(os.RTLD_LAZY)\n")
+    folder = torch / "lib"
     with tempfile.NamedTemporaryFile(suffix=".c") as empty:
         # A library that could not be loaded hides what it needs itself: look again until nothing is missing.
         while names := missing(folder):

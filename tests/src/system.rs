@@ -15,6 +15,8 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use tempfile::TempDir;
 
+use crate::repository::root;
+
 /// How often a condition is looked at again.
 const POLL: Duration = Duration::from_millis(50);
 /// Variables that would say where the learner is and what to show it.
@@ -73,6 +75,16 @@ pub fn program(name: &str) -> Result<PathBuf> {
          (`cargo xtask test` does it by itself)",
         path.display()
     );
+    Ok(path)
+}
+
+/// The Python that has dm_control and torch.
+///
+/// # Errors
+/// When it has not been made, with the command that does.
+pub fn python() -> Result<PathBuf> {
+    let path = root().join(".deps/python/requirements-export/bin/python");
+    ensure!(path.exists(), "there is no {}: `cargo xtask test` makes it, once", path.display());
     Ok(path)
 }
 

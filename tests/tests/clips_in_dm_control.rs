@@ -5,7 +5,7 @@ use std::process::{Command, Output};
 
 use anyhow::{Context, Result, ensure};
 use comic_tests::repository::root;
-use comic_tests::system::program;
+use comic_tests::system::{program, python};
 use serde_json::Value;
 
 /// m, or a quaternion's part: kinematics of two programs in double precision.
@@ -23,9 +23,7 @@ fn succeeds(arguments: &[&str]) -> Result<String> {
 
 /// What `tests/python/read_clips.py` says of a file.
 fn dm_control(file: &str) -> Result<Value> {
-    let python = root().join(".deps/python/requirements-tracking/bin/python");
-    ensure!(python.exists(), "there is no {}: `cargo xtask test` makes it, once", python.display());
-    let output = Command::new(python).arg(root().join("tests/python/read_clips.py")).arg(file).output()?;
+    let output = Command::new(python()?).arg(root().join("tests/python/read_clips.py")).arg(file).output()?;
     ensure!(output.status.success(), "dm_control cannot read {file}: {}", String::from_utf8_lossy(&output.stderr));
     serde_json::from_slice(&output.stdout).context("read_clips.py printed no JSON")
 }

@@ -41,8 +41,9 @@ With --json one object goes to standard output:
 #[derive(Args, Clone, Debug)]
 #[command(after_long_help = JSON_HELP)]
 pub struct Evaluate {
-    /// A run's directory, its `checkpoints`, or one checkpoint; the newest complete one is taken.
-    #[arg(long, value_name = "DIR", required_unless_present = "preset")]
+    /// A run's directory, its `checkpoints`, or one checkpoint, of which the newest complete one is taken; or a policy that
+    /// `comic-learner export` wrote.
+    #[arg(long, value_name = "DIR|FILE", visible_alias = "policy", required_unless_present = "preset")]
     checkpoint: Option<PathBuf>,
     /// The experiment to evaluate without a checkpoint: a preset's name or a TOML file.
     #[arg(long, value_name = "NAME|FILE", conflicts_with = "checkpoint")]
@@ -71,6 +72,9 @@ pub struct Evaluate {
     /// JSON instead of a table; see below.
     #[arg(long)]
     json: bool,
+    /// Write the reward of every step there too, one JSON object an episode: clip, start (its frame), rewards.
+    #[arg(long, value_name = "FILE")]
+    rewards: Option<PathBuf>,
     /// Report the evaluation of a checkpoint to this learner too, which keeps it in `evaluations.jsonl`.
     #[arg(long, value_name = "URL", requires = "checkpoint")]
     learner: Option<String>,
@@ -135,7 +139,11 @@ impl Evaluate {
         let recorder =
             self.video.as_ref().map(|out| Recorder::new(&self.look, out, task.control_timestep())).transpose()?;
         let mut follower = Follower { recorder, failed: None };
-        let report = evaluate(&mut evaluated, &task, sizes, &options, &mut follower)?;
+        let finished = evaluate(&mut evaluated, &task, sizes, &options, &mut follower)?;
+        let report = Report::new(task.spec(), &finished, &options);
+        if let Some(path) = &self.rewards {
+            super::rewards::write(path, task.spec(), &finished)?;
+        }
         let film = match (follower.failed, follower.recorder) {
             (Some(error), _) => Err(error),
             (None, recorder) => recorder.map_or(Ok(()), Recorder::finish),

@@ -9,18 +9,27 @@ use serde::{Deserialize, Serialize};
 use super::Options;
 
 /// An episode that is over.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Finished {
     /// The clip's index.
     pub clip: usize,
+    /// Frame within the clip.
+    pub start: usize,
     /// Steps that were left in the clip at the start.
     pub steps_left: usize,
-    /// Steps it lasted.
-    pub steps: usize,
+    /// The reward of each step it lasted.
+    pub rewards: Vec<f64>,
     /// Sums of the reward terms.
     pub returns: [f64; MAX_REWARD_TERMS],
     /// The simulation diverged.
     pub diverged: bool,
+}
+
+impl Finished {
+    /// Steps it lasted.
+    pub fn steps(&self) -> usize {
+        self.rewards.len()
+    }
 }
 
 /// An evaluation: `comic-actor evaluate --json` prints exactly this.
@@ -72,38 +81,39 @@ impl Report {
             .iter()
             .enumerate()
             .map(|(index, name)| {
-                let of_clip: Vec<Finished> = finished.iter().filter(|e| e.clip == index).copied().collect();
+                let of_clip: Vec<&Finished> = finished.iter().filter(|e| e.clip == index).collect();
                 ClipReport::new(name, spec, &of_clip)
             })
             .filter(|clip| clip.episodes > 0)
             .collect();
         let of_task = |(index, task): (usize, &TaskPart)| {
-            let own: Vec<Finished> = finished.iter().filter(|e| spec.task_of(e.clip) == index).copied().collect();
+            let own: Vec<&Finished> = finished.iter().filter(|e| spec.task_of(e.clip) == index).collect();
             ClipReport::new(&task.name, spec, &own)
         };
         let several = spec.tasks.len() > 1;
         let tasks = spec.tasks.iter().enumerate().filter(|_| several).map(of_task).collect();
-        let overall = ClipReport::new("overall", spec, finished);
+        let overall = ClipReport::new("overall", spec, &finished.iter().collect::<Vec<_>>());
         Self { deterministic: options.deterministic, seed: options.seed, clips, tasks, overall }
     }
 }
 
 impl ClipReport {
-    fn new(clip: &str, spec: &TaskSpec, finished: &[Finished]) -> Self {
-        let mean = |value: &dyn Fn(&Finished) -> f64| ratio(finished.iter().map(value).sum(), finished.len() as f64);
+    fn new(clip: &str, spec: &TaskSpec, finished: &[&Finished]) -> Self {
+        let mean =
+            |value: &dyn Fn(&Finished) -> f64| ratio(finished.iter().copied().map(value).sum(), finished.len() as f64);
         let total = |episode: &Finished| episode.returns.iter().sum::<f64>();
-        let steps: f64 = finished.iter().map(|episode| episode.steps as f64).sum();
+        let steps: f64 = finished.iter().map(|episode| episode.steps() as f64).sum();
         let most = |episode: &Finished| spec.max_reward(episode.clip);
-        let per_step = |value: &dyn Fn(&Finished) -> f64| ratio(finished.iter().map(value).sum(), steps);
+        let per_step = |value: &dyn Fn(&Finished) -> f64| ratio(finished.iter().copied().map(value).sum(), steps);
         Self {
             clip: clip.to_string(),
             episodes: finished.len(),
             diverged: finished.iter().filter(|episode| episode.diverged).count(),
-            length_mean: mean(&|episode| episode.steps as f64),
+            length_mean: mean(&|episode| episode.steps() as f64),
             return_mean: mean(&total),
             normalised_reward: mean(&|episode| ratio(total(episode), most(episode) * episode.steps_left as f64)),
             reward_per_step: per_step(&|episode| ratio(total(episode), most(episode))),
-            fraction_survived: mean(&|episode| ratio(episode.steps as f64, episode.steps_left as f64)),
+            fraction_survived: mean(&|episode| ratio(episode.steps() as f64, episode.steps_left as f64)),
             reward_terms: spec
                 .reward_terms
                 .iter()
@@ -144,7 +154,7 @@ mod tests {
     fn episode(clip: usize, steps_left: usize, steps: usize, pose: f64, velocity: f64) -> Finished {
         let mut returns = [0.0; MAX_REWARD_TERMS];
         returns[..2].copy_from_slice(&[pose, velocity]);
-        Finished { clip, steps_left, steps, returns, diverged: false }
+        Finished { clip, start: 0, steps_left, rewards: vec![0.0; steps], returns, diverged: false }
     }
 
     #[test]

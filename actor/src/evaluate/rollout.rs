@@ -90,7 +90,7 @@ pub(super) fn run<E: Environment, F: ForwardPass>(
         for (index, lane) in lanes.iter_mut().enumerate().filter(|(_, lane)| lane.episode.is_some()) {
             let ended = lane.step(&mut batch, index, options, &mut rng, &mut scratch);
             let mut seen = ControlFlow::Continue(());
-            if !ended.is_some_and(|episode| episode.diverged) {
+            if !ended.as_ref().is_some_and(|episode| episode.diverged) {
                 seen = audience.watch(lane.number, &mut lane.environment)?;
             }
             if let Some(episode) = ended {
@@ -156,8 +156,9 @@ impl<E: Environment> Lane<E> {
         let steps_left = episode.steps_left;
         self.episode = Some(Finished {
             clip: start.clip,
+            start: start.start,
             steps_left,
-            steps: 0,
+            rewards: Vec::new(),
             returns: [0.0; MAX_REWARD_TERMS],
             diverged: false,
         });
@@ -182,7 +183,7 @@ impl<E: Environment> Lane<E> {
         }
         clip_action(sampled, clipped);
         let step = self.environment.step(clipped);
-        episode.steps += 1;
+        episode.rewards.push(step.reward_terms.iter().sum());
         for (sum, term) in episode.returns.iter_mut().zip(&step.reward_terms) {
             *sum += term;
         }
@@ -264,7 +265,7 @@ mod tests {
         let options = Options { deterministic: true, ..Options::default() };
         let sizes = ActingSizes { proprioception: 1, task: 0, latent: 1, action: 2, image: 0, components: 1, state: 0 };
         let finished = run(evaluated, environments, sizes, &starts, &options, &mut |_: usize, _: usize| ()).unwrap();
-        let mut found: Vec<_> = finished.iter().map(|e| (e.steps, e.steps_left, e.returns[0])).collect();
+        let mut found: Vec<_> = finished.iter().map(|e| (e.steps(), e.steps_left, e.returns[0])).collect();
         found.sort_by(|a, b| a.partial_cmp(b).unwrap());
         found
     }

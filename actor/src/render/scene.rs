@@ -26,9 +26,9 @@ pub(super) struct Scene {
     /// The clip to follow, or to start from, in place of the experiment's own: builtin:NAME, FILE.h5#CLIP.
     #[arg(long, value_name = "SOURCE")]
     clip: Option<String>,
-    /// The policy that acts: a run's directory, its `checkpoints`, or one checkpoint. Without, the servo action follows
-    /// a clip, and the zero action plays any other task.
-    #[arg(long, value_name = "DIR")]
+    /// The policy that acts: a run's directory, its `checkpoints`, one checkpoint, or a policy that `comic-learner export`
+    /// wrote. Without, the servo action follows a clip, and the zero action plays any other task.
+    #[arg(long, value_name = "DIR|FILE", visible_alias = "policy")]
     checkpoint: Option<PathBuf>,
     /// The experiment without a checkpoint: a preset's name or a TOML file; the task's own preset unless given.
     #[arg(long, value_name = "NAME|FILE", conflicts_with = "checkpoint")]

@@ -15,7 +15,7 @@ pub(crate) struct TestOptions {
 /// Sets up and runs every test: by cargo-nextest where it is installed, else by cargo itself.
 pub(crate) fn test(options: &TestOptions) -> Result<()> {
     setup::run(&setup::Options::default())?;
-    // Files written here are read by dm_control's own loader.
+    // Files written here are read by dm_control's own loader, and policies act in its own environment.
     python::prepare_tests()?;
     // The whole-system tests start the programs, so these are built first.
     workspace::build()?;

@@ -97,7 +97,10 @@ pub(crate) fn run(metrics: &[String], quantity: Quantity, out: &Path) -> Result<
 
 /// Draws a curve for each run, over wall-clock time and over environment steps.
 pub(crate) fn draw_runs(sources: &[Source], quantity: Quantity, out: &Path) -> Result<()> {
-    let curves = sources.iter().map(|source| read(&source.path, source.task.as_deref(), quantity)).collect::<Result<Vec<_>>>()?;
+    let curves = sources
+        .iter()
+        .map(|source| read(&source.path, source.task.as_deref(), quantity))
+        .collect::<Result<Vec<_>>>()?;
     let series = |x: fn(&Point) -> f64| -> Vec<Series> {
         let line = |points: &Vec<Point>| points.iter().map(|point| (x(point), point.value)).collect();
         let named = sources.iter().zip(&curves);

@@ -38,9 +38,9 @@ pub(crate) fn fixtures(options: &FixtureOptions) -> Result<()> {
     Ok(())
 }
 
-/// Makes the environment in which tests run dm_control; under a second when it is there.
+/// Makes the environment in which tests run dm_control and torch; under a second when it is there.
 pub(crate) fn prepare_tests() -> Result<()> {
-    environment(&workspace::root().join("tests/python/requirements-tracking.txt")).map(drop)
+    environment(&workspace::root().join("tests/python/requirements-export.txt")).map(drop)
 }
 
 /// A command that runs `tests/python/SCRIPT` with what `tests/python/REQUIREMENTS` names.

@@ -1,0 +1,65 @@
+//! `comic-learner export`: a checkpoint's policy, or a part of it, as a file that others read.
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+use comic_experiment::Experiment;
+use comic_networks::export::{Exported, Part, Source};
+
+use crate::checkpoint::{self, Snapshot};
+use crate::options::Misuse;
+use crate::trainer::Progress;
+
+/// What the file's extension says it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Form {
+    Safetensors,
+    TorchScript,
+}
+
+/// Writes `part` of the newest checkpoint that `path` names to `out`. It is the online policy's, which evaluations take too.
+///
+/// # Errors
+/// No checkpoint, no such part in it, another extension than `.safetensors` and `.pt`, or a disk that refuses.
+pub fn run(path: &Path, part: Part, out: &Path) -> Result<()> {
+    let form = form(out)?;
+    let (place, snapshot) = checkpoint::find(path)?;
+    let exported = take(&place, part, &snapshot).with_context(|| format!("cannot export {}", place.display()))?;
+    let written = match form {
+        Form::Safetensors => std::fs::write(out, &exported.bytes).map_err(anyhow::Error::from),
+        Form::TorchScript => exported.save_script(out).map_err(anyhow::Error::from),
+    };
+    written.with_context(|| format!("cannot write {}", out.display()))?;
+    tracing::info!(checkpoint = %place.display(), %part, out = %out.display(), "exported");
+    Ok(())
+}
+
+fn form(out: &Path) -> Result<Form> {
+    match out.extension().and_then(|extension| extension.to_str()) {
+        Some("safetensors") => Ok(Form::Safetensors),
+        Some("pt") => Ok(Form::TorchScript),
+        _ => Err(Misuse::new(format!("--out {}: name it .safetensors, or .pt for TorchScript", out.display())).into()),
+    }
+}
+
+fn take(place: &Path, part: Part, snapshot: &Snapshot) -> Result<Exported> {
+    let experiment = Experiment::from_toml("experiment.toml of the checkpoint", snapshot.text("experiment.toml")?)?;
+    let progress: Progress =
+        serde_json::from_slice(snapshot.part("progress.json")?).context("the checkpoint's progress is damaged")?;
+    let name = |path: Option<&Path>| {
+        path.and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+    };
+    // RUN/checkpoints/NAME, wherever it was named from.
+    let place = std::path::absolute(place)?;
+    let source = Source {
+        program: concat!(env!("CARGO_PKG_NAME"), " ", env!("CARGO_PKG_VERSION")).into(),
+        run: name(place.ancestors().nth(2)),
+        checkpoint: name(Some(&place)),
+        updates: progress.updates,
+        environment_steps: progress.environment_steps,
+        epoch: progress.epoch,
+        version: progress.version,
+        seed: experiment.seed,
+    };
+    Ok(Exported::new(part, &experiment, source, snapshot.part("policy.safetensors")?)?)
+}

@@ -1,0 +1,153 @@
+//! Files, written and read.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::Read as _;
+use std::path::Path;
+
+use comic_experiment::{Experiment, TaskSpec};
+use safetensors::SafeTensors;
+use safetensors::tensor::TensorView;
+use tch::{Device, nn};
+
+use super::spec::task_spec;
+use super::{FORMAT, Part, Source, Spec, weights};
+use crate::{Error, Policy, parameters};
+
+/// Where in the metadata the [`Spec`] stands.
+pub const KEY: &str = "comic";
+/// Bytes that a file may have at most.
+pub const LONGEST: u64 = 1 << 30;
+
+/// A policy, or a part of one, that is whole: every tensor its [`Spec`] asks for is there, and fit to be used.
+#[derive(Clone, Debug)]
+pub struct Exported {
+    /// What it is.
+    pub spec: Spec,
+    /// Its experiment.
+    pub experiment: Experiment,
+    /// The file: safetensors, with the specification in its metadata.
+    pub bytes: Vec<u8>,
+}
+
+impl Exported {
+    /// Takes a part out of a checkpoint: its experiment and the parameters of its policy (safetensors).
+    ///
+    /// # Errors
+    /// A task that the experiment does not have, or parameters that are not its own.
+    pub fn new(part: Part, experiment: &Experiment, source: Source, policy: &[u8]) -> Result<Self, Error> {
+        let own = part.of(experiment)?;
+        let sizes = task_spec(&own)?;
+        let place = experiment.tasks().iter().position(|(task, _)| Some(*task) == part.task());
+        let document = SafeTensors::deserialize(policy)?;
+        let mut views = Vec::new();
+        for (name, view) in document.tensors().into_iter().filter(|(name, _)| part.holds(name)) {
+            let view = match place {
+                Some(place) if name.starts_with("normaliser.task_") => row(&view, place, sizes.task)?,
+                _ => view,
+            };
+            views.push((name, view));
+        }
+        let spec = Spec::new(part, &own, source)?;
+        let text = serde_json::to_string(&spec)
+            .map_err(|error| Error::Metadata { field: KEY.into(), problem: format!("cannot be written: {error}") })?;
+        // Read as anybody will read it: what could not be used is not given out.
+        Self::read(safetensors::serialize(views, Some(HashMap::from([(KEY.to_string(), text)])))?)
+    }
+
+    /// Reads a file, which may come from anywhere.
+    ///
+    /// # Errors
+    /// What is wrong with it, and what helps.
+    pub fn open(path: &Path) -> Result<Self, Error> {
+        let mut bytes = Vec::new();
+        File::open(path).and_then(|file| file.take(LONGEST + 1).read_to_end(&mut bytes)).map_err(Error::File)?;
+        if bytes.len() as u64 > LONGEST {
+            return Err(Error::Long { most: LONGEST });
+        }
+        Self::read(bytes)
+    }
+
+    /// Reads a file that is in memory.
+    ///
+    /// # Errors
+    /// As [`Exported::open`].
+    pub fn read(bytes: Vec<u8>) -> Result<Self, Error> {
+        let (_, metadata) = SafeTensors::read_metadata(&bytes)?;
+        let text = metadata.metadata().as_ref().and_then(|entries| entries.get(KEY));
+        let spec = parse(text.ok_or_else(|| wrong(KEY, "is missing: `comic-learner export` writes it"))?)?;
+        let experiment = Experiment::from_toml("its experiment", &spec.experiment).map_err(Error::Experiment)?;
+        agree(&spec, &experiment)?;
+        let sizes = task_spec(&experiment)?;
+        let expected = weights::count(spec.part, &sizes, &experiment.network);
+        let counted = metadata.tensors().into_iter().filter(|(name, info)| weights::is_counted(name, &info.shape));
+        let found: u64 = counted.map(|(_, info)| info.shape.iter().map(|size| *size as u64).product::<u64>()).sum();
+        if expected != found {
+            let problem =
+                format!("describes networks of {expected} weights where the file holds {found}: export it anew");
+            return Err(wrong("experiment", problem));
+        }
+        let exported = Self { spec, experiment, bytes };
+        exported.load(&exported.policy(&sizes)?.0)?;
+        Ok(exported)
+    }
+
+    /// Sets the parameters in `store` that this part is about, by their names; all others stay as they are.
+    ///
+    /// # Errors
+    /// Parameters of other names or shapes: `store` is untouched then.
+    pub fn load(&self, store: &nn::VarStore) -> Result<(), Error> {
+        let mut variables = store.variables();
+        variables.retain(|name, _| self.spec.part.holds(name));
+        parameters::set(&variables, &self.bytes)
+    }
+
+    /// Freshly initialised networks of its experiment.
+    pub(super) fn policy(&self, sizes: &TaskSpec) -> Result<(nn::VarStore, Policy), Error> {
+        let store = nn::VarStore::new(Device::Cpu);
+        let policy = Policy::new(&store.root(), sizes, &self.experiment.network, &vec![0.0; sizes.action])?;
+        Ok((store, policy))
+    }
+}
+
+/// The last `width` entries of one row of a matrix `[tasks, X]`, as a matrix of its own.
+fn row<'a>(view: &TensorView<'a>, place: usize, width: usize) -> Result<TensorView<'a>, Error> {
+    let size = size_of::<f32>();
+    let longest = view.shape().last().copied().unwrap_or(0);
+    let end = (place + 1) * longest * size;
+    let data = view.data().get(end.saturating_sub(width * size)..end).filter(|_| width <= longest);
+    let data = data.ok_or_else(|| wrong("normaliser.task_mean", "has no row of this task in the checkpoint"))?;
+    Ok(TensorView::new(view.dtype(), vec![1, width], data)?)
+}
+
+fn parse(text: &str) -> Result<Spec, Error> {
+    let malformed = |error: serde_json::Error| wrong(KEY, format!("is not what it should be: {error}"));
+    let value: serde_json::Value = serde_json::from_str(text).map_err(malformed)?;
+    // First of all, since another format has other fields.
+    if value["format"] != FORMAT {
+        let problem = format!("is {} where this program reads {FORMAT}: export it anew", value["format"]);
+        return Err(wrong("format", problem));
+    }
+    serde_json::from_value(value).map_err(malformed)
+}
+
+/// What the file says of itself is what this program makes of its experiment: one whose observations are in another
+/// order is refused, not misread.
+fn agree(spec: &Spec, experiment: &Experiment) -> Result<(), Error> {
+    let own = spec.part.of(experiment)?;
+    let made = Spec::new(spec.part, &own, spec.source.clone())?;
+    let fields = [
+        ("experiment", own == *experiment),
+        ("inputs", spec.inputs == made.inputs),
+        ("outputs", spec.outputs == made.outputs),
+        ("normalisation", spec.normalisation == made.normalisation),
+    ];
+    match fields.into_iter().find(|(_, same)| !same) {
+        Some((field, _)) => Err(wrong(field, "is not what this release makes of it: export it anew with this release")),
+        None => Ok(()),
+    }
+}
+
+fn wrong(field: &str, problem: impl Into<String>) -> Error {
+    Error::Metadata { field: field.into(), problem: problem.into() }
+}

@@ -1,0 +1,126 @@
+//! What a file holds.
+
+use comic_experiment::{Experiment, TaskName};
+use serde::{Deserialize, Serialize};
+
+use crate::Error;
+
+/// What a file holds: as the command line and the file write it, `policy`, `policy:TASK`, `encoder:TASK` or `low-level`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Part {
+    /// Everything that acts, of all tasks or of one.
+    Policy(Option<TaskName>),
+    /// One task's encoder, with the statistics that normalise its inputs.
+    Encoder(TaskName),
+    /// The low level, with the statistics that normalise proprioception.
+    LowLevel,
+}
+
+impl Part {
+    /// The task it is limited to.
+    pub fn task(self) -> Option<TaskName> {
+        match self {
+            Self::Policy(task) => task,
+            Self::Encoder(task) => Some(task),
+            Self::LowLevel => None,
+        }
+    }
+
+    /// Whether a parameter of this name, as checkpoints have it, belongs to it.
+    pub(crate) fn holds(self, name: &str) -> bool {
+        let of = |task: TaskName| name.strip_prefix("encoder.").and_then(|rest| rest.strip_prefix(task.name()));
+        let encodes = |task| of(task).is_some_and(|rest| rest.starts_with('.'));
+        match self {
+            Self::Policy(None) => true,
+            Self::Policy(Some(task)) => !name.starts_with("encoder.") || encodes(task),
+            Self::Encoder(task) => encodes(task) || name.starts_with("sight.") || name.starts_with("normaliser."),
+            Self::LowLevel => name.starts_with("low_level.") || name.starts_with("normaliser.proprioception_"),
+        }
+    }
+
+    /// The experiment as far as this part goes: a part of one task knows of no other.
+    ///
+    /// # Errors
+    /// [`Error::NoTask`] when the experiment has no such task.
+    pub(crate) fn of(self, experiment: &Experiment) -> Result<Experiment, Error> {
+        let Some(task) = self.task() else { return Ok(experiment.clone()) };
+        let tasks: Vec<TaskName> = experiment.tasks().into_iter().map(|(task, _)| task).collect();
+        if !tasks.contains(&task) {
+            let known = tasks.iter().map(|task| task.name()).collect::<Vec<_>>().join(", ");
+            return Err(Error::NoTask { task: task.to_string(), known });
+        }
+        Ok(Experiment { task, joint: Vec::new(), ..experiment.clone() })
+    }
+}
+
+impl std::fmt::Display for Part {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Policy(None) => formatter.write_str("policy"),
+            Self::Policy(Some(task)) => write!(formatter, "policy:{task}"),
+            Self::Encoder(task) => write!(formatter, "encoder:{task}"),
+            Self::LowLevel => formatter.write_str("low-level"),
+        }
+    }
+}
+
+impl std::str::FromStr for Part {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text.split_once(':') {
+            None if text == "policy" => Ok(Self::Policy(None)),
+            None if text == "low-level" => Ok(Self::LowLevel),
+            Some(("policy", task)) => Ok(Self::Policy(Some(task.parse()?))),
+            Some(("encoder", task)) => Ok(Self::Encoder(task.parse()?)),
+            _ => Err(format!("no part `{text}`; parts are policy, policy:TASK, encoder:TASK and low-level")),
+        }
+    }
+}
+
+impl TryFrom<String> for Part {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
+    }
+}
+
+impl From<Part> for String {
+    fn from(part: Part) -> Self {
+        part.to_string()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_are_read_as_they_are_written() {
+        for text in ["policy", "policy:get-up", "encoder:tracking", "low-level"] {
+            assert_eq!(text.parse::<Part>().unwrap().to_string(), text);
+        }
+        for text in ["", "value", "encoder", "encoder:", "encoder:flying", "low-level:tracking", "policy:"] {
+            assert!(text.parse::<Part>().is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_part_holds_its_own_parameters_alone() {
+        let names = [
+            "encoder.tracking.head.bias",
+            "encoder.get-up.head.bias",
+            "low_level.head.bias",
+            "normaliser.proprioception_std",
+            "normaliser.task_std",
+            "sight.first.weight",
+        ];
+        let held = |part: &str| names.map(|name| part.parse::<Part>().unwrap().holds(name));
+        assert_eq!(held("policy"), [true; 6]);
+        assert_eq!(held("policy:get-up"), [false, true, true, true, true, true]);
+        assert_eq!(held("encoder:tracking"), [true, false, false, true, true, true]);
+        assert_eq!(held("low-level"), [false, false, true, true, false, false]);
+    }
+}

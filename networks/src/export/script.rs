@@ -1,0 +1,66 @@
+//! The same policy as TorchScript.
+
+use std::fs::OpenOptions;
+use std::io::Write as _;
+use std::path::Path;
+
+use tch::{CModule, Kind, Tensor};
+use zip::write::FileOptions;
+use zip::{CompressionMethod, ZipArchive, ZipWriter};
+
+use super::spec::task_spec;
+use super::{Exported, KEY, Part};
+use crate::{Error, Memory, Policy, Routing};
+
+impl Exported {
+    /// Writes the policy of one task as TorchScript to `path`: a module whose `forward` takes the inputs of the
+    /// [`super::Spec`], `[1, size]` each, an image last, and gives the outputs side by side, `[1, A + M]`. The
+    /// specification lies in it as the extra file `comic.json`.
+    ///
+    /// # Errors
+    /// [`Error::Script`] for anything but a policy of one task; what libtorch or the disk refuses.
+    pub fn save_script(&self, path: &Path) -> Result<(), Error> {
+        let sizes = task_spec(&self.experiment)?;
+        if !matches!(self.spec.part, Part::Policy(_)) || sizes.tasks.len() != 1 {
+            let tasks: Vec<&str> = sizes.tasks.iter().map(|task| task.name.as_str()).collect();
+            return Err(Error::Script { part: self.spec.part.to_string(), tasks: tasks.join(", ") });
+        }
+        let (mut store, policy) = self.policy(&sizes)?;
+        self.load(&store)?;
+        // What needs a gradient cannot be a constant of a trace.
+        store.freeze();
+        let network = &self.experiment.network;
+        let (latent, state) = (network.latent.size as i64, network.state_size() as i64);
+        let row = |size: i64, kind| Tensor::zeros([1, size], (kind, store.device()));
+        let widths = [sizes.proprioception as i64, sizes.task as i64, latent + state];
+        let mut inputs: Vec<Tensor> = widths.into_iter().map(|width| row(width, Kind::Float)).collect();
+        if sizes.image > 0 {
+            inputs.push(row(sizes.image as i64, Kind::Uint8));
+        }
+        let mut forward = |inputs: &[Tensor]| vec![step(&policy, inputs, latent, state)];
+        let module = tch::no_grad(|| CModule::create_by_tracing("Policy", "forward", &inputs, &mut forward))?;
+        module.save(path)?;
+        self.enclose(path).map_err(Error::File)
+    }
+
+    /// PyTorch looks for extra files in a directory `extra` of the archive; libtorch's own writer takes none from here.
+    fn enclose(&self, path: &Path) -> std::io::Result<()> {
+        let mut file = OpenOptions::new().read(true).write(true).open(path)?;
+        let first = ZipArchive::new(&mut file)?.by_index(0)?.name().to_string();
+        let root = first.split('/').next().unwrap_or_default();
+        let mut archive = ZipWriter::new_append(file)?;
+        let stored = FileOptions::default().compression_method(CompressionMethod::Stored);
+        archive.start_file(format!("{root}/extra/{KEY}.json"), stored)?;
+        archive.write_all(serde_json::to_string(&self.spec)?.as_bytes())?;
+        archive.finish()?.sync_all()
+    }
+}
+
+/// One step without noise: the action within its bounds, and what is remembered.
+fn step(policy: &Policy, inputs: &[Tensor], latent: i64, state: i64) -> Tensor {
+    let observation = policy.normalise(&inputs[0], &inputs[1], inputs.get(3), &Routing::single());
+    let previous = inputs[2].narrow(1, 0, latent);
+    let memory = Memory { state: &inputs[2].narrow(1, latent, state), first: None };
+    let acting = policy.act(&observation, &previous, &previous.zeros_like(), memory);
+    Tensor::cat(&[acting.action.mode().clamp(-1.0, 1.0), acting.latent, acting.state], 1)
+}

@@ -1,0 +1,98 @@
+//! How many weights an experiment's networks have, before they are built.
+
+use comic_experiment::{LowLevelName, Network, TaskSpec};
+
+use super::Part;
+
+/// Entries of the matrices of encoders and low level, as far as `part` goes. Whoever reads a file compares it with what
+/// the file holds: an experiment in a file of a thousand numbers must not make networks of a billion.
+pub(super) fn count(part: Part, spec: &TaskSpec, network: &Network) -> u64 {
+    let encoders = || spec.tasks.iter().map(|task| encoder(spec, task.observation, network)).sum();
+    match part {
+        Part::Policy(_) => encoders() + low_level(spec, network),
+        Part::Encoder(_) => encoders(),
+        Part::LowLevel => low_level(spec, network),
+    }
+}
+
+/// Whether [`count`] counts a tensor of this name and shape.
+pub(super) fn is_counted(name: &str, shape: &[usize]) -> bool {
+    shape.len() > 1 && (name.starts_with("encoder.") || name.starts_with("low_level."))
+}
+
+/// Weights of hidden layers, and the width of the last one.
+fn hidden(input: u64, sizes: &[usize]) -> (u64, u64) {
+    sizes.iter().fold((0, input), |(weights, width), size| (weights + width * *size as u64, *size as u64))
+}
+
+fn encoder(spec: &TaskSpec, observation: usize, network: &Network) -> u64 {
+    let latent = network.latent.size as u64;
+    let seen = if spec.image > 0 { network.image_features } else { 0 };
+    let input = (spec.proprioception + observation + seen) as u64 + latent;
+    let (weights, width) = hidden(input, &network.encoder);
+    let output = if latent == 0 { network.primitives.count as u64 } else { 2 * latent };
+    let path = if latent > 0 && network.encoder_linear_path { output * input } else { 0 };
+    weights + width * output + path
+}
+
+fn low_level(spec: &TaskSpec, network: &Network) -> u64 {
+    let (latent, proprioception, actions) =
+        (network.latent.size as u64, spec.proprioception as u64, spec.action as u64);
+    match network.low_level {
+        LowLevelName::Mlp => {
+            let (weights, width) = hidden(latent + proprioception, &network.mlp.hidden);
+            weights + width * 2 * actions
+        }
+        LowLevelName::Lstm => {
+            let layer = |(weights, width): (u64, u64), units: &usize| {
+                let units = *units as u64;
+                (weights + 4 * units * (width + units), units)
+            };
+            let (weights, width) = network.lstm.units.iter().fold((0, latent + proprioception), layer);
+            weights + width * 2 * actions
+        }
+        LowLevelName::Mixture | LowLevelName::Product => {
+            let sizes = &network.primitives;
+            let (count, units) = (sizes.count as u64, sizes.hidden as u64);
+            let (torso, width) = hidden(proprioception, &sizes.torso);
+            let primitives = torso + width * count * units + count * (units + 1) * 2 * actions;
+            let (gate, width) = hidden(latent + proprioception, &sizes.gate);
+            primitives + if latent > 0 { gate + width * count } else { 0 }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use comic_experiment::{presets, resolve};
+    use tch::{Device, nn};
+
+    use super::*;
+    use crate::Policy;
+    use crate::export::spec::task_spec;
+
+    #[test]
+    fn the_count_is_that_of_the_built_networks_in_every_preset() {
+        let bare = ["network.latent.size=0".to_string()];
+        for (name, _) in presets::ALL {
+            for overrides in [&[][..], &bare[..]] {
+                // Not every low level can do without a bottleneck.
+                let Ok(experiment) = resolve(name, overrides) else { continue };
+                let (spec, network) = (task_spec(&experiment).unwrap(), &experiment.network);
+                let store = nn::VarStore::new(Device::Cpu);
+                Policy::new(&store.root(), &spec, network, &vec![0.0; spec.action]).unwrap();
+                for part in [Part::Policy(None), Part::LowLevel] {
+                    let sizes =
+                        |tensor: &tch::Tensor| tensor.size().iter().map(|size| *size as usize).collect::<Vec<_>>();
+                    let built: usize = store
+                        .variables()
+                        .iter()
+                        .filter(|(name, tensor)| part.holds(name) && is_counted(name, &sizes(tensor)))
+                        .map(|(_, tensor)| tensor.numel())
+                        .sum();
+                    assert_eq!(count(part, &spec, network), built as u64, "{name}: {part}");
+                }
+            }
+        }
+    }
+}

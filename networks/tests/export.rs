@@ -1,0 +1,322 @@
+//! Policies as files: what is exported is what acts, and nothing hostile gets in.
+
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+use comic_experiment::{Experiment, LowLevelName, TaskSpec, resolve};
+use comic_networks::export::{Exported, KEY, Part, Source};
+use comic_networks::{Error, Memory, Policy, Routing, from_safetensors, to_safetensors};
+use proptest::prelude::*;
+use safetensors::SafeTensors;
+use safetensors::tensor::{Dtype, TensorView};
+use serde_json::Value;
+use tch::{CModule, Device, Kind, Tensor, nn};
+
+/// libtorch's generator is the process's: tests that seed it take turns.
+static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
+
+/// A preset, with networks of a few numbers.
+fn small(preset: &str, more: &[&str]) -> Experiment {
+    let sizes = [
+        "network.encoder=[8]",
+        "network.mlp.hidden=[8]",
+        "network.lstm.units=[6,5]",
+        "network.primitives.count=3",
+        "network.primitives.torso=[8]",
+        "network.primitives.hidden=6",
+        "network.primitives.gate=[7]",
+        "network.latent.size=4",
+        "network.normaliser_steps=1",
+        "network.policy_head_scale=1",
+    ];
+    let overrides: Vec<String> = sizes.iter().chain(more).map(|field| (*field).to_string()).collect();
+    resolve(preset, &overrides).unwrap()
+}
+
+/// A policy of the experiment in which no number is another's, its statistics included.
+fn policy(experiment: &Experiment) -> (nn::VarStore, Policy, TaskSpec) {
+    tch::manual_seed(1);
+    let spec = TaskSpec::new(experiment, Vec::new()).unwrap();
+    let store = nn::VarStore::new(Device::Cpu);
+    let policy = Policy::new(&store.root(), &spec, &experiment.network, &vec![0.1; spec.action]).unwrap();
+    // In order, so that the same experiment has the same policy again.
+    for (name, tensor) in store.variables().into_iter().collect::<BTreeMap<_, _>>() {
+        let mut noise = tensor.detach().rand_like() * 0.5 - 0.25;
+        if name.ends_with("_std") {
+            noise = noise + 1.0;
+        }
+        tch::no_grad(|| tensor.shallow_clone().copy_(&noise));
+    }
+    (store, policy, spec)
+}
+
+fn source() -> Source {
+    Source { run: "walk".into(), checkpoint: "checkpoint-0000000007".into(), updates: 7, ..Source::default() }
+}
+
+fn exported(part: &str, experiment: &Experiment) -> Result<Exported, Error> {
+    let _guard = GENERATOR.lock().unwrap();
+    let (store, ..) = policy(experiment);
+    Exported::new(part.parse().unwrap(), experiment, source(), &to_safetensors(&store).unwrap())
+}
+
+fn names(exported: &Exported) -> BTreeSet<String> {
+    let document = SafeTensors::deserialize(&exported.bytes).unwrap();
+    document.names().into_iter().map(String::from).collect()
+}
+
+fn random(width: usize) -> Tensor {
+    Tensor::randn([1, width as i64], (Kind::Float, Device::Cpu))
+}
+
+#[test]
+fn every_part_comes_back_as_it_went_out_and_says_what_it_is() {
+    let joint = small("joint-get-up", &[]);
+    for (part, inputs, outputs) in [
+        ("policy", "proprioception observation:tracking observation:get-up memory", "action memory"),
+        ("policy:get-up", "proprioception observation:get-up memory", "action memory"),
+        ("encoder:get-up", "observation:get-up proprioception previous_latent", "latent_mean latent_std"),
+        ("low-level", "latent proprioception state", "mean std state"),
+    ] {
+        let file = exported(part, &joint).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("part.safetensors");
+        std::fs::write(&path, &file.bytes).unwrap();
+        let again = Exported::open(&path).unwrap();
+        assert_eq!((&again.spec, &again.experiment, &again.bytes), (&file.spec, &file.experiment, &file.bytes));
+        assert_eq!((again.spec.part.to_string().as_str(), again.spec.source), (part, source()));
+        let named = |vectors: &[comic_networks::export::Vector]| {
+            vectors.iter().map(|vector| vector.name.clone()).collect::<Vec<_>>().join(" ")
+        };
+        assert_eq!((named(&again.spec.inputs), named(&again.spec.outputs)), (inputs.into(), outputs.into()));
+        for vector in again.spec.inputs.iter().filter(|vector| !vector.entries.is_empty()) {
+            assert_eq!(vector.entries.iter().map(|entry| entry.size).sum::<usize>(), vector.size, "{vector:?}");
+        }
+    }
+}
+
+#[test]
+fn tensors_keep_the_names_they_have_in_a_checkpoint() {
+    let joint = small("joint-get-up", &[]);
+    let all = names(&exported("policy", &joint).unwrap());
+    let getting_up = names(&exported("encoder:get-up", &joint).unwrap());
+    let low_level = names(&exported("low-level", &joint).unwrap());
+    assert!(getting_up.is_subset(&all) && low_level.is_subset(&all));
+    for name in ["encoder.get-up.layers.0.weight", "encoder.get-up.head.bias", "normaliser.task_mean"] {
+        assert!(getting_up.contains(name), "{name}");
+    }
+    for name in ["low_level.layers.0.weight", "low_level.head.bias", "normaliser.proprioception_std"] {
+        assert!(low_level.contains(name), "{name}");
+    }
+    assert!(!low_level.contains("normaliser.task_mean") && !getting_up.contains("low_level.head.bias"));
+    assert!(!names(&exported("policy:get-up", &joint).unwrap()).contains("encoder.tracking.head.bias"));
+}
+
+#[test]
+fn a_policy_of_one_task_acts_as_the_joint_policy_does_in_that_task() {
+    let joint = small("joint-get-up", &[]);
+    let file = exported("policy:get-up", &joint).unwrap();
+    let _guard = GENERATOR.lock().unwrap();
+    let (_, both, spec) = policy(&joint);
+    let own = TaskSpec::new(&file.experiment, Vec::new()).unwrap();
+    let mut store = nn::VarStore::new(Device::Cpu);
+    let alone = Policy::new(&store.root(), &own, &file.experiment.network, &vec![0.0; own.action]).unwrap();
+    from_safetensors(&mut store, &file.bytes).unwrap();
+
+    let (proprioception, latent, state) = (random(spec.proprioception), random(4), random(0));
+    let task = random(spec.task);
+    let act = |policy: &Policy, task: &Tensor, routing: Routing| {
+        let observation = policy.normalise(&proprioception, task, None, &routing);
+        let memory = Memory { state: &state, first: None };
+        policy.act(&observation, &latent, &latent.zeros_like(), memory).action.mode()
+    };
+    let expected = act(&both, &task, Routing::grouped(&[1], 2));
+    // A shorter task's observation is at the end of the longest.
+    let own_task = task.narrow(1, (spec.task - own.task) as i64, own.task as i64);
+    let found = act(&alone, &own_task, Routing::single());
+    assert!((expected - found).abs().max().double_value(&[]) < 1e-6);
+}
+
+#[test]
+fn a_low_level_moves_into_another_policy_and_changes_nothing_else_there() {
+    let file = exported("low-level", &small("joint-get-up", &[])).unwrap();
+    let _guard = GENERATOR.lock().unwrap();
+    // Another task, with an encoder of another size.
+    let (store, ..) = policy(&small("go-to-target", &["network.encoder=[9, 9]"]));
+    let values = || {
+        let values = |tensor: Tensor| Vec::<f32>::try_from(tensor.detach().flatten(0, -1)).unwrap();
+        store.variables().into_iter().map(|(name, tensor)| (name, values(tensor))).collect::<HashMap<_, _>>()
+    };
+    for tensor in store.variables().values() {
+        let _ = tch::no_grad(|| tensor.shallow_clone().fill_(0.5));
+    }
+    file.load(&store).unwrap();
+    let moved = names(&file);
+    for (name, after) in values() {
+        assert_eq!(after.iter().all(|value| *value == 0.5), !moved.contains(&name), "{name}");
+    }
+    let (other, ..) = policy(&small("go-to-target", &["network.mlp.hidden=[9]"]));
+    assert!(matches!(file.load(&other).unwrap_err(), Error::Shape { .. }));
+}
+
+#[test]
+fn torch_script_acts_as_the_policy_does_whatever_its_low_level() {
+    let directory = tempfile::tempdir().unwrap();
+    for (name, bare) in LowLevelName::ALL.into_iter().map(|name| (name, false)).chain([(LowLevelName::Mixture, true)]) {
+        let size = format!("network.latent.size={}", if bare { 0 } else { 4 });
+        let experiment = small("tracking-mlp", &[&format!("network.low_level={name}"), &size]);
+        let file = exported("policy", &experiment).unwrap();
+        let path = directory.path().join(format!("{name}-{bare}.pt"));
+        let _guard = GENERATOR.lock().unwrap();
+        file.save_script(&path).unwrap();
+        let module = CModule::load(&path).unwrap();
+
+        let (_, policy, spec) = policy(&experiment);
+        let (latent, state) = (experiment.network.latent.size, experiment.network.state_size());
+        let mut remembered = Tensor::zeros([1, (latent + state) as i64], (Kind::Float, Device::Cpu));
+        let mut memory = (remembered.narrow(1, 0, latent as i64), remembered.narrow(1, latent as i64, state as i64));
+        for step in 0..4 {
+            let (proprioception, task) = (random(spec.proprioception), random(spec.task));
+            let output = module.forward_ts(&[&proprioception, &task, &remembered]).unwrap();
+            let observation = policy.normalise(&proprioception, &task, None, &Routing::single());
+            let before = Memory { state: &memory.1, first: None };
+            let acting = tch::no_grad(|| policy.act(&observation, &memory.0, &memory.0.zeros_like(), before));
+            let action = acting.action.mode().clamp(-1.0, 1.0);
+            let expected = Tensor::cat(&[&action, &acting.latent, &acting.state], 1);
+            assert_eq!(output, expected, "{name}, step {step}");
+            remembered = output.narrow(1, spec.action as i64, (latent + state) as i64);
+            memory = (acting.latent, acting.state);
+        }
+    }
+}
+
+#[test]
+fn a_mixture_without_noise_acts_by_its_likeliest_component_row_by_row() {
+    let weights = Tensor::from_slice(&[0.2f32, 0.8, 0.7, 0.3]).log().reshape([2, 2]);
+    let mean = Tensor::from_slice(&[1.0f32, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]).reshape([2, 4]);
+    let action = comic_networks::ActionDistribution::from_rows(&mean, &mean.ones_like(), &weights).mode();
+    assert_eq!(Vec::<Vec<f32>>::try_from(&action).unwrap(), [[3.0, 4.0], [5.0, 6.0]]);
+}
+
+#[test]
+fn torch_script_is_of_one_task() {
+    let directory = tempfile::tempdir().unwrap();
+    let joint = small("joint-get-up", &[]);
+    for part in ["policy", "low-level"] {
+        let file = exported(part, &joint).unwrap();
+        let refused = file.save_script(&directory.path().join("policy.pt")).unwrap_err().to_string();
+        assert!(refused.contains("policy:TASK") && refused.contains("tracking, get-up"), "{refused}");
+    }
+    let path = directory.path().join("get-up.pt");
+    exported("policy:get-up", &joint).unwrap().save_script(&path).unwrap();
+    assert!(CModule::load(&path).is_ok());
+}
+
+#[test]
+fn a_task_that_was_not_learnt_is_named_beside_those_that_were() {
+    let refused = exported("encoder:ball-catch", &small("joint-get-up", &[])).unwrap_err().to_string();
+    assert!(refused.contains("`ball-catch`") && refused.contains("tracking, get-up"), "{refused}");
+}
+
+/// A file whose description, or tensors, somebody altered.
+fn altered(
+    description: impl FnOnce(&mut Value),
+    tensors: impl FnOnce(&mut HashMap<String, (Vec<usize>, Vec<u8>)>),
+) -> Vec<u8> {
+    let file = exported("policy", &small("tracking-mlp", &[])).unwrap();
+    let mut spec = serde_json::to_value(&file.spec).unwrap();
+    description(&mut spec);
+    let document = SafeTensors::deserialize(&file.bytes).unwrap();
+    let entries = document.tensors().into_iter();
+    let mut entries = entries.map(|(name, view)| (name, (view.shape().to_vec(), view.data().to_vec()))).collect();
+    tensors(&mut entries);
+    let views =
+        entries.iter().map(|(name, (shape, bytes))| (name, TensorView::new(Dtype::F32, shape.clone(), bytes).unwrap()));
+    safetensors::serialize(views, Some(HashMap::from([(KEY.to_string(), spec.to_string())]))).unwrap()
+}
+
+fn refused(bytes: Vec<u8>) -> String {
+    Exported::read(bytes).unwrap_err().to_string()
+}
+
+#[test]
+fn a_description_that_lies_is_refused_by_its_field() {
+    type Alteration = fn(&mut Value);
+    let cases: [(&str, Alteration); 11] = [
+        ("`format`", |spec| spec["format"] = 2.into()),
+        ("`format`", |spec| *spec = Value::Null),
+        ("no part `value`", |spec| spec["part"] = "value".into()),
+        ("no task `ball-catch`", |spec| spec["part"] = "policy:ball-catch".into()),
+        ("`experiment`", |spec| spec["experiment"] = "seed = -".into()),
+        ("network.encoder", |spec| spec["experiment"] = "[network]\nencoder = []".into()),
+        ("`inputs`", |spec| spec["inputs"][0]["entries"][0]["name"] = "joints_vel".into()),
+        ("`inputs`", |spec| spec["inputs"][1]["size"] = 3.into()),
+        ("`outputs`", |spec| spec["outputs"] = Value::Array(Vec::new())),
+        ("`normalisation`", |spec| spec["normalisation"]["limit"] = 5.into()),
+        ("unknown field `more`", |spec| spec["more"] = 1.into()),
+    ];
+    for (expected, alter) in cases {
+        let said = refused(altered(alter, |_| ()));
+        assert!(said.contains(expected), "{expected}: {said}");
+    }
+}
+
+#[test]
+fn no_networks_are_built_that_the_file_cannot_fill() {
+    let grow = |spec: &mut Value| {
+        let experiment =
+            spec["experiment"].as_str().unwrap().replace("encoder = [8]", "encoder = [16384, 16384, 16384]");
+        spec["experiment"] = experiment.into();
+    };
+    let said = refused(altered(grow, |_| ()));
+    assert!(said.contains("`experiment`") && said.contains("weights where the file holds"), "{said}");
+}
+
+#[test]
+fn tensors_that_do_not_fit_are_refused_by_name() {
+    let name = "low_level.head.bias".to_string();
+    let missing = altered(|_| (), |tensors| drop(tensors.remove("low_level.head.bias")));
+    assert!(refused(missing).contains("`low_level.head.bias` is missing"));
+    let unknown = altered(|_| (), |tensors| drop(tensors.insert("more".into(), (vec![1], vec![0; 4]))));
+    assert!(refused(unknown).contains("`more` is unknown"));
+    let shape = altered(|_| (), |tensors| drop(tensors.insert(name.clone(), (vec![1], vec![0; 4]))));
+    assert!(refused(shape).contains("has shape [1]"));
+    let nan = altered(
+        |_| (),
+        |tensors| {
+            let (_, bytes) = tensors.get_mut("low_level.head.bias").unwrap();
+            bytes[..4].copy_from_slice(&f32::NAN.to_le_bytes());
+        },
+    );
+    assert!(refused(nan).contains("an infinity or a NaN"));
+}
+
+#[test]
+fn a_file_without_a_description_says_who_writes_one() {
+    let _guard = GENERATOR.lock().unwrap();
+    let (store, ..) = policy(&small("tracking-mlp", &[]));
+    let said = refused(to_safetensors(&store).unwrap());
+    assert!(said.contains("`comic`") && said.contains("comic-learner export"), "{said}");
+}
+
+proptest! {
+    #[test]
+    fn no_damage_panics(damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..4), cut in any::<prop::sample::Index>()) {
+        static FILE: std::sync::OnceLock<Vec<u8>> = std::sync::OnceLock::new();
+        let whole = FILE.get_or_init(|| altered(|_| (), |_| ()));
+        let mut bytes = whole.clone();
+        // The head, where the description is: numbers that change are still numbers.
+        let head = bytes.len().min(16_384);
+        for (place, value) in &damage {
+            bytes[place.index(head)] = *value;
+        }
+        drop(Exported::read(bytes));
+        prop_assert!(Exported::read(whole[..cut.index(whole.len())].to_vec()).is_err());
+    }
+}
+
+#[test]
+fn parts_are_spelt_as_the_command_line_spells_them() {
+    assert_eq!(serde_json::to_string(&"encoder:get-up".parse::<Part>().unwrap()).unwrap(), "\"encoder:get-up\"");
+}
