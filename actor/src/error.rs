@@ -2,15 +2,29 @@
 
 use std::path::PathBuf;
 
-/// An actor's errors; what a variant holds as its source is not repeated in its message. [`Error::is_configuration`] tells those that no restart can mend.
+/// An actor's errors; what a variant holds as its source is not repeated in its message. [`Error::is_configuration`]
+/// tells those that no restart can mend.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The learner's address is no URL.
-    #[error("`{url}` is no address of a learner: give one like http://host:7070")]
-    Url {
-        /// What was given.
+    /// The learner's address, certificates or token cannot be used.
+    #[error(transparent)]
+    Access(#[from] comic_proto::AccessError),
+    /// Token or certificate are not accepted, by one side or the other.
+    #[error("the learner at {url} does not let this actor in: {message}")]
+    Unwelcome {
+        /// The learner's address.
         url: String,
+        /// What is not accepted.
+        message: String,
+    },
+    /// The learner does not answer.
+    #[error("the learner at {url} cannot be reached: {message}")]
+    Unreachable {
+        /// The learner's address.
+        url: String,
+        /// Why not.
+        message: String,
     },
     /// The learner answers, and will not have this actor.
     #[error("the learner at {url} refused this actor: {message} (do both programs come from the same release?)")]
@@ -43,8 +57,8 @@ pub enum Error {
     /// After a reconnect the learner serves another experiment.
     #[error("the learner now serves another experiment than the one this actor runs: start the actor again")]
     Changed,
-    /// The process was told to stop before it had begun.
-    #[error("stopped before the learner answered")]
+    /// The process was told to stop before the run was over.
+    #[error("told to stop before the run was over")]
     Stopped,
     /// An asset did not arrive as announced.
     #[error("asset `{origin}` did not arrive as the learner announced it: {reason}")]
@@ -126,7 +140,8 @@ impl Error {
     pub fn is_configuration(&self) -> bool {
         matches!(
             self,
-            Self::Url { .. }
+            Self::Access(_)
+                | Self::Unwelcome { .. }
                 | Self::Refused { .. }
                 | Self::Experiment(_)
                 | Self::Spec(_)

@@ -11,11 +11,13 @@ use comic_actor::evaluate::command::Evaluate;
 use comic_actor::render::command::Render;
 use comic_actor::render::view::View;
 use comic_actor::{Error, bench, policy, run};
+use comic_proto::Access;
 use tracing_subscriber::EnvFilter;
 
 const EXIT_CODES: &str = "\
-Exit codes: 0 when the run is over or the actor was told to stop, 2 when the configuration is wrong and starting
-again cannot help, 1 otherwise (for instance when the learner now serves another experiment).
+Exit codes: 0 when the run is over, 2 when the configuration is wrong and starting again cannot help (a token or a
+certificate that is not accepted, another release), 1 otherwise (told to stop before the run was over, or the learner now
+serves another experiment).
 Logs go to standard error; RUST_LOG chooses what (default: info).";
 
 /// Steps humanoids for a learner; it needs nothing but the learner's address.
@@ -48,9 +50,11 @@ enum Command {
 
 #[derive(Args, Debug)]
 struct Act {
-    /// The learner's address, for instance http://host:7070.
+    /// The learner's address, for instance http://host:7070 or https://host:7070.
     #[arg(long, value_name = "URL", env = "COMIC_LEARNER")]
     learner: Option<String>,
+    #[command(flatten)]
+    access: Access,
     /// Threads; the experiment's number unless given.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
@@ -77,8 +81,12 @@ fn main() -> ExitCode {
     match command(arguments) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            tracing::error!("{error:#}");
-            let configuration = error.downcast_ref::<Error>().is_some_and(Error::is_configuration);
+            let known = error.downcast_ref::<Error>();
+            match known {
+                Some(stopped @ Error::Stopped) => tracing::info!("{stopped}"),
+                _ => tracing::error!("{error:#}"),
+            }
+            let configuration = known.is_some_and(Error::is_configuration);
             ExitCode::from(if configuration { 2 } else { 1 })
         }
     }
@@ -92,12 +100,12 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
         Some(Command::Clips(clips)) => clips.run().map_err(anyhow::Error::from),
         Some(Command::Bench(bench)) => bench.run().context("cannot measure"),
         None => {
-            let Act { learner, threads, environments, cache } = arguments.act;
+            let Act { learner, access, threads, environments, cache } = arguments.act;
             let learner = learner.ok_or_else(|| {
                 Error::Usage("no learner: give its address with --learner http://host:7070, or see --help".into())
             })?;
             let (threads, environments) = (threads.map(usize::from), environments.map(usize::from));
-            run::run(&run::Options { learner, threads, environments, cache }).context("cannot act")
+            run::run(&run::Options { learner, access, threads, environments, cache }).context("cannot act")
         }
     }
 }

@@ -7,6 +7,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use comic_clips::Catalogue;
+use comic_proto::Access;
 use comic_tasks::Simulated;
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
@@ -34,6 +35,8 @@ const LOG_EVERY: Duration = Duration::from_secs(10);
 pub struct Options {
     /// For instance `http://host:7070`.
     pub learner: String,
+    /// Certificates and token.
+    pub access: Access,
     /// Threads; the experiment's number when absent.
     pub threads: Option<usize>,
     /// Environments a thread; the experiment's number when absent.
@@ -44,10 +47,11 @@ pub struct Options {
 
 type TaskWorker = Worker<Box<dyn Simulated>, TorchPolicy>;
 
-/// Acts for a learner until the run is over or the process is told to stop (SIGTERM, SIGINT).
+/// Acts for a learner until the run is over.
 ///
 /// # Errors
-/// [`Error`]; a lost connection is none.
+/// [`Error::Stopped`] when the process was told to stop before that (SIGTERM, SIGINT, SIGHUP) and has delivered what was
+/// finished; a lost connection is none.
 pub fn run(options: &Options) -> Result<(), Error> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
@@ -66,11 +70,12 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
     let (stopping, stop) = watch::channel(false);
     let closing = Closing { mailbox: Arc::clone(&mailbox), stopping };
     stop_on_signal(runtime, closing.clone())?;
-    let session = session::Options { learner: options.learner.clone(), cache: options.cache.clone() };
-    let joined = match runtime.block_on(session::join(&session, stop.clone())) {
-        Err(Error::Stopped) => return Ok(()),
-        joined => joined?,
+    let session = session::Options {
+        learner: options.learner.clone(),
+        access: options.access.clone(),
+        cache: options.cache.clone(),
     };
+    let joined = runtime.block_on(session::join(&session, stop.clone()))?;
     let threads = options.threads.unwrap_or(joined.experiment.actor.threads).max(1);
     let environments = options.environments.unwrap_or(joined.experiment.actor.environments).max(1);
     let (workers, parameters) = build(&joined, threads, environments)?;
@@ -93,7 +98,8 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
     }
     let settled = settled.map_err(|_| Error::WorkerPanicked)??;
     tracing::info!(steps = progress.steps.load(Ordering::Relaxed), ?settled, "leaving");
-    Ok(())
+    // Whoever counts what ends with 0 as done, as Kubernetes does with a Job, must not count this.
+    if settled.over { Ok(()) } else { Err(Error::Stopped) }
 }
 
 /// Stops everything at SIGTERM or SIGINT.

@@ -2,7 +2,8 @@
 //!
 //! [`join`] asks the learner who we are and what to run; [`Joined::run`] then exchanges unrolls and parameters. A lost
 //! connection is made again, with back-off, for ever; what was not acknowledged is sent again, in order. Only another
-//! experiment, a refusal, or the learner's word that the run is over end it.
+//! experiment, a refusal, or the learner's word that the run is over end it. A refused token or certificate ends an
+//! actor that was never let in; one that was waits until the files, which are read for every connection, are renewed.
 
 mod assets;
 mod backoff;
@@ -18,7 +19,7 @@ use std::time::Duration;
 
 use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::v1::JoinReply;
-use comic_proto::{UnrollLayout, UnrollShape};
+use comic_proto::{Access, UnrollLayout, UnrollShape};
 use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
@@ -42,6 +43,8 @@ const STABLE: Duration = Duration::from_secs(5);
 pub struct Options {
     /// For instance `http://host:7070`.
     pub learner: String,
+    /// Certificates and token.
+    pub access: Access,
     /// Directory of the asset cache; [`default_cache`] when absent.
     pub cache: Option<PathBuf>,
 }
@@ -120,7 +123,7 @@ pub async fn join(options: &Options, mut stop: watch::Receiver<bool>) -> Result<
 }
 
 async fn join_for_ever(options: &Options) -> Result<Joined, Error> {
-    let mut connector = Connector::new(&options.learner)?;
+    let mut connector = Connector::new(&options.learner, &options.access)?;
     let mut backoff = Backoff::default();
     loop {
         match attempt(options, &mut connector).await {
@@ -180,26 +183,27 @@ impl Joined {
         let mut outbox = Outbox::new(limits.window, self.layout.hash());
         let ended = tokio::select! {
             ended = self.keep_connected(limits, unrolls, mailbox, &mut outbox) => ended,
-            () = deadline(stop, limits.flush) => Ok(()),
+            () = deadline(stop, limits.flush) => Ok(false),
         };
         if !outbox.is_empty() {
             tracing::warn!(unrolls = outbox.len(), "left with unrolls that were not acknowledged");
         }
-        ended.map(|()| outbox.settled())
+        ended.map(|over| Settled { over, ..outbox.settled() })
     }
 
+    /// Whether it ended because the run is over.
     async fn keep_connected(
         mut self,
         limits: Limits,
         mut unrolls: mpsc::Receiver<FinishedUnroll>,
         mailbox: Arc<Mailbox>,
         outbox: &mut Outbox,
-    ) -> Result<(), Error> {
+    ) -> Result<bool, Error> {
         let mut backoff = Backoff::default();
         let mut link = Some(self.link);
         loop {
             if unrolls.is_closed() && unrolls.is_empty() && outbox.is_empty() {
-                return Ok(());
+                return Ok(false);
             }
             let attempt = match link.take() {
                 Some(link) => Ok(link),
@@ -210,7 +214,8 @@ impl Joined {
                     let since = Instant::now();
                     let exchange = Exchange { unrolls: &mut unrolls, outbox, mailbox: &mailbox, limits };
                     match exchange.run(link, self.connector.incarnation()).await {
-                        Ended::Drained | Ended::Over => return Ok(()),
+                        Ended::Drained => return Ok(false),
+                        Ended::Over => return Ok(true),
                         Ended::Lost(reason) => {
                             if since.elapsed() > STABLE {
                                 backoff = Backoff::default();

@@ -81,26 +81,30 @@ pub struct Difference {
 }
 
 impl Experiment {
-    /// The first field in which `other` is another experiment.
+    /// Every field in which `other` is another experiment.
     ///
     /// # Errors
     /// [`Error::Malformed`] when a number is beyond what TOML can write.
-    pub fn difference(&self, other: &Self) -> Result<Option<Difference>, Error> {
+    pub fn differences(&self, other: &Self) -> Result<Vec<Difference>, Error> {
         let [ours, theirs] = [self.to_table()?, other.to_table()?];
-        Ok(difference_in("", &ours, &theirs))
+        let mut differences = Vec::new();
+        collect_differences("", &ours, &theirs, &mut differences);
+        Ok(differences)
     }
 }
 
-fn difference_in(prefix: &str, ours: &Table, theirs: &Table) -> Option<Difference> {
-    ours.keys().chain(theirs.keys()).find_map(|key| {
+fn collect_differences(prefix: &str, ours: &Table, theirs: &Table, differences: &mut Vec<Difference>) {
+    for key in ours.keys().chain(theirs.keys().filter(|key| !ours.contains_key(*key))) {
         let field = join(prefix, key);
         match (ours.get(key), theirs.get(key)) {
-            (Some(Value::Table(ours)), Some(Value::Table(theirs))) => difference_in(&field, ours, theirs),
-            (ours, theirs) if ours == theirs => None,
+            (Some(Value::Table(ours)), Some(Value::Table(theirs))) => {
+                collect_differences(&field, ours, theirs, differences);
+            }
+            (ours, theirs) if ours == theirs => {}
             (ours, theirs) => {
                 let text = |value: Option<&Value>| value.map_or_else(|| "nothing".to_string(), Value::to_string);
-                Some(Difference { field, ours: text(ours), theirs: text(theirs) })
+                differences.push(Difference { field, ours: text(ours), theirs: text(theirs) });
             }
         }
-    })
+    }
 }

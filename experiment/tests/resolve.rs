@@ -2,8 +2,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
 
 use comic_experiment::{
-    ClipSource, Difference, Error, Experiment, InitialPose, LowLevelName, Prior, TRACKING_OBSERVATIONS, TaskName,
-    TaskSpec, TerminationError, find_field, presets, resolve,
+    ClipSource, Difference, Error, Experiment, InitialPose, LowLevelName, Prior, TRACKING_OBSERVATIONS,
+    TerminationError, find_field, presets, resolve,
 };
 use proptest::prelude::*;
 
@@ -77,55 +77,6 @@ fn the_other_low_levels_presets_are_the_papers() {
     assert_eq!(of("tracking-lstm"), (LowLevelName::Lstm, 0.1, 0.1, 1e-5, 1e-3, (60, 5e-4, false)));
     assert_eq!(of("tracking-mixture"), (LowLevelName::Mixture, 0.1, 0.1, 1e-3, 1e-3, (0, 5e-4, true)));
     assert_eq!(of("tracking-product"), (LowLevelName::Product, 0.1, 0.1, 1e-3, 1e-3, (60, 5e-4, false)));
-}
-
-#[test]
-fn the_joint_presets_have_the_papers_probabilities() {
-    let of = |preset: &str| resolve(preset, &[]).unwrap().tasks();
-    assert_eq!(of("joint-get-up"), [(TaskName::Tracking, 0.9), (TaskName::GetUp, 0.1)]);
-    assert_eq!(of("joint-ball"), [(TaskName::Tracking, 0.8), (TaskName::BallCatch, 0.2)]);
-}
-
-#[test]
-fn joint_tasks_that_make_no_sense_are_refused() {
-    let refused = |joint: &str, other: &str| {
-        let overrides = [format!("joint=[{joint}]"), other.to_string()];
-        resolve("quickstart", &overrides).unwrap_err().to_string()
-    };
-    let get_up = r#"{task="get-up", probability=0.1}"#;
-    for (joint, other, field) in [
-        (r#"{task="tracking", probability=0.1}"#, "seed=1", "joint.0.task"),
-        (&format!("{get_up}, {get_up}"), "seed=1", "joint.1.task"),
-        (r#"{task="get-up", probability=0}"#, "seed=1", "joint.0.probability"),
-        (r#"{task="get-up", probability=1}"#, "seed=1", "joint.0.probability"),
-        (r#"{task="get-up", probability=nan}"#, "seed=1", "joint.0.probability"),
-        (r#"{task="get-up", probability=0.5}, {task="ball-catch", probability=0.5}"#, "seed=1", "joint"),
-        (r#"{task="gaps", probability=0.5}"#, "seed=1", "gaps.corridor.vision"),
-        (get_up, "network.value_lstm=[8]", "network.value_lstm"),
-        (r#"{task="get-up", probability=0.1}"#, "task=go-to-target", "warm_start.steps"),
-    ] {
-        let error = refused(joint, other);
-        assert!(error.contains(field), "{joint}, {other}: {error}");
-    }
-    resolve("quickstart", &[r#"joint=[{task="gaps", probability=0.5}]"#.into(), "gaps.corridor.vision=off".into()])
-        .unwrap();
-    let error = resolve("quickstart", &[r#"joint=[{task="get-up", probabilty=0.1}]"#.into()]).unwrap_err().to_string();
-    assert!(error.contains("joint.0.probability"), "{error}");
-}
-
-#[test]
-fn a_clip_belongs_to_the_task_it_was_listed_with() {
-    let experiment = resolve("joint-ball", &[]).unwrap();
-    let spec = TaskSpec::new(&experiment, vec!["walk".into(), "run".into()]).unwrap();
-    assert_eq!(spec.clips, ["walk", "run", "ball-catch"]);
-    assert_eq!([0, 1, 2].map(|clip| spec.task_of(clip)), [0, 0, 1]);
-    let ball = &experiment.ball_catch;
-    let most = 2.0 * ball.touch_reward + ball.standing_reward + ball.walking_reward;
-    assert_eq!([0, 1, 2].map(|clip| spec.max_reward(clip)), [1.45, 1.45, most]);
-    assert_eq!(
-        (spec.reward_terms.len(), spec.task),
-        (1, TaskSpec::tracking(&experiment.tracking, Vec::new()).unwrap().task)
-    );
 }
 
 #[test]
@@ -376,11 +327,11 @@ fn the_end_of_no_name_is_refused_with_the_nearest() {
 #[test]
 fn experiments_differ_by_name_and_both_values() {
     let [ours, theirs] = ["1e-3", "0.5"].map(|beta| set(&[&format!("network.latent.beta={beta}")]).unwrap());
-    assert_eq!(ours.difference(&ours).unwrap(), None);
+    assert_eq!(ours.differences(&ours).unwrap(), []);
     let expected = Difference { field: "network.latent.beta".into(), ours: "0.001".into(), theirs: "0.5".into() };
-    assert_eq!(ours.difference(&theirs).unwrap(), Some(expected));
+    assert_eq!(ours.differences(&theirs).unwrap(), [expected]);
     let theirs = ours.clone().with_clips(&["builtin:run".into()]);
-    assert_eq!(ours.difference(&theirs).unwrap().unwrap().field, "clips");
+    assert_eq!(ours.differences(&theirs).unwrap()[0].field, "clips");
 }
 
 // Values

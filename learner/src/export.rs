@@ -7,7 +7,7 @@ use comic_experiment::Experiment;
 use comic_networks::export::{Exported, Part, Source};
 
 use crate::checkpoint::{self, Snapshot};
-use crate::run::Misuse;
+use crate::options::Misuse;
 use crate::trainer::Progress;
 
 /// What the file's extension says it is.

@@ -8,22 +8,31 @@
 //! - [`vmpo`] is the algorithm: losses, and the gradient step. [`adam`] is its optimiser.
 //! - `state` turns the trainer into a snapshot and back. [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
 //! - [`export`] makes a checkpoint's policy a file that others read.
-//! - [`metrics`] is what a person sees; [`sizes`] counts parameters.
+//! - [`metrics`] is what a person sees of learning, [`telemetry`] what Prometheus sees of the service, by way of [`probes`].
+//! - [`security`] is who may talk to it; [`certs`] makes certificates for trying that out.
+//! - [`status`] and [`health`] are commands that ask another learner how it is.
+//! - [`sizes`] counts parameters.
 //!
 //! There is no MuJoCo here: whatever needs a simulator is done by actors.
 
 pub mod adam;
 pub mod bench;
+pub mod certs;
 pub mod checkpoint;
 pub mod export;
+pub mod health;
 pub mod metrics;
 pub mod options;
+pub mod probes;
 pub mod publish;
 pub mod run;
+pub mod security;
 pub mod service;
 pub mod sizes;
 mod state;
 pub mod statistics;
+pub mod status;
+pub mod telemetry;
 pub mod tensors;
 pub mod trainer;
 pub mod vmpo;

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use anyhow::Context as _;
 use clap::Parser as _;
 use comic_learner::bench::Subject;
-use comic_learner::options::{Command, LogFormat, Options};
+use comic_learner::options::{Command, LogFormat, Misuse, Options};
 use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
@@ -28,6 +28,10 @@ fn main() -> ExitCode {
         Some(Command::Export { checkpoint, part, out }) => comic_learner::export::run(checkpoint, *part, out),
         Some(Command::Sizes) => comic_learner::sizes::table()
             .and_then(|table| std::io::stdout().write_all(table.as_bytes()).context("cannot write to stdout")),
+        Some(Command::Status(status)) => status.run(),
+        Some(Command::Health(health)) => return health.run(),
+        Some(Command::Certs(certs)) => certs.run(),
+        Some(Command::Metrics) => comic_learner::telemetry::print_reference(),
         None => comic_learner::run::run(&options),
     };
     match ended {
@@ -38,7 +42,8 @@ fn main() -> ExitCode {
             let configuration = error.chain().any(|cause| {
                 cause.is::<comic_experiment::Error>()
                     || cause.is::<comic_clips::Error>()
-                    || cause.is::<comic_learner::run::Misuse>()
+                    || cause.is::<comic_proto::AccessError>()
+                    || cause.is::<Misuse>()
             });
             ExitCode::from(if configuration { 2 } else { 1 })
         }

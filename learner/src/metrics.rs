@@ -92,6 +92,8 @@ pub struct Metrics {
     since: Instant,
     /// The books of the last line.
     books: Value,
+    /// Whether the last line may have ended half-way.
+    torn: bool,
 }
 
 /// Where the run stands, for the line's head.
@@ -124,6 +126,7 @@ impl Metrics {
             window: Window::default(),
             since: Instant::now(),
             books: Value::Null,
+            torn: false,
         })
     }
 
@@ -137,11 +140,15 @@ impl Metrics {
         self.window.unrolls > 0 || self.window.tasks.iter().any(|task| task.unrolls > 0) || self.books != *books
     }
 
-    /// Appends an actor's evaluation to `RUN/evaluations.jsonl`.
-    ///
-    /// # Errors
-    /// When the file refuses.
-    pub fn keep_evaluation(&self, evaluation: &Evaluation) -> Result<()> {
+    /// Appends an actor's evaluation to `RUN/evaluations.jsonl`. A disk that refuses is complained about, and training
+    /// goes on.
+    pub fn keep_evaluation(&self, evaluation: &Evaluation) {
+        if let Err(error) = self.append_evaluation(evaluation) {
+            tracing::error!(version = evaluation.version, "an evaluation is lost: {error:#}");
+        }
+    }
+
+    fn append_evaluation(&self, evaluation: &Evaluation) -> Result<()> {
         let path = self.run.join("evaluations.jsonl");
         let report: Value = serde_json::from_str(&evaluation.json).unwrap_or(Value::Null);
         let line = json!({ "learner_epoch": evaluation.epoch, "version": evaluation.version, "evaluation": report });
@@ -197,11 +204,9 @@ impl Metrics {
         }
     }
 
-    /// Writes the line, starts a new window, and returns the line for the status.
-    ///
-    /// # Errors
-    /// When the file refuses.
-    pub fn write(&mut self, position: Position, books: Value, losses: Map<String, Value>) -> Result<String> {
+    /// Writes the line, starts a new window, and returns the line for the status. A disk that refuses is complained
+    /// about, and training goes on.
+    pub fn write(&mut self, position: Position, books: Value, losses: Map<String, Value>) -> String {
         let seconds = self.since.elapsed().as_secs_f64().max(1e-9);
         let window = std::mem::take(&mut self.window);
         self.since = Instant::now();
@@ -244,12 +249,41 @@ impl Metrics {
                 .into();
         }
         let line = line.to_string();
-        writeln!(self.file, "{line}").context("cannot write metrics.jsonl")?;
-        Ok(line)
+        // What a full disk cut off keeps its own line.
+        let start = if self.torn { "\n" } else { "" };
+        let written = self.file.write_all(format!("{start}{line}\n").as_bytes());
+        self.torn = written.is_err();
+        if let Err(error) = written {
+            tracing::error!("metrics.jsonl lacks a line: {error}");
+        }
+        line
     }
 }
 
 fn append(path: &Path) -> Result<File> {
     let file = OpenOptions::new().create(true).append(true).open(path);
     file.with_context(|| format!("cannot write {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use comic_experiment::Experiment;
+
+    use super::*;
+
+    #[test]
+    fn a_full_disk_costs_lines_and_nothing_else() {
+        let directory = tempfile::tempdir().unwrap();
+        // A device that refuses every byte, for want of space.
+        std::os::unix::fs::symlink("/dev/full", directory.path().join("metrics.jsonl")).unwrap();
+        std::os::unix::fs::symlink("/dev/full", directory.path().join("evaluations.jsonl")).unwrap();
+        let spec = TaskSpec::new(&Experiment::default(), vec!["walk".into()]).unwrap();
+        let mut metrics = Metrics::open(directory.path(), &spec).unwrap();
+        let position = Position { seconds: 1.0, environment_steps: 2, updates: 3, version: 4, epoch: 5 };
+        for _ in 0..2 {
+            let line = metrics.write(position, Value::Null, Map::new());
+            assert!(line.contains("\"updates\":3"), "{line}");
+        }
+        metrics.keep_evaluation(&Evaluation { epoch: 5, version: 4, json: "{}".into() });
+    }
 }

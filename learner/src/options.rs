@@ -7,9 +7,14 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use comic_experiment::{Experiment, LowLevelName};
 use comic_networks::export::Part;
 
+use crate::certs::Certs;
+use crate::health::Health;
+use crate::security::{Limits, SecurityOptions};
+use crate::status::Status;
+
 /// Learns reusable motor skills from the experience that comic-actor processes stream to it.
 #[derive(Debug, Parser)]
-#[command(name = "comic-learner", version, about)]
+#[command(name = "comic-learner", version, about, after_help = EXIT_CODES)]
 pub struct Options {
     /// What else than serving.
     #[command(subcommand)]
@@ -20,13 +25,25 @@ pub struct Options {
     /// Port to serve on; 0 lets the system choose.
     #[arg(long, default_value_t = 7070)]
     pub port: u16,
-    /// Address to serve on.
-    #[arg(long, default_value = "0.0.0.0")]
+    /// Address to serve on. Beyond this machine (0.0.0.0) it wants TLS, a token, or --insecure.
+    #[arg(long, default_value = "127.0.0.1")]
     pub address: std::net::IpAddr,
+    /// Port on the same address for /metrics, /healthz and /readyz over HTTP; none unless given, 0 lets the system choose.
+    #[arg(long, value_name = "PORT")]
+    pub metrics_port: Option<u16>,
+    /// Who gets in.
+    #[command(flatten)]
+    pub security: SecurityOptions,
+    /// How many get in.
+    #[command(flatten)]
+    pub limits: Limits,
     /// The run's directory: checkpoints, metrics.jsonl, the resolved experiment. A directory that holds checkpoints is
     /// resumed.
     #[arg(long, value_name = "DIR", default_value = "runs/default")]
     pub run: PathBuf,
+    /// Go on with a run whose experiment was another one, as far as its checkpoint fits.
+    #[arg(long)]
+    pub allow_changed: bool,
     /// Print the resolved experiment and leave.
     #[arg(long)]
     pub print: bool,
@@ -78,6 +95,14 @@ pub enum Command {
     },
     /// Print how many parameters the networks of the paper's presets have.
     Sizes,
+    /// Print the state of a running learner.
+    Status(Status),
+    /// Exit with 0 if a learner serves and with 1 if not, for a container's health check.
+    Health(Health),
+    /// Make a development authority, and certificates for a learner and its actors.
+    Certs(Certs),
+    /// Print what each metric means, as docs/metrics.md has it.
+    Metrics,
     /// Time the update against its bare matrix products; one JSON line per figure.
     Bench {
         /// libtorch's threads.
@@ -93,6 +118,24 @@ pub enum Command {
         #[arg(long, conflicts_with = "low_level")]
         joint: bool,
     },
+}
+
+/// The same on both sides; `docs/operations.md` says more.
+const EXIT_CODES: &str = "\
+Exit codes: 0 when the run is over or the learner was told to stop and wrote its checkpoint, 2 when the configuration
+is wrong and starting again cannot help, 1 otherwise.
+Logs go to standard error; RUST_LOG chooses what (default: info).";
+
+/// A configuration that is wrong and stays wrong, however often it is tried: exit code 2.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct Misuse(pub(crate) String);
+
+impl Misuse {
+    /// What is wrong, and the remedy.
+    pub fn new(message: impl Into<String>) -> Self {
+        Self(message.into())
+    }
 }
 
 /// Form of the log.

@@ -13,16 +13,21 @@ use comic_experiment::{Difference, Experiment, InitialPose, TaskSpec};
 use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
 use comic_replay::{Batcher, Config, Ledger, Phase};
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
 
 use crate::checkpoint::{Snapshot, Store};
-use crate::options::Options;
+use crate::options::{Misuse, Options};
+use crate::probes;
 use crate::publish::Publisher;
+use crate::security::Security;
 use crate::service::{self, Shared};
 use crate::trainer::{Ending, Setup, Trainer};
 
+/// File descriptors for everything that is no connection to an actor.
+const OTHER_FILES: u64 = 256;
 /// How long actors are given to hear that the run is over.
 const FAREWELL: Duration = Duration::from_millis(1500);
 
@@ -50,20 +55,28 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     let mut interrupt = signal(SignalKind::interrupt())?;
     let mut terminate = signal(SignalKind::terminate())?;
     let mut hangup = signal(SignalKind::hangup())?;
-    let address = SocketAddr::new(options.address, options.port);
-    let listener = TcpListener::bind(address)
-        .await
-        .with_context(|| format!("cannot listen on {address}: choose another --port, or 0 for any free one"))?;
+    let security = Security::new(&options.security, options.address)?;
+    allow_descriptors(options.limits.max_connections() as u64 + OTHER_FILES);
+    let listener = listen(options, "port", options.port).await?;
+    let metrics = match options.metrics_port {
+        Some(port) => Some(listen(options, "metrics-port", port).await?),
+        None => None,
+    };
     let _lock = Store::open(&options.run, experiment.learner.checkpoints_kept)?.lock()?;
-    let (setup, shared) = prepare(options, experiment)?;
+    let (setup, shared) = prepare(options, experiment, security)?;
     let (batcher, publisher, epoch) = (setup.batcher.clone(), setup.publisher.clone(), setup.epoch);
     let mut training = start_trainer(setup)?;
     let (stop_serving, stopped) = oneshot::channel::<()>();
     let address = listener.local_addr()?;
+    let mut listening =
+        serde_json::json!({ "listening": address.to_string(), "learner_epoch": epoch, "run": options.run });
+    if let Some(metrics) = metrics {
+        listening["metrics"] = metrics.local_addr()?.to_string().into();
+        tokio::spawn(probes::serve(metrics, shared.clone()));
+    }
     let serving = tokio::spawn(service::serve(listener, shared, async {
         let _ = stopped.await;
     }));
-    let listening = serde_json::json!({ "listening": address.to_string(), "learner_epoch": epoch, "run": options.run });
     // Nobody has to read it.
     let _ = writeln!(std::io::stdout(), "{listening}");
     tracing::info!(%address, epoch, run = %options.run.display(), "serving");
@@ -103,6 +116,26 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     Ok(())
 }
 
+/// A connection is a file descriptor, and systems give 1024 unless asked for more.
+fn allow_descriptors(wanted: u64) {
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    if current.is_none_or(|current| current >= wanted) {
+        return;
+    }
+    let allowed = maximum.map_or(wanted, |maximum| maximum.min(wanted));
+    let raised = setrlimit(Resource::Nofile, Rlimit { current: Some(allowed), maximum });
+    if raised.is_err() || allowed < wanted {
+        tracing::warn!(wanted, ?current, ?maximum, "too few file descriptors for --max-actors: raise `ulimit -n`");
+    }
+}
+
+async fn listen(options: &Options, flag: &str, port: u16) -> Result<TcpListener> {
+    let address = SocketAddr::new(options.address, port);
+    TcpListener::bind(address)
+        .await
+        .with_context(|| format!("cannot listen on {address}: choose another --{flag}, or 0 for any free one"))
+}
+
 type Training = oneshot::Receiver<Result<Ending>>;
 
 fn start_trainer(setup: Setup) -> Result<Training> {
@@ -117,11 +150,11 @@ fn start_trainer(setup: Setup) -> Result<Training> {
     Ok(training)
 }
 
-fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shared>)> {
+fn prepare(options: &Options, experiment: Experiment, security: Security) -> Result<(Setup, Arc<Shared>)> {
     let catalogue = Catalogue::open(&experiment.clips)?;
     let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
     let spec = TaskSpec::new(&experiment, names)
-        .map_err(|name| Misuse(format!("tracking.observations: the tracking task has no observation `{name}`")))?;
+        .map_err(|name| Misuse::new(format!("tracking.observations: the tracking task has no observation `{name}`")))?;
     let pose = match experiment.network.initial_pose {
         InitialPose::MidRange => vec![0.0; spec.action],
         InitialPose::ReferenceMean => catalogue.mean_action()?.iter().map(|action| *action as f32).collect(),
@@ -129,7 +162,7 @@ fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shar
     let store = Store::open(&options.run, experiment.learner.checkpoints_kept)?;
     let resume = store.newest()?;
     if let Some((path, snapshot)) = &resume {
-        check_same_experiment(&experiment, &spec, snapshot)
+        check_same_experiment(&experiment, &spec, snapshot, options.allow_changed)
             .with_context(|| format!("{} cannot be resumed", options.run.display()))?;
         tracing::info!(checkpoint = %path.display(), "resuming");
     }
@@ -150,6 +183,9 @@ fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shar
     let batcher = Batcher::new(layout, config, Phase { epoch, ..Phase::default() }, ledger);
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {
+        run: options.run.clone(),
+        security,
+        limits: options.limits.clone(),
         experiment: experiment.clone(),
         spec: spec.clone(),
         assets: catalogue.assets()?,
@@ -161,30 +197,71 @@ fn prepare(options: &Options, experiment: Experiment) -> Result<(Setup, Arc<Shar
     Ok((setup, shared))
 }
 
-/// A run goes on only as the experiment it was; how long, how often and with how many threads may change.
-fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot) -> Result<()> {
+/// A run goes on only as the experiment it was, unless it is allowed to change; how long, how often and with how many
+/// threads may always.
+fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot, allowed: bool) -> Result<()> {
     let then = Experiment::from_toml("experiment.toml of the checkpoint", snapshot.text("experiment.toml")?)?;
-    let now = Experiment {
-        budget: then.budget.clone(),
-        learner: then.learner.clone(),
-        actor: then.actor.clone(),
-        ..now.clone()
-    };
-    if let Some(Difference { field, ours, theirs }) = then.difference(&now)? {
-        return Err(Misuse(format!(
-            "it was made with `{field} = {ours}` where the experiment now says `{theirs}`: give another --run, or the \
-             old value"
-        ))
-        .into());
+    let mut now = now.clone();
+    now.budget = then.budget.clone();
+    now.learner = then.learner.clone();
+    now.actor = then.actor.clone();
+    let changed = |Difference { field, ours, theirs }| format!("{field} was {ours} and is {theirs}");
+    let mut changes: Vec<String> = then.differences(&now)?.into_iter().map(changed).collect();
+    let task: TaskSpec = serde_json::from_slice(snapshot.part("task.json")?)?;
+    if changes.is_empty() && task != *spec {
+        changes.push("the clips, or what the task observes and pays, are others".into());
     }
-    let clips: TaskSpec = serde_json::from_slice(snapshot.part("task.json")?)?;
-    if clips != *spec {
-        return Err(Misuse("it was made when the same sources held other clips: give another --run".into()).into());
+    if changes.is_empty() {
+        return Ok(());
     }
-    Ok(())
+    let changes = changes.join("; ");
+    if allowed {
+        tracing::warn!("the run goes on as another experiment: {changes}");
+        return Ok(());
+    }
+    Err(Misuse::new(format!(
+        "it was made by another experiment ({changes}): give another --run, the old values, or --allow-changed"
+    ))
+    .into())
 }
 
-/// A configuration that is wrong and stays wrong, however often it is tried.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct Misuse(pub(crate) String);
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn resumed(change: impl FnOnce(&mut Experiment), allowed: bool) -> Result<()> {
+        let then = Experiment::default();
+        let spec = TaskSpec::new(&then, vec!["walk".into()]).unwrap();
+        let mut snapshot = Snapshot::default();
+        snapshot.parts.insert("experiment.toml".into(), then.to_toml()?.into_bytes());
+        snapshot.parts.insert("task.json".into(), serde_json::to_vec(&spec)?);
+        let mut now = then;
+        change(&mut now);
+        check_same_experiment(&now, &spec, &snapshot, allowed)
+    }
+
+    #[test]
+    fn another_experiment_is_refused_with_every_field_that_differs() {
+        let change = |experiment: &mut Experiment| {
+            experiment.vmpo.lambda = 0.5;
+            experiment.network.latent.beta = 0.25;
+        };
+        let refused = resumed(change, false).unwrap_err();
+        assert!(refused.is::<Misuse>());
+        let said = refused.to_string();
+        for part in ["vmpo.lambda was", "is 0.5", "network.latent.beta was", "is 0.25", "--allow-changed"] {
+            assert!(said.contains(part), "no `{part}` in {said}");
+        }
+        assert!(resumed(change, true).is_ok());
+    }
+
+    #[test]
+    fn how_long_and_how_often_may_always_change() {
+        let change = |experiment: &mut Experiment| {
+            experiment.budget.minutes = 7.0;
+            experiment.learner.checkpoint_seconds = 8.0;
+            experiment.actor.threads = 9;
+        };
+        assert!(resumed(change, false).is_ok());
+    }
+}

@@ -3,37 +3,50 @@
 //! # Layout
 //! - [`Shared`] is what all calls have in common: the experiment, the batcher, the publisher.
 //! - [`serve`] is the server, up to its graceful end.
+//! - `incoming` lets connections in, `admission` calls: TLS, tokens and limits are theirs, and nobody else's.
 //! - `calls` answers each call; `unrolls` and `assets` are the two streams with a life of their own, and
-//!   [`publish`](crate::publish) the third. `complaints` keeps the log readable when an actor sends rubbish.
+//!   [`publish`](crate::publish) the third. `status` tells how things are, `roster` how the actors are.
+//!   `complaints` keeps the log readable when a peer misbehaves.
 //!
 //! Streams are pulled: nothing is read from an actor until the unroll before it has a slot in a batch, so HTTP/2 flow
 //! control carries the batcher's back-pressure to the actor, and no queue lies in between.
 
+mod admission;
 mod assets;
 mod calls;
 mod complaints;
+mod incoming;
+mod roster;
+mod status;
 mod unrolls;
 
 use std::collections::VecDeque;
 use std::future::Future;
+use std::path::PathBuf;
 use std::pin::pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use comic_clips::Asset;
 use comic_experiment::{Experiment, TaskSpec};
-use comic_proto::UnrollShape;
 use comic_proto::v1::learner_server::LearnerServer;
+use comic_proto::{FILE_DESCRIPTOR_SET, UnrollShape};
 use comic_replay::Batcher;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tonic::transport::Server;
-use tonic::transport::server::TcpIncoming;
+use tonic_health::ServingStatus;
 
+use crate::options::Misuse;
 use crate::publish::Publisher;
+use crate::security::{Limits, Security, Tls, Tokens};
+use crate::telemetry::Telemetry;
+use admission::Admission;
 use calls::Calls;
 use complaints::Complaints;
+use incoming::Door;
+use roster::Roster;
 
 /// A peer that answers no ping for [`KEEPALIVE_TIMEOUT`] is gone; without pings a half-open one is never noticed.
 const KEEPALIVE: Duration = Duration::from_secs(15);
@@ -60,6 +73,12 @@ const EVALUATIONS: usize = 16;
 /// What the service is made of.
 #[derive(Debug)]
 pub struct Setup {
+    /// The run's directory, for those who ask.
+    pub run: PathBuf,
+    /// Who gets in.
+    pub security: Security,
+    /// How many get in.
+    pub limits: Limits,
     /// The resolved experiment, handed to every actor.
     pub experiment: Experiment,
     /// The task's sizes and names, handed to every actor.
@@ -96,7 +115,19 @@ pub struct Shared {
     publisher: Publisher,
     metrics: Mutex<String>,
     evaluations: Mutex<VecDeque<Evaluation>>,
-    complaints: Complaints,
+    complaints: Complaints<u64>,
+    /// The experiment's name.
+    name: String,
+    run: PathBuf,
+    since: Instant,
+    /// Unrolls that the batches have room for: open, full, ahead, and at the trainer.
+    capacity: u64,
+    tls: Option<Arc<Tls>>,
+    tokens: Option<Arc<Tokens>>,
+    limits: Limits,
+    message_limit: usize,
+    roster: Arc<Roster>,
+    pub(crate) telemetry: Arc<Telemetry>,
     closing: watch::Sender<bool>,
 }
 
@@ -104,15 +135,33 @@ impl Shared {
     /// Everything ready to serve.
     ///
     /// # Errors
-    /// When the batcher's layout or epoch are not those of the rest, or experiment or spec cannot be written as TOML.
+    /// [`Misuse`] when no unroll fits the limit of a message; otherwise when the batcher's layout or epoch are not those
+    /// of the rest, or experiment or spec cannot be written as TOML.
     pub fn new(setup: Setup) -> Result<Arc<Self>> {
-        let Setup { experiment, spec, assets, batcher, publisher } = setup;
+        let Setup { run, security, limits, experiment, spec, assets, batcher, publisher } = setup;
         let shape = UnrollShape::new(&spec, &experiment);
         let found = *batcher.layout().shape();
         ensure!(shape == found, "the batcher takes unrolls of {found:?}, the experiment makes {shape:?}");
         let (epoch, found) = (publisher.epoch(), batcher.phase().epoch);
         ensure!(epoch == found, "the batcher is in learner epoch {found}, the publisher in {epoch}");
+        let needed = batcher.layout().message_limit();
+        let message_limit = limits.max_message_bytes.unwrap_or(needed.max(MIN_MESSAGE_LIMIT));
+        if message_limit < needed {
+            let remedy = format!("--max-message-bytes {message_limit} lets no unroll through: it takes {needed}");
+            return Err(Misuse::new(remedy).into());
+        }
+        let buffers = experiment.unroll.ahead as u64 + 1;
         Ok(Arc::new(Self {
+            name: experiment.name.clone(),
+            run,
+            since: Instant::now(),
+            capacity: buffers * experiment.unroll.batch as u64,
+            tls: security.tls.map(Arc::new),
+            tokens: security.tokens.map(Arc::new),
+            message_limit,
+            roster: Arc::new(Roster::new(limits.max_actors)),
+            limits,
+            telemetry: Arc::default(),
             task_spec: toml::to_string(&spec).context("the task's spec cannot be written as TOML")?,
             seed: experiment.seed,
             experiment: experiment.to_toml()?,
@@ -135,6 +184,11 @@ impl Shared {
     /// Takes the evaluations reported since the last time, oldest first.
     pub fn take_evaluations(&self) -> Vec<Evaluation> {
         lock(&self.evaluations).drain(..).collect()
+    }
+
+    /// Whether the server goes down.
+    pub(crate) fn is_closing(&self) -> bool {
+        *self.closing.borrow()
     }
 
     /// False when too many wait already.
@@ -180,8 +234,17 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 /// # Errors
 /// When the server cannot go on accepting connections.
 pub async fn serve(listener: TcpListener, shared: Arc<Shared>, shutdown: impl Future<Output = ()>) -> Result<()> {
-    let message_limit = shared.batcher.layout().message_limit().max(MIN_MESSAGE_LIMIT);
-    let calls = LearnerServer::new(Calls::new(shared.clone())).max_decoding_message_size(message_limit);
+    let calls = LearnerServer::new(Calls::new(shared.clone())).max_decoding_message_size(shared.message_limit);
+    let (reporter, health) = tonic_health::server::health_reporter();
+    reporter.set_serving::<LearnerServer<Calls>>().await;
+    let reflection = tonic_reflection::server::Builder::configure()
+        .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
+        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+        .build_v1()
+        .context("the protocol's descriptors are damaged")?;
+    let telemetry = &shared.telemetry;
+    let admission = Admission::new(shared.tokens.clone(), shared.limits.max_requests, telemetry.clone());
+    let door = Door::new(shared.tls.clone(), &shared.limits, telemetry.clone());
     let mut closing = shared.closing();
     let server = Server::builder()
         .http2_keepalive_interval(Some(KEEPALIVE))
@@ -191,15 +254,20 @@ pub async fn serve(listener: TcpListener, shared: Arc<Shared>, shutdown: impl Fu
         .max_frame_size(FRAME_SIZE)
         .max_concurrent_streams(MAX_STREAMS)
         .timeout(ANSWER_TIMEOUT)
+        .layer(admission)
         .add_service(calls)
-        // The builder's own TCP settings do not reach a listener that is handed in.
-        .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), async move {
+        .add_service(health)
+        .add_service(reflection)
+        .serve_with_incoming_shutdown(door.open(listener), async move {
             closing.begun().await;
         });
     let mut server = pin!(server);
     tokio::select! {
         served = &mut server => return served.context("the server stopped accepting connections"),
         () = shutdown => {}
+    }
+    for service in ["", "comic.v1.Learner"] {
+        reporter.set_service_status(service, ServingStatus::NotServing).await;
     }
     shared.closing.send_replace(true);
     match tokio::time::timeout(GRACE, server).await {

@@ -271,7 +271,7 @@ mod tests {
         assert_eq!(metrics.count_steps(&batch(&spec), &[0, 1]), 4);
         let position =
             crate::metrics::Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
-        let line = metrics.write(position, serde_json::Value::Null, serde_json::Map::new()).unwrap();
+        let line = metrics.write(position, serde_json::Value::Null, serde_json::Map::new());
         let line: serde_json::Value = serde_json::from_str(&line).unwrap();
         assert_eq!(line["tasks"]["tracking"]["environment_steps"], 3);
         assert_eq!(line["tasks"]["get-up"]["environment_steps"], 1);

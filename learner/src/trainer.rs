@@ -127,7 +127,7 @@ impl Trainer {
             losses: Map::new(),
             oldest: 0,
             metrics: Metrics::open(&run, &spec)?,
-            writer: Writer::start(store)?,
+            writer: Writer::start(store, shared.telemetry.clone())?,
             checkpointed: Instant::now(),
             experiment,
             spec,
@@ -183,6 +183,7 @@ impl Trainer {
 
     /// One batch: gradient steps on it, its books, and new parameters when they are due.
     fn learn(&mut self, batch: Batch) -> Result<()> {
+        let began = Instant::now();
         let tensors = self.tensors(&batch)?;
         let unseen = self.normalises() && self.statistics.lacks(&tasks_of_unrolls(&batch, &self.spec));
         if unseen || self.normalises_still() {
@@ -208,11 +209,13 @@ impl Trainer {
         self.progress.updates += 1;
         self.metrics.count_update();
         self.metrics.absorb(batch.headers(), self.progress.version);
+        let ages = batch.headers().iter().map(|header| self.progress.version.saturating_sub(header.version)).collect();
         // Published before the batch goes back: whoever waits for its room goes on with these parameters.
         if self.progress.updates.is_multiple_of(self.experiment.vmpo.target_period) {
             self.publish(Behaviour::Policy)?;
         }
         self.book(batch);
+        self.shared.telemetry.count_update(began.elapsed(), ages);
         self.after_update()
     }
 }
@@ -291,7 +294,9 @@ impl Trainer {
     /// Counts a batch's steps, and gives its memory back.
     pub(crate) fn book(&mut self, batch: Batch) {
         let tasks = tasks_of_unrolls(&batch, &self.spec);
-        self.progress.environment_steps += self.metrics.count_steps(&batch, &tasks);
+        let steps = self.metrics.count_steps(&batch, &tasks);
+        self.progress.environment_steps += steps;
+        self.shared.telemetry.environment_steps.inc_by(steps);
         self.batcher.trained(batch);
     }
 
@@ -386,7 +391,7 @@ impl Trainer {
             return Ok(());
         }
         for evaluation in self.shared.take_evaluations() {
-            self.metrics.keep_evaluation(&evaluation)?;
+            self.metrics.keep_evaluation(&evaluation);
         }
         if self.metrics.has_news(&self.books()?) { self.write_metrics() } else { Ok(()) }
     }
@@ -405,9 +410,9 @@ impl Trainer {
         };
         let books = self.books()?;
         for evaluation in self.shared.take_evaluations() {
-            self.metrics.keep_evaluation(&evaluation)?;
+            self.metrics.keep_evaluation(&evaluation);
         }
-        let line = self.metrics.write(position, books, self.losses.clone())?;
+        let line = self.metrics.write(position, books, self.losses.clone());
         tracing::info!(target: "metrics", "{line}");
         self.shared.set_metrics(line);
         Ok(())

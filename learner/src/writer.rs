@@ -8,6 +8,7 @@ use std::thread::JoinHandle;
 use anyhow::{Context as _, Result, anyhow};
 
 use crate::checkpoint::{Name, Snapshot, Store};
+use crate::telemetry::Telemetry;
 
 /// The writing thread. At most one snapshot waits behind the one being written.
 #[derive(Debug)]
@@ -23,13 +24,13 @@ impl Writer {
     ///
     /// # Errors
     /// When the system gives no thread.
-    pub fn start(store: Store) -> Result<Self> {
+    pub fn start(store: Store, telemetry: Arc<Telemetry>) -> Result<Self> {
         let (queue, received) = sync_channel(1);
         let pending = Arc::<AtomicUsize>::default();
         let shared = Arc::clone(&pending);
         let thread = std::thread::Builder::new()
             .name("checkpoints".into())
-            .spawn(move || write_all(&store, &received, &shared))
+            .spawn(move || write_all(&store, &received, &shared, &telemetry))
             .context("cannot start the checkpoint thread")?;
         Ok(Self { queue, pending, thread })
     }
@@ -59,10 +60,16 @@ impl Writer {
 }
 
 /// A disk that refuses once may take the next one: training goes on, and the log says so. The last one counts.
-fn write_all(store: &Store, queue: &Receiver<(Name, Snapshot)>, pending: &AtomicUsize) -> Result<()> {
+fn write_all(
+    store: &Store,
+    queue: &Receiver<(Name, Snapshot)>,
+    pending: &AtomicUsize,
+    telemetry: &Telemetry,
+) -> Result<()> {
     let mut last = Ok(());
     while let Ok((name, snapshot)) = queue.recv() {
         last = store.write(name, &snapshot).map(|path| tracing::info!(checkpoint = %path.display(), "written"));
+        telemetry.checkpoints.of(if last.is_ok() { "written" } else { "failed" }).inc();
         if let Err(error) = &last {
             tracing::error!(checkpoint = %name, "checkpoint not written: {error:#}");
         }

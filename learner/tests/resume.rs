@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex};
 use comic_experiment::{Experiment, TaskSpec, resolve};
 use comic_learner::checkpoint::{Snapshot, Store};
 use comic_learner::publish::Publisher;
+use comic_learner::security::{Limits, Security};
 use comic_learner::service::{self, Shared};
 use comic_learner::trainer::{Ending, Setup, Trainer};
 use comic_proto::v1::UnrollHeader;
@@ -99,6 +100,9 @@ fn live(preset: &str, run: &Path, updates: u64) -> Snapshot {
     let batcher = Batcher::new(layout.clone(), config, Phase { epoch, ..Phase::default() }, ledger);
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {
+        run: run.to_path_buf(),
+        security: Security::default(),
+        limits: Limits::default(),
         experiment: experiment.clone(),
         spec: spec.clone(),
         assets: Vec::new(),

@@ -6,6 +6,7 @@ mod service_support;
 
 use comic_experiment::{Experiment, TaskSpec};
 use comic_learner::publish::Publisher;
+use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
 use comic_proto::v1::JoinRequest;
 use comic_proto::{PROTOCOL_VERSION, UnrollLayout, UnrollShape};
@@ -54,6 +55,9 @@ async fn another_protocol_is_refused_with_the_remedy() {
 async fn a_service_whose_parts_disagree_does_not_start() {
     let world = World::start().await;
     let setup = || Setup {
+        run: "runs/test".into(),
+        security: Security::default(),
+        limits: Limits::default(),
         experiment: world.experiment.clone(),
         spec: world.spec.clone(),
         assets: Vec::new(),

@@ -114,6 +114,7 @@ fn an_unroll_of_nothing_but_masked_rows_changes_nothing() {
     padded.valid.extend([0.0; LENGTH]);
     padded.first.extend(padding.first);
     padded.clip.extend(padding.clip);
+    padded.tasks.extend(padding.tasks);
     assert!(compare(&base.minibatch(), &padded.minibatch()) < 1e-6);
 }
 

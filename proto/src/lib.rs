@@ -5,6 +5,7 @@
 //! - [`UnrollLayout`] says where each [`Field`] of an unroll lies in the payload, and hashes that into what both sides
 //!   compare. It follows from an [`UnrollShape`], and that from the experiment and the task's spec alone.
 //! - [`UnrollBuffer`] is an unroll that an actor writes.
+//! - [`Access`] is a client's way to a learner: URL, TLS, and the [`Token`] it shows.
 //! - [`validate`] is what a payload has to pass before it touches a batch.
 //!
 //! # An unroll
@@ -16,8 +17,10 @@
 #[cfg(target_endian = "big")]
 compile_error!("the payload of an unroll is little-endian and is copied, not converted");
 
+mod access;
 mod buffer;
 mod layout;
+mod token;
 mod validate;
 
 /// Messages, client and server generated from `comic/v1/learner.proto`.
@@ -26,9 +29,14 @@ pub mod v1 {
     tonic::include_proto!("comic.v1");
 }
 
+pub use access::{Access, AccessError, Authorised, Bearer, Client, chain, distrusted};
 pub use buffer::UnrollBuffer;
 pub use layout::{Field, UnrollLayout, UnrollShape};
+pub use token::{TOKEN_VARIABLE, Token};
 pub use validate::{Expected, Invalid, MAX_SEQUENCE, validate};
+
+/// The protocol's descriptors, as gRPC reflection hands them out.
+pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
 /// Version of the protocol, which `Join` compares; it changes whenever an old peer would misunderstand a new one.
 pub const PROTOCOL_VERSION: u32 = 1;

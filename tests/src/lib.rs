@@ -1,10 +1,12 @@
 //! What the whole-system tests share.
 //!
 //! # Layout
+//! - [`certificates`] makes certificates, expired ones too.
 //! - [`repository`] looks at the workspace's own files and dependencies.
 //! - [`steps`] is what they make a learner and its actors go through.
 //! - [`system`] runs a learner and actors as a user would: real programs, real sockets, one directory for the run.
 
+pub mod certificates;
 pub mod repository;
 pub mod steps;
 pub mod system;

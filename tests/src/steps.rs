@@ -17,42 +17,6 @@ const BEYOND_WHAT_IS_LEFT: u64 = 200;
 /// More versions than actors may lag behind.
 const VERSIONS: f64 = 30.0;
 
-/// Small enough that an update takes milliseconds.
-pub const SMALL: [&str; 32] = [
-    "--preset",
-    "quickstart",
-    "--clips",
-    "builtin:CMU_007_01",
-    "--set",
-    "network.encoder=[32]",
-    "--set",
-    "network.mlp.hidden=[32]",
-    "--set",
-    "network.value=[32]",
-    "--set",
-    "network.normaliser_steps=256",
-    "--set",
-    "vmpo.target_period=1",
-    "--set",
-    "vmpo.gradient_steps=1",
-    "--set",
-    "vmpo.minibatch_unrolls=8",
-    "--set",
-    "unroll.length=8",
-    "--set",
-    "unroll.batch=8",
-    "--set",
-    "actor.environments=2",
-    "--set",
-    "warm_start.steps=0",
-    "--set",
-    "learner.checkpoint_seconds=0.5",
-    "--set",
-    "learner.metrics_seconds=0.2",
-    "--set",
-    "budget.minutes=0",
-];
-
 /// The books of a status.
 pub fn books(status: &Status) -> Books {
     status.books.unwrap_or_default()
@@ -109,13 +73,14 @@ async fn newest_checkpoint(system: &mut System) -> Result<u64> {
         .await
 }
 
-/// An actor leaves when it is asked to.
+/// An actor leaves when it is asked to, with 1: it was told to stop before the run was over, and whoever counts what ends
+/// with 0 as done must not count it.
 ///
 /// # Errors
 /// When it does not, or in another way.
 pub async fn leaves(actor: Process) -> Result<()> {
     let status = actor.terminate(ACTOR_LEAVES).await?;
-    ensure!(status.success(), "an actor that is asked to leave leaves with {status}");
+    ensure!(status.code() == Some(1), "an actor that is asked to leave leaves with {status}");
     Ok(())
 }
 
@@ -126,7 +91,6 @@ pub async fn leaves(actor: Process) -> Result<()> {
 pub async fn the_books_balance_at_the_end(mut system: System) -> Result<()> {
     let books = books(&system.status().await?);
     ensure!(balance(&books), "{books:?}");
-    ensure!(books.trained > 4 * BEYOND_WHAT_IS_LEFT, "{books:?}");
     ensure!(books.dropped_invalid == 0, "no actor sends what is invalid: {books:?}");
     let learner = system.learner.take().context("no learner")?;
     let status = learner.terminate(LIMIT).await?;

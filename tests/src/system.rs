@@ -1,12 +1,14 @@
 //! A learner and actors as real processes on this machine.
 
+use std::ffi::OsString;
 use std::fs::{self, File, OpenOptions};
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
+use comic_proto::Access;
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{Books, Status, StatusRequest};
 use rustix::process::{Pid, Signal, kill_process};
@@ -17,8 +19,46 @@ use crate::repository::root;
 
 /// How often a condition is looked at again.
 const POLL: Duration = Duration::from_millis(50);
+/// Variables that would say where the learner is and what to show it.
+const SETTINGS: [&str; 6] = ["COMIC_LEARNER", "COMIC_CA", "COMIC_CERT", "COMIC_KEY", "COMIC_TOKEN_FILE", "COMIC_TOKEN"];
 /// How long a status call may take.
 const CALL_LIMIT: Duration = Duration::from_secs(5);
+
+/// Options of a learner whose experiment is so small that an update takes milliseconds.
+pub const SMALL: [&str; 32] = [
+    "--preset",
+    "quickstart",
+    "--clips",
+    "builtin:CMU_007_01",
+    "--set",
+    "network.encoder=[32]",
+    "--set",
+    "network.mlp.hidden=[32]",
+    "--set",
+    "network.value=[32]",
+    "--set",
+    "network.normaliser_steps=256",
+    "--set",
+    "vmpo.target_period=1",
+    "--set",
+    "vmpo.gradient_steps=1",
+    "--set",
+    "vmpo.minibatch_unrolls=8",
+    "--set",
+    "unroll.length=8",
+    "--set",
+    "unroll.batch=8",
+    "--set",
+    "actor.environments=2",
+    "--set",
+    "warm_start.steps=0",
+    "--set",
+    "learner.checkpoint_seconds=0.5",
+    "--set",
+    "learner.metrics_seconds=0.2",
+    "--set",
+    "budget.minutes=0",
+];
 
 /// A program of this workspace, built beside the running test.
 ///
@@ -53,6 +93,10 @@ pub struct System {
     directory: TempDir,
     port: u16,
     arguments: Vec<String>,
+    /// How actors and the tests themselves reach the learner; with an authority, by https.
+    pub access: Access,
+    /// What the learner logs, as RUST_LOG has it; the usual unless given.
+    pub log_level: Option<String>,
     /// The learner's process, while there is one.
     pub learner: Option<Process>,
     started: usize,
@@ -68,9 +112,17 @@ impl System {
             directory: tempfile::tempdir().context("cannot make a directory")?,
             port: free_port()?,
             arguments: arguments.iter().map(|argument| (*argument).to_owned()).collect(),
+            access: Access::default(),
+            log_level: None,
             learner: None,
             started: 0,
         })
+    }
+
+    /// The learner's address.
+    pub fn url(&self) -> String {
+        let scheme = if self.access.ca.is_some() { "https" } else { "http" };
+        format!("{scheme}://127.0.0.1:{}", self.port)
     }
 
     /// The run's directory.
@@ -84,8 +136,11 @@ impl System {
     /// When it does not serve within `limit`, with the end of its log.
     pub async fn start_learner(&mut self, limit: Duration) -> Result<Status> {
         let mut command = Command::new(program("comic-learner")?);
-        command.args(&self.arguments).args(["--address", "127.0.0.1", "--port", &self.port.to_string()]);
+        command.args(&self.arguments).args(["--port", &self.port.to_string()]);
         command.arg("--run").arg(self.run());
+        if let Some(level) = &self.log_level {
+            command.env("RUST_LOG", level);
+        }
         self.learner = Some(self.spawn("learner", command)?);
         self.until("the learner serves", limit, |status| Some(status.clone())).await
     }
@@ -95,9 +150,32 @@ impl System {
     /// # Errors
     /// When it cannot be started.
     pub fn start_actor(&mut self) -> Result<Process> {
+        let access = self.access.clone();
+        self.start_actor_with(&access, |_| {})
+    }
+
+    /// Starts an actor that shows and trusts what `access` says; `change` has the last word.
+    ///
+    /// # Errors
+    /// When it cannot be started.
+    pub fn start_actor_with(&mut self, access: &Access, change: impl FnOnce(&mut Command)) -> Result<Process> {
         let mut command = Command::new(program("comic-actor")?);
-        command.args(["--learner", &format!("http://127.0.0.1:{}", self.port)]);
+        command.args(["--learner", &self.url()]).args(flags(access));
+        change(&mut command);
         self.spawn("actor", command)
+    }
+
+    /// Runs `comic-learner COMMAND` against the learner and waits for its end.
+    ///
+    /// # Errors
+    /// When it cannot be started.
+    pub fn ask(&self, command: &[&str]) -> Result<Output> {
+        let mut asking = Command::new(program("comic-learner")?);
+        asking.args(command).args(["--learner", &self.url()]).args(flags(&self.access));
+        for name in SETTINGS {
+            asking.env_remove(name);
+        }
+        asking.output().context("cannot start comic-learner")
     }
 
     fn spawn(&mut self, kind: &str, mut command: Command) -> Result<Process> {
@@ -107,11 +185,13 @@ impl System {
         // Nobody's own directories and settings decide what a test sees.
         let home = self.directory.path().join("home");
         fs::create_dir_all(&home).context("cannot make a home directory")?;
-        command
-            .env("HOME", &home)
-            .env("XDG_CACHE_HOME", home.join("cache"))
-            .env_remove("RUST_LOG")
-            .env("NO_COLOR", "1");
+        command.env("HOME", &home).env("XDG_CACHE_HOME", home.join("cache")).env("NO_COLOR", "1");
+        for name in SETTINGS {
+            command.env_remove(name);
+        }
+        if !command.get_envs().any(|(name, _)| name == "RUST_LOG") {
+            command.env_remove("RUST_LOG");
+        }
         let child = command.stdin(Stdio::null()).stdout(output.try_clone()?).stderr(output).spawn();
         let child = child.with_context(|| format!("cannot start the {kind}"))?;
         Ok(Process { child, log })
@@ -122,9 +202,9 @@ impl System {
     /// # Errors
     /// When it does not answer.
     pub async fn status(&self) -> Result<Status> {
-        let address = format!("http://127.0.0.1:{}", self.port);
+        let (endpoint, bearer) = (self.access.endpoint(&self.url())?, self.access.bearer()?);
         let call = async {
-            let mut client = LearnerClient::connect(address).await?;
+            let mut client = LearnerClient::with_interceptor(endpoint.connect().await?, bearer);
             anyhow::Ok(client.get_status(StatusRequest {}).await?.into_inner())
         };
         tokio::time::timeout(CALL_LIMIT, call).await.context("the learner does not answer")?
@@ -165,6 +245,14 @@ impl System {
         let log = self.learner.as_ref().map(Process::log).unwrap_or_default();
         bail!("{what}: not within {limit:?}; last status: {last}; learner's log: {log}")
     }
+}
+
+/// The options that say the same.
+fn flags(access: &Access) -> Vec<OsString> {
+    let Access { ca, cert, key, token_file } = access;
+    let flags = [("--ca", ca), ("--cert", cert), ("--key", key), ("--token-file", token_file)];
+    let given = flags.into_iter().filter_map(|(flag, path)| Some((flag, path.as_ref()?)));
+    given.flat_map(|(flag, path)| [flag.into(), path.into()]).collect()
 }
 
 /// produced = trained + dropped by reason + in flight.
@@ -229,6 +317,21 @@ impl Process {
     /// When the system refuses.
     pub fn ended(&mut self) -> Result<Option<ExitStatus>> {
         self.child.try_wait().context("cannot wait")
+    }
+
+    /// Waits until it ends by itself.
+    ///
+    /// # Errors
+    /// When it is still there after `limit`, with its log.
+    pub async fn until_it_ends(&mut self, limit: Duration) -> Result<ExitStatus> {
+        let deadline = Instant::now() + limit;
+        loop {
+            match self.ended()? {
+                Some(status) => return Ok(status),
+                None if Instant::now() > deadline => bail!("still there after {limit:?}: {}", self.log()),
+                None => tokio::time::sleep(POLL).await,
+            }
+        }
     }
 
     /// Everything it has written.

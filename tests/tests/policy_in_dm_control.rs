@@ -6,8 +6,8 @@ use std::process::{Command, Output};
 
 use anyhow::{Context, Result, ensure};
 use comic_tests::repository::root;
-use comic_tests::steps::{LIMIT, SMALL};
-use comic_tests::system::{System, metric, program, python};
+use comic_tests::steps::LIMIT;
+use comic_tests::system::{SMALL, System, metric, program, python};
 use serde_json::Value;
 
 /// Steps of each episode that are compared.

@@ -2,9 +2,9 @@
 
 use anyhow::{Result, ensure};
 use comic_tests::steps::{
-    LIMIT, SMALL, kill_and_restart_the_learner, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on,
+    LIMIT, kill_and_restart_the_learner, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on,
 };
-use comic_tests::system::System;
+use comic_tests::system::{SMALL, System};
 
 #[tokio::test]
 async fn two_actors_and_a_learner_survive_every_death_and_their_books_balance() -> Result<()> {

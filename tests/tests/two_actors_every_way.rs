@@ -5,9 +5,9 @@
 use anyhow::{Result, ensure};
 use comic_proto::v1::Status;
 use comic_tests::steps::{
-    LIMIT, SMALL, kill_and_restart_the_learner, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on,
+    LIMIT, kill_and_restart_the_learner, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on,
 };
-use comic_tests::system::System;
+use comic_tests::system::{SMALL, System};
 
 async fn two_actors_learn(overrides: &[&str], check: fn(&Status) -> Option<()>) -> Result<()> {
     let arguments = overrides.iter().flat_map(|field| ["--set", *field]);

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
 use comic_proto::v1::*;
-use comic_proto::{Expected, Field, UnrollBuffer, UnrollLayout, UnrollShape, validate};
+use comic_proto::{Access, Expected, Field, UnrollBuffer, UnrollLayout, UnrollShape, validate};
 use comic_replay::{Batcher, Config, Ledger, Outcome, Phase};
 use futures::{Stream, StreamExt as _};
 use tokio::net::TcpListener;
@@ -107,7 +107,7 @@ fn still_unroll(layout: &UnrollLayout) -> FinishedUnroll {
 /// Processor time of this thread from the first unroll handed over to the last acknowledgement.
 async fn send(address: &str, unroll: &FinishedUnroll, unrolls: usize) -> Result<Duration, Error> {
     let (_stop, stopped) = watch::channel(false);
-    let options = session::Options { learner: address.to_string(), cache: None };
+    let options = session::Options { learner: address.to_string(), access: Access::default(), cache: None };
     let joined = session::join(&options, stopped.clone()).await?;
     let (sender, receiver) = mpsc::channel(super::ENVIRONMENTS);
     let limits = Limits { window: 2 * super::ENVIRONMENTS, parameters: 0, flush: Duration::ZERO };

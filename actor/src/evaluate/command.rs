@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use clap::Args;
 use comic_clips::Catalogue;
 use comic_experiment::Experiment;
+use comic_proto::Access;
 use comic_proto::v1::EvaluationReport;
 use comic_tasks::{Simulated, Task};
 
@@ -77,6 +78,8 @@ pub struct Evaluate {
     /// Report the evaluation of a checkpoint to this learner too, which keeps it in `evaluations.jsonl`.
     #[arg(long, value_name = "URL", requires = "checkpoint")]
     learner: Option<String>,
+    #[command(flatten)]
+    access: Access,
     /// Films the first episode: .gif, .webp, .mp4 (through ffmpeg) or .png (a contact sheet).
     #[arg(long, value_name = "FILE", help_heading = "Film")]
     video: Option<PathBuf>,
@@ -107,7 +110,7 @@ impl Evaluate {
         std::io::stdout().write_all(text.as_bytes()).map_err(Error::file("standard output"))?;
         if let Some(learner) = &self.learner {
             let Position { epoch: learner_epoch, version } = position;
-            deliver(learner, EvaluationReport { learner_epoch, version, json })?;
+            deliver(learner, &self.access, EvaluationReport { learner_epoch, version, json })?;
         }
         film
     }

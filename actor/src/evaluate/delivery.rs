@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use comic_proto::v1::EvaluationReport;
 use comic_proto::v1::learner_client::LearnerClient;
-use tonic::transport::Endpoint;
+use comic_proto::{Access, chain, distrusted};
+use tonic::Code;
 
 use crate::Error;
 
@@ -14,18 +15,24 @@ const PATIENCE: Duration = Duration::from_secs(10);
 /// Reports an evaluation to the learner at `url`, which keeps it with the run.
 ///
 /// # Errors
-/// [`Error::Url`], or [`Error::Refused`] with the learner's or the network's reason.
-pub(super) fn deliver(url: &str, report: EvaluationReport) -> Result<(), Error> {
-    let endpoint = Endpoint::from_shared(url.to_string()).map_err(|_| Error::Url { url: url.to_string() })?;
-    let endpoint = endpoint.connect_timeout(PATIENCE).timeout(PATIENCE);
-    let refused = |message: String| Error::Refused { url: url.to_string(), message };
+/// [`Error::Access`], [`Error::Unwelcome`], [`Error::Refused`] with the learner's reason, or [`Error::Unreachable`].
+pub(super) fn deliver(url: &str, access: &Access, report: EvaluationReport) -> Result<(), Error> {
+    let (endpoint, bearer) = (access.endpoint(url)?.timeout(PATIENCE), access.bearer()?);
+    let failed = |error: &(dyn std::error::Error + 'static)| {
+        let (url, message) = (url.to_string(), chain(error));
+        if distrusted(error) { Error::Unwelcome { url, message } } else { Error::Unreachable { url, message } }
+    };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(Error::Thread)?;
     runtime.block_on(async {
-        let channel = endpoint.connect().await.map_err(|error| refused(error.to_string()))?;
-        LearnerClient::new(channel)
-            .report_evaluation(report)
-            .await
-            .map(drop)
-            .map_err(|status| refused(status.message().to_string()))
+        let channel = endpoint.connect().await.map_err(|error| failed(&error))?;
+        let answer = LearnerClient::with_interceptor(channel, bearer).report_evaluation(report).await;
+        answer.map(drop).map_err(|status| {
+            let (url, message) = (url.to_string(), status.message().to_string());
+            match status.code() {
+                Code::Unauthenticated => Error::Unwelcome { url, message },
+                Code::InvalidArgument | Code::Unimplemented => Error::Refused { url, message },
+                _ => failed(&status),
+            }
+        })
     })
 }

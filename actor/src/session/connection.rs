@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use comic_proto::PROTOCOL_VERSION;
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{JoinReply, JoinRequest};
-use tonic::transport::{Channel, Endpoint};
+use comic_proto::{Access, AccessError, Client, PROTOCOL_VERSION, chain, distrusted};
+use tonic::transport::Endpoint;
 use tonic::{Code, Request, Status};
 
 use super::Terms;
@@ -31,15 +31,15 @@ impl From<Status> for Failure {
     }
 }
 
-/// A status without its metadata.
+/// A status without its metadata, and what led to it.
 pub(super) fn describe(status: &Status) -> String {
-    format!("{}: {}", status.code(), status.message())
+    format!("{}: {}", status.code(), chain(status))
 }
 
 /// A connection that has joined.
 #[derive(Debug)]
 pub(super) struct Link {
-    pub(super) client: LearnerClient<Channel>,
+    pub(super) client: Client,
     pub(super) reply: JoinReply,
 }
 
@@ -47,36 +47,39 @@ pub(super) struct Link {
 #[derive(Debug)]
 pub(super) struct Connector {
     address: String,
-    endpoint: Endpoint,
+    access: Access,
     incarnation: u64,
     actor: Option<u64>,
     learner_epoch: Option<u64>,
 }
 
 impl Connector {
-    pub(super) fn new(address: &str) -> Result<Self, Error> {
-        let url = || Error::Url { url: address.to_string() };
-        let endpoint = Endpoint::from_shared(address.to_string()).map_err(|_| url())?;
-        if endpoint.uri().scheme_str() != Some("http") || endpoint.uri().host().is_none() {
-            return Err(url());
-        }
-        // Keep-alive while idle: a peer that vanished without a word is otherwise never noticed. The connection's
-        // window exceeds the parameter stream's, so an unread version cannot stall the acknowledgements.
-        let endpoint = endpoint
-            .connect_timeout(Duration::from_secs(5))
+    /// Looks at address, certificates and token, so that what is wrong with them is said at once.
+    pub(super) fn new(address: &str, access: &Access) -> Result<Self, Error> {
+        let connector = Self {
+            address: address.to_string(),
+            access: access.clone(),
+            incarnation: rand::random(),
+            actor: None,
+            learner_epoch: None,
+        };
+        connector.endpoint()?;
+        connector.access.bearer()?;
+        Ok(connector)
+    }
+
+    /// Keep-alive while idle: a peer that vanished without a word is otherwise never noticed. The connection's window
+    /// exceeds the parameter stream's, so an unread version cannot stall the acknowledgements.
+    fn endpoint(&self) -> Result<Endpoint, AccessError> {
+        Ok(self
+            .access
+            .endpoint(&self.address)?
             .tcp_nodelay(true)
             .http2_keep_alive_interval(Duration::from_secs(15))
             .keep_alive_timeout(Duration::from_secs(10))
             .keep_alive_while_idle(true)
             .initial_stream_window_size(1 << 20)
-            .initial_connection_window_size(4 << 20);
-        Ok(Self {
-            address: address.to_string(),
-            endpoint,
-            incarnation: rand::random(),
-            actor: None,
-            learner_epoch: None,
-        })
+            .initial_connection_window_size(4 << 20))
     }
 
     pub(super) fn address(&self) -> &str {
@@ -88,8 +91,7 @@ impl Connector {
     }
 
     pub(super) async fn connect(&mut self) -> Result<Link, Failure> {
-        let channel = self.endpoint.connect().await.map_err(|error| Failure::Lost(with_sources(&error)))?;
-        let mut client = LearnerClient::new(channel).max_decoding_message_size(MESSAGE_LIMIT);
+        let mut client = self.client().await?.max_decoding_message_size(MESSAGE_LIMIT);
         let mut request =
             Request::new(JoinRequest { incarnation: self.incarnation, actor: self.actor, protocol: PROTOCOL_VERSION });
         request.set_timeout(CALL);
@@ -106,6 +108,29 @@ impl Connector {
         Ok(Link { client, reply })
     }
 
+    async fn client(&self) -> Result<Client, Failure> {
+        // In the middle of a renewal the files may not fit together: who was let in once tries again.
+        let renewed = |error: AccessError| match self.actor {
+            Some(_) => Failure::Lost(chain(&error)),
+            None => Failure::Fatal(error.into()),
+        };
+        let (endpoint, bearer) = (self.endpoint().map_err(renewed)?, self.access.bearer().map_err(renewed)?);
+        let channel = endpoint.connect().await.map_err(|error| match self.is_barred(&error) {
+            true => Failure::Fatal(self.unwelcome(chain(&error))),
+            false => Failure::Lost(chain(&error)),
+        })?;
+        Ok(LearnerClient::with_interceptor(channel, bearer))
+    }
+
+    /// Whether a certificate is at fault, and was from the beginning.
+    fn is_barred(&self, error: &(dyn std::error::Error + 'static)) -> bool {
+        self.actor.is_none() && distrusted(error)
+    }
+
+    fn unwelcome(&self, message: String) -> Error {
+        Error::Unwelcome { url: self.address.clone(), message }
+    }
+
     /// Connects and checks that the experiment is still `terms`.
     pub(super) async fn reconnect(&mut self, terms: &Terms) -> Result<Link, Failure> {
         let link = self.connect().await?;
@@ -113,27 +138,19 @@ impl Connector {
     }
 
     fn judge(&self, status: &Status) -> Failure {
-        match status.code() {
-            Code::InvalidArgument | Code::FailedPrecondition | Code::Unimplemented | Code::PermissionDenied => {
-                let message = describe(status);
-                // Who was let in once is configured rightly; a new process may be let in again.
-                Failure::Fatal(match self.actor {
-                    Some(actor) => Error::Dismissed { actor, message },
-                    None => Error::Refused { url: self.address.clone(), message },
-                })
-            }
-            _ => Failure::Lost(describe(status)),
+        let message = describe(status);
+        // Who was let in once is configured rightly; a new process, or a renewed token, may be let in again.
+        match (status.code(), self.actor) {
+            (Code::Unauthenticated, None) => Failure::Fatal(self.unwelcome(status.message().to_string())),
+            (
+                Code::InvalidArgument | Code::FailedPrecondition | Code::Unimplemented | Code::PermissionDenied,
+                actor,
+            ) => Failure::Fatal(match actor {
+                Some(actor) => Error::Dismissed { actor, message },
+                None => Error::Refused { url: self.address.clone(), message },
+            }),
+            _ if self.is_barred(status) => Failure::Fatal(self.unwelcome(chain(status))),
+            _ => Failure::Lost(message),
         }
     }
-}
-
-/// The transport's own message is `transport error`; what happened is in its sources.
-fn with_sources(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut source = error.source();
-    while let Some(error) = source {
-        text = format!("{text}: {error}");
-        source = error.source();
-    }
-    text
 }

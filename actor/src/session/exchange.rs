@@ -2,12 +2,11 @@
 
 use std::sync::Arc;
 
-use comic_proto::v1::learner_client::LearnerClient;
+use comic_proto::Client;
 use comic_proto::v1::{UnrollAck, UnrollMessage, WatchRequest};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::Channel;
 
 use super::connection::{Link, describe};
 use super::{Assembled, Assembler, Limits, Outbox};
@@ -83,11 +82,7 @@ impl Exchange<'_> {
     }
 }
 
-async fn send(
-    mut client: LearnerClient<Channel>,
-    outbound: mpsc::Receiver<UnrollMessage>,
-    acked: mpsc::Sender<UnrollAck>,
-) -> Ended {
+async fn send(mut client: Client, outbound: mpsc::Receiver<UnrollMessage>, acked: mpsc::Sender<UnrollAck>) -> Ended {
     let mut stream = match client.send_unrolls(ReceiverStream::new(outbound)).await {
         Ok(reply) => reply.into_inner(),
         Err(status) => return Ended::Lost(describe(&status)),
@@ -105,12 +100,7 @@ async fn send(
     }
 }
 
-async fn watch(
-    mut client: LearnerClient<Channel>,
-    request: WatchRequest,
-    mut assembler: Assembler,
-    mailbox: Arc<Mailbox>,
-) -> Ended {
+async fn watch(mut client: Client, request: WatchRequest, mut assembler: Assembler, mailbox: Arc<Mailbox>) -> Ended {
     let mut stream = match client.watch_parameters(request).await {
         Ok(reply) => reply.into_inner(),
         Err(status) => return Ended::Lost(describe(&status)),

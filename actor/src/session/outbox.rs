@@ -10,7 +10,7 @@ use crate::worker::FinishedUnroll;
 /// How often a refusal is logged.
 const REFUSAL_LOG: Duration = Duration::from_secs(60);
 
-/// How the learner answered, in numbers of unrolls.
+/// How the learner answered: numbers of unrolls, and its last word.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Settled {
     /// Taken into a batch.
@@ -21,6 +21,8 @@ pub struct Settled {
     pub stale: u64,
     /// Refused as invalid, or with a verdict this actor does not know.
     pub invalid: u64,
+    /// Whether the learner said that the run is over.
+    pub over: bool,
 }
 
 /// A bounded queue in the order of sequence numbers; the front part has been sent on the current connection.
@@ -164,7 +166,7 @@ mod tests {
         outbox.rewind();
         assert_eq!(sent(&mut outbox), [2, 3, 4]);
         outbox.settle(&ack(2, Verdict::Duplicate));
-        assert_eq!(outbox.settled(), Settled { taken: 1, duplicate: 1, stale: 1, invalid: 0 });
+        assert_eq!(outbox.settled(), Settled { taken: 1, duplicate: 1, stale: 1, ..Settled::default() });
     }
 
     #[test]

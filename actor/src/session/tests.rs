@@ -11,6 +11,10 @@ use learner::{FakeLearner, Script};
 
 const LIMITS: Limits = Limits { window: 4, parameters: 1000, flush: Duration::from_secs(60) };
 
+fn options_for(learner: impl Into<String>) -> Options {
+    Options { learner: learner.into(), access: Access::default(), cache: None }
+}
+
 /// An unroll that names itself by its version.
 fn unroll(number: u64) -> FinishedUnroll {
     FinishedUnroll {
@@ -32,7 +36,7 @@ struct Running {
 
 async fn start(learner: &FakeLearner) -> Running {
     let (stop, stopped) = watch::channel(false);
-    let options = Options { learner: learner.address(), cache: None };
+    let options = options_for(learner.address());
     let joined = join(&options, stopped.clone()).await.unwrap();
     let (unrolls, receiver) = mpsc::channel(1);
     let mailbox = Arc::new(Mailbox::default());
@@ -96,7 +100,7 @@ async fn parameters_reach_the_mailbox_and_leaving_ends_the_session() {
     };
     assert_eq!(*first_directive(&running.mailbox).await, expected);
     learner.publish(Behaviour::Leave, 6, b"");
-    running.session.await.unwrap().unwrap();
+    assert!(running.session.await.unwrap().unwrap().over);
 }
 
 #[tokio::test]
@@ -131,14 +135,14 @@ async fn stopping_flushes_what_is_finished() {
     running.stop.send_replace(true);
     drop(running.unrolls);
     let settled = running.session.await.unwrap().unwrap();
-    assert_eq!(settled.taken, 3);
+    assert_eq!((settled.taken, settled.over), (3, false));
 }
 
 #[tokio::test]
 async fn stopping_does_not_wait_for_a_learner_for_ever() {
     let learner = FakeLearner::start(Script { silent: true, ..Script::default() }).await;
     let (stop, stopped) = watch::channel(false);
-    let options = Options { learner: learner.address(), cache: None };
+    let options = options_for(learner.address());
     let joined = join(&options, stopped.clone()).await.unwrap();
     let (unrolls, receiver) = mpsc::channel(1);
     let limits = Limits { flush: Duration::from_millis(20), ..LIMITS };
@@ -154,7 +158,7 @@ async fn a_learner_that_comes_up_later_is_waited_for() {
     let address = listener.local_addr().unwrap();
     drop(listener);
     let (_stop, stopped) = watch::channel(false);
-    let options = Options { learner: format!("http://{address}"), cache: None };
+    let options = options_for(format!("http://{address}"));
     let joining = tokio::spawn(async move { join(&options, stopped).await });
     let listener = tokio::net::TcpListener::bind(address).await.unwrap();
     let _learner = FakeLearner::serve(listener, Script::default());
@@ -165,7 +169,7 @@ async fn a_learner_that_comes_up_later_is_waited_for() {
 async fn a_refusal_is_a_configuration_error_and_stopping_ends_the_wait() {
     let refused = |script| async {
         let learner = FakeLearner::start(script).await;
-        let options = Options { learner: learner.address(), cache: None };
+        let options = options_for(learner.address());
         let (_stop, stopped) = watch::channel(false);
         join(&options, stopped).await.unwrap_err()
     };
@@ -177,7 +181,7 @@ async fn a_refusal_is_a_configuration_error_and_stopping_ends_the_wait() {
     let (stop, stopped) = watch::channel(false);
     stop.send_replace(true);
     // Nobody listens at port 1.
-    let options = Options { learner: "http://127.0.0.1:1".into(), cache: None };
+    let options = options_for("http://127.0.0.1:1");
     assert!(matches!(join(&options, stopped).await, Err(Error::Stopped)));
 }
 
@@ -185,9 +189,9 @@ async fn a_refusal_is_a_configuration_error_and_stopping_ends_the_wait() {
 async fn an_address_that_is_none_is_refused_at_once() {
     let (_stop, stopped) = watch::channel(false);
     for learner in ["host:7070", "https://host:7070", "", "http://", "not a url"] {
-        let options = Options { learner: learner.into(), cache: None };
+        let options = options_for(learner);
         let error = join(&options, stopped.clone()).await.unwrap_err();
-        assert!(matches!(error, Error::Url { .. }), "{learner}: {error}");
+        assert!(matches!(error, Error::Access(_)) && error.is_configuration(), "{learner}: {error}");
     }
 }
 
@@ -196,7 +200,7 @@ mod assets {
 
     async fn fetch(learner: &FakeLearner, cache: &std::path::Path) -> Result<HashMap<String, PathBuf>, Error> {
         let (_stop, stopped) = watch::channel(false);
-        let options = Options { learner: learner.address(), cache: Some(cache.to_path_buf()) };
+        let options = Options { cache: Some(cache.to_path_buf()), ..options_for(learner.address()) };
         Ok(join(&options, stopped).await?.assets)
     }
 

@@ -48,7 +48,8 @@ enum Command {
     Bench(bench::Options),
     /// Draw the curves of runs, or of ../shared/baselines, as one picture
     Plot {
-        /// Files of metrics, `runs/NAME/metrics.jsonl`; `LABEL=FILE` gives a curve its name
+        /// Files of metrics, `runs/NAME/metrics.jsonl`; `LABEL=FILE` gives a curve its name, and `#TASK`
+        /// behind it draws one task of joint training
         #[arg(required = true)]
         metrics: Vec<String>,
         /// What the curves show

@@ -49,6 +49,8 @@ impl Quantity {
 pub(crate) struct Source {
     label: String,
     path: PathBuf,
+    /// In joint training the task whose episodes are drawn; all of them otherwise.
+    task: Option<String>,
 }
 
 impl Source {
@@ -56,15 +58,23 @@ impl Source {
     pub(crate) fn of(path: PathBuf) -> Self {
         let metrics = path.file_stem().is_some_and(|stem| stem == "metrics");
         let named = if metrics { path.parent().and_then(Path::file_name) } else { path.file_stem() };
-        Self { label: named.unwrap_or(path.as_os_str()).to_string_lossy().into_owned(), path }
+        Self { label: named.unwrap_or(path.as_os_str()).to_string_lossy().into_owned(), path, task: None }
     }
 
-    /// `FILE` or `LABEL=FILE`; a file that is there is no label, since a sweep's runs have `=` in their names.
+    /// `FILE` or `LABEL=FILE`, either with `#TASK` behind it; a file that is there is no label, since a sweep's runs have
+    /// `=` in their names.
     fn parse(argument: &str) -> Self {
-        match argument.split_once('=') {
-            Some((label, path)) if !Path::new(argument).exists() => Self { label: label.to_owned(), path: path.into() },
-            _ => Self::of(argument.into()),
-        }
+        let (file, task) = match argument.rsplit_once('#') {
+            Some((file, task)) if !Path::new(argument).exists() => (file, Some(task.to_owned())),
+            _ => (argument, None),
+        };
+        let source = match file.split_once('=') {
+            Some((label, path)) if !Path::new(file).exists() => {
+                Self { label: label.to_owned(), ..Self::of(path.into()) }
+            }
+            _ => Self::of(file.into()),
+        };
+        Self { task, ..source }
     }
 }
 
@@ -87,7 +97,10 @@ pub(crate) fn run(metrics: &[String], quantity: Quantity, out: &Path) -> Result<
 
 /// Draws a curve for each run, over wall-clock time and over environment steps.
 pub(crate) fn draw_runs(sources: &[Source], quantity: Quantity, out: &Path) -> Result<()> {
-    let curves = sources.iter().map(|source| read(&source.path, quantity)).collect::<Result<Vec<_>>>()?;
+    let curves = sources
+        .iter()
+        .map(|source| read(&source.path, source.task.as_deref(), quantity))
+        .collect::<Result<Vec<_>>>()?;
     let series = |x: fn(&Point) -> f64| -> Vec<Series> {
         let line = |points: &Vec<Point>| points.iter().map(|point| (x(point), point.value)).collect();
         let named = sources.iter().zip(&curves);
@@ -103,16 +116,20 @@ pub(crate) fn draw_runs(sources: &[Source], quantity: Quantity, out: &Path) -> R
 /// Draws each group of runs as their mean over environment steps, with a band from the least to the most of them.
 pub(crate) fn draw_groups(groups: &[(String, Vec<PathBuf>)], quantity: Quantity, out: &Path) -> Result<()> {
     let series = groups.iter().map(|(label, runs)| {
-        let curves = runs.iter().map(|path| read(path, quantity)).collect::<Result<Vec<_>>>()?;
+        let curves = runs.iter().map(|path| read(path, None, quantity)).collect::<Result<Vec<_>>>()?;
         Ok(pool(label.clone(), &curves))
     });
     draw(&[("million environment steps", series.collect::<Result<Vec<_>>>()?)], quantity, out)
 }
 
-fn read(path: &Path, quantity: Quantity) -> Result<Vec<Point>> {
+fn read(path: &Path, task: Option<&str>, quantity: Quantity) -> Result<Vec<Point>> {
     let mut points: Vec<Point> = Vec::new();
     for line in metrics::read(path)? {
-        if let Some(value) = quantity.of(&line) {
+        let of_task = match task {
+            Some(task) => line.tasks.get(task),
+            None => Some(&line),
+        };
+        if let Some(value) = of_task.and_then(|line| quantity.of(line)) {
             let steps = line.environment_steps as f64 / 1e6;
             // A run that was killed does again what it did after its last checkpoint: the newer line holds.
             points.truncate(points.partition_point(|point| point.steps < steps));
@@ -120,7 +137,8 @@ fn read(path: &Path, quantity: Quantity) -> Result<Vec<Point>> {
         }
     }
     if points.is_empty() {
-        bail!("{} holds no finished episode yet", path.display());
+        let of_task = task.map_or_else(String::new, |task| format!(" of {task}"));
+        bail!("{} holds no finished episode{of_task} yet", path.display());
     }
     Ok(smooth(&points))
 }
@@ -202,10 +220,25 @@ mod tests {
     }
 
     #[test]
+    fn one_tasks_episodes_are_drawn_where_it_is_named() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("metrics.jsonl");
+        let line = r#"{"environment_steps":1000000,"episode_return":9.0,"tasks":{"get-up":{"episode_return":2.0}}}"#;
+        std::fs::write(&path, format!("{line}\n")).unwrap();
+        let of = |argument: &str| {
+            let Source { path, task, .. } = Source::parse(&argument.replace("FILE", &path.display().to_string()));
+            read(&path, task.as_deref(), Quantity::EpisodeReturn).map(|points| (points[0].steps, points[0].value))
+        };
+        assert_eq!(of("FILE").unwrap(), (1.0, 9.0));
+        assert_eq!(of("up=FILE#get-up").unwrap(), (1.0, 2.0));
+        assert!(of("FILE#gaps").unwrap_err().to_string().ends_with("no finished episode of gaps yet"));
+    }
+
+    #[test]
     fn what_was_done_again_after_a_crash_is_drawn_once() {
         let directory = tempfile::tempdir().unwrap();
         let lines = [(1_000_000, 1.0), (2_000_000, 7.0), (3_000_000, 7.0), (2_000_000, 1.0), (4_000_000, 1.0)];
-        let points = read(&metrics(directory.path(), "metrics.jsonl", &lines), Quantity::EpisodeReturn).unwrap();
+        let points = read(&metrics(directory.path(), "metrics.jsonl", &lines), None, Quantity::EpisodeReturn).unwrap();
         assert_eq!(
             points.iter().map(|point| (point.steps, point.value)).collect::<Vec<_>>(),
             [(1.0, 1.0), (2.0, 1.0), (4.0, 1.0)]

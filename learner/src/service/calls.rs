@@ -1,6 +1,7 @@
 //! An answer to each call of the protocol.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use comic_proto::PROTOCOL_VERSION;
 use comic_proto::v1::learner_server::Learner;
@@ -12,8 +13,9 @@ use futures::stream::{self, BoxStream, StreamExt as _};
 use serde::de::IgnoredAny;
 use tonic::{Request, Response, Status, Streaming};
 
+use super::roster::Presence;
 use super::unrolls::UnrollStream;
-use super::{Closing, Evaluation, Shared, assets, lock};
+use super::{Closing, Evaluation, Shared, assets, status};
 use crate::publish::Subscription;
 
 /// The service, as tonic wants it: one per server, shared by every connection.
@@ -37,16 +39,23 @@ impl Learner for Calls {
     async fn join(&self, request: Request<JoinRequest>) -> Result<Response<JoinReply>, Status> {
         let peer = request.remote_addr();
         let JoinRequest { incarnation, actor, protocol } = request.into_inner();
+        let shared = &self.shared;
+        let joins = &shared.telemetry.joins;
         if protocol != PROTOCOL_VERSION {
+            joins.of("refused").inc();
             return Err(Status::failed_precondition(format!(
                 "this learner speaks protocol {PROTOCOL_VERSION}, the actor {protocol}: run both from the same release"
             )));
         }
-        let shared = &self.shared;
-        let joined = shared
-            .batcher
-            .join(incarnation, actor)
-            .map_err(|refused| Status::failed_precondition(refused.to_string()))?;
+        if !shared.roster.join(incarnation, Instant::now()) {
+            joins.of("full").inc();
+            return Err(Status::resource_exhausted("as many actors as --max-actors allows are here: try again later"));
+        }
+        let joined = shared.batcher.join(incarnation, actor).map_err(|refused| {
+            joins.of("refused").inc();
+            Status::failed_precondition(refused.to_string())
+        })?;
+        joins.of("joined").inc();
         tracing::info!(actor = joined.actor, incarnation = format_args!("{incarnation:016x}"), peer = ?peer, "actor joined");
         Ok(Response::new(JoinReply {
             learner_epoch: shared.publisher.epoch(),
@@ -75,9 +84,10 @@ impl Learner for Calls {
 
     async fn watch_parameters(
         &self,
-        _: Request<WatchRequest>,
+        request: Request<WatchRequest>,
     ) -> Result<Response<Self::WatchParametersStream>, Status> {
-        let watch = (self.shared.publisher.subscribe(), self.shared.closing());
+        let present = self.shared.roster.watch(request.into_inner().incarnation);
+        let watch = (self.shared.publisher.subscribe(), self.shared.closing(), present);
         Ok(Response::new(stream::unfold(watch, next_parameters).boxed()))
     }
 
@@ -89,33 +99,21 @@ impl Learner for Calls {
         if !self.shared.keep_evaluation(Evaluation { epoch, version, json }) {
             return Err(Status::resource_exhausted("too many evaluations wait for the trainer: report this one later"));
         }
+        self.shared.telemetry.evaluations.inc();
         Ok(Response::new(EvaluationAck {}))
     }
 
     async fn get_status(&self, _: Request<StatusRequest>) -> Result<Response<v1::Status>, Status> {
-        let books = self.shared.batcher.books();
-        Ok(Response::new(v1::Status {
-            learner_epoch: self.shared.publisher.epoch(),
-            books: Some(v1::Books {
-                produced: books.produced,
-                trained: books.trained,
-                dropped_stale: books.dropped.stale,
-                dropped_invalid: books.dropped.invalid,
-                dropped_superseded: books.dropped.superseded,
-                dropped_lost_at_restart: books.dropped.lost_at_restart,
-                in_flight: books.in_flight,
-                duplicates: books.duplicates,
-                unattributed: books.unattributed,
-            }),
-            metrics_json: lock(&self.shared.metrics).clone(),
-        }))
+        Ok(Response::new(status::of(&self.shared)))
     }
 }
 
-type Watch = (Subscription, Closing);
+type Watch = (Subscription, Closing, Presence);
 
 /// The next piece of the newest parameters. At the server's end only a farewell is still sent.
-async fn next_parameters((mut parameters, mut closing): Watch) -> Option<(Result<ParametersChunk, Status>, Watch)> {
+async fn next_parameters(
+    (mut parameters, mut closing, present): Watch,
+) -> Option<(Result<ParametersChunk, Status>, Watch)> {
     let chunk = if closing.has_begun() {
         parameters.farewell()?
     } else {
@@ -125,7 +123,7 @@ async fn next_parameters((mut parameters, mut closing): Watch) -> Option<(Result
             chunk = parameters.next() => chunk?,
         }
     };
-    Some((Ok(chunk), (parameters, closing)))
+    Some((Ok(chunk), (parameters, closing, present)))
 }
 
 /// An actor's seed: the same for the same index of the same experiment, whatever process has it (SplitMix64).

@@ -1,35 +1,38 @@
-//! A log that stays readable when an actor sends rubbish at full speed.
+//! A log that stays readable when a peer misbehaves at full speed.
 
 use std::collections::HashMap;
-use std::fmt::Display;
+use std::hash::Hash;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use super::lock;
 
-/// Silence after a complaint about an actor.
+/// Silence after a complaint about a peer.
 const QUIET: Duration = Duration::from_secs(60);
-/// Actors remembered. Were so many to send rubbish within a minute, the log would have nothing more to tell.
+/// Peers remembered. Were so many to misbehave within a minute, the log would have nothing more to tell.
 const REMEMBERED: usize = 1024;
 
-/// When each actor was last complained about, and how often it deserved it since.
-#[derive(Debug, Default)]
-pub(super) struct Complaints {
-    actors: Mutex<HashMap<u64, (Instant, u64)>>,
+/// When each peer was last complained about, and how often it deserved it since.
+#[derive(Debug)]
+pub(super) struct Complaints<K> {
+    peers: Mutex<HashMap<K, (Instant, u64)>>,
 }
 
-impl Complaints {
-    /// Logs a refused unroll, at most once per actor and minute.
-    pub(super) fn about(&self, actor: u64, sequence: u64, reason: &dyn Display) {
-        if let Some(unreported) = self.due(actor, Instant::now()) {
-            tracing::warn!(actor, sequence, unreported, "invalid unroll refused: {reason}");
-        }
+impl<K> Default for Complaints<K> {
+    fn default() -> Self {
+        Self { peers: Mutex::default() }
+    }
+}
+
+impl<K: Eq + Hash> Complaints<K> {
+    /// How many complaints about this peer went unreported before this one, if it is to be reported: once a minute.
+    pub(super) fn due(&self, peer: K) -> Option<u64> {
+        self.due_at(peer, Instant::now())
     }
 
-    /// How many went unreported before this one, if it is to be reported.
-    fn due(&self, actor: u64, now: Instant) -> Option<u64> {
-        let mut actors = lock(&self.actors);
-        if let Some((last, unreported)) = actors.get_mut(&actor) {
+    fn due_at(&self, peer: K, now: Instant) -> Option<u64> {
+        let mut peers = lock(&self.peers);
+        if let Some((last, unreported)) = peers.get_mut(&peer) {
             if now.duration_since(*last) < QUIET {
                 *unreported += 1;
                 return None;
@@ -37,13 +40,13 @@ impl Complaints {
             *last = now;
             return Some(std::mem::take(unreported));
         }
-        if actors.len() >= REMEMBERED {
-            actors.retain(|_, (last, _)| now.duration_since(*last) < QUIET);
+        if peers.len() >= REMEMBERED {
+            peers.retain(|_, (last, _)| now.duration_since(*last) < QUIET);
         }
-        if actors.len() >= REMEMBERED {
+        if peers.len() >= REMEMBERED {
             return None;
         }
-        actors.insert(actor, (now, 0));
+        peers.insert(peer, (now, 0));
         Some(0)
     }
 }
@@ -53,22 +56,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_actor_is_complained_about_once_a_minute_and_the_rest_is_counted() {
+    fn a_peer_is_complained_about_once_a_minute_and_the_rest_is_counted() {
         let (complaints, start) = (Complaints::default(), Instant::now());
-        assert_eq!(complaints.due(7, start), Some(0));
-        assert_eq!(complaints.due(7, start + QUIET / 2), None);
-        assert_eq!(complaints.due(8, start + QUIET / 2), Some(0), "another actor has its own minute");
-        assert_eq!(complaints.due(7, start + QUIET), Some(1));
+        assert_eq!(complaints.due_at(7, start), Some(0));
+        assert_eq!(complaints.due_at(7, start + QUIET / 2), None);
+        assert_eq!(complaints.due_at(8, start + QUIET / 2), Some(0), "another peer has its own minute");
+        assert_eq!(complaints.due_at(7, start + QUIET), Some(1));
     }
 
     #[test]
     fn memory_is_bounded_and_recovers() {
         let (complaints, start) = (Complaints::default(), Instant::now());
-        for actor in 0..5000 {
-            complaints.due(actor, start);
+        for peer in 0..5000 {
+            complaints.due_at(peer, start);
         }
-        assert_eq!(lock(&complaints.actors).len(), REMEMBERED);
-        assert_eq!(complaints.due(5000, start), None);
-        assert_eq!(complaints.due(5000, start + QUIET), Some(0));
+        assert_eq!(lock(&complaints.peers).len(), REMEMBERED);
+        assert_eq!(complaints.due_at(5000, start), None);
+        assert_eq!(complaints.due_at(5000, start + QUIET), Some(0));
     }
 }

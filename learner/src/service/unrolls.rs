@@ -2,6 +2,7 @@
 
 use std::error::Error as _;
 use std::sync::Arc;
+use std::time::Instant;
 
 use comic_proto::v1::{UnrollAck, UnrollHeader, UnrollMessage, Verdict};
 use comic_proto::{Expected, Invalid, validate};
@@ -63,6 +64,8 @@ async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAc
         shared.batcher.refuse_unattributed();
         return Ok(Some(ack(shared, 0, Verdict::Invalid, Invalid::Header.to_string())));
     };
+    shared.telemetry.unroll_bytes.observe(payload.len() as f64);
+    shared.roster.heard(header.incarnation, Instant::now());
     let expected = Expected {
         clips: &shared.clips,
         epoch: shared.publisher.epoch(),
@@ -72,7 +75,10 @@ async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAc
     let earlier = header.learner_epoch < expected.epoch;
     let valid = if earlier { Ok(()) } else { validate(shared.batcher.layout(), &header, &payload, &expected) };
     let (outcome, invalid) = match valid {
-        Ok(()) => (shared.batcher.insert(&header, payload).await, None),
+        Ok(()) => {
+            let _waiting = shared.roster.wait(header.incarnation);
+            (shared.batcher.insert(&header, payload).await, None)
+        }
         Err(invalid) => (shared.batcher.refuse_invalid(&header), Some(invalid)),
     };
     let sequence = header.sequence;
@@ -91,7 +97,9 @@ async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAc
         }
         Outcome::Invalid => {
             let reason = invalid.map_or_else(|| "its numbers fit no account".into(), |invalid| invalid.to_string());
-            shared.complaints.about(header.actor, sequence, &reason);
+            if let Some(unreported) = shared.complaints.due(header.actor) {
+                tracing::warn!(actor = header.actor, sequence, unreported, "invalid unroll refused: {reason}");
+            }
             ack(shared, sequence, Verdict::Invalid, reason)
         }
         Outcome::NotJoined => {

@@ -9,10 +9,11 @@ use bytes::Bytes;
 use comic_clips::Asset;
 use comic_experiment::{Experiment, TaskPart, TaskSpec};
 use comic_learner::publish::Publisher;
+use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared, serve};
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{JoinReply, JoinRequest, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict};
-use comic_proto::{Field, PROTOCOL_VERSION, UnrollBuffer, UnrollLayout, UnrollShape};
+use comic_proto::{Access, Client, Field, PROTOCOL_VERSION, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{Batcher, Config, Ledger, Phase};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
@@ -43,6 +44,20 @@ impl World {
 
     /// With so many numbers of proprioception, and these assets.
     pub(crate) async fn start_with(proprioception: usize, assets: Vec<Asset>) -> Self {
+        Self::guarded(proprioception, assets, Security::default(), Limits::default()).await
+    }
+
+    /// Behind these limits.
+    pub(crate) async fn limited(limits: Limits) -> Self {
+        Self::guarded(8, Vec::new(), Security::default(), limits).await
+    }
+
+    /// Behind certificates and tokens.
+    pub(crate) async fn secured(security: Security) -> Self {
+        Self::guarded(8, Vec::new(), security, Limits::default()).await
+    }
+
+    async fn guarded(proprioception: usize, assets: Vec<Asset>, security: Security, limits: Limits) -> Self {
         let mut experiment = Experiment::default();
         experiment.unroll.length = 4;
         experiment.unroll.batch = BATCH;
@@ -69,6 +84,9 @@ impl World {
         let batcher = Batcher::new(layout, config, phase, Ledger::new());
         let publisher = Publisher::new(EPOCH);
         let setup = Setup {
+            run: "runs/test".into(),
+            security,
+            limits,
             experiment: experiment.clone(),
             spec: spec.clone(),
             assets,
@@ -85,9 +103,22 @@ impl World {
         Self { experiment, spec, batcher, publisher, shared, address, shutdown: Some(shutdown), server }
     }
 
+    /// A connection, for clients of other services than the learner's own.
+    pub(crate) async fn channel(&self) -> Channel {
+        Channel::from_shared(self.address.clone()).unwrap().connect().await.unwrap()
+    }
+
     /// A client on a connection of its own.
     pub(crate) async fn client(&self) -> LearnerClient<Channel> {
         LearnerClient::connect(self.address.clone()).await.unwrap()
+    }
+
+    /// A client that shows what `access` holds, or why there is none.
+    pub(crate) async fn client_with(&self, access: &Access) -> Result<Client> {
+        let scheme = if access.ca.is_some() { "https://localhost" } else { "http://127.0.0.1" };
+        let port = self.address.rsplit(':').next().unwrap();
+        let channel = access.endpoint(&format!("{scheme}:{port}"))?.connect().await?;
+        Ok(LearnerClient::with_interceptor(channel, access.bearer()?))
     }
 
     /// An actor that has joined.

@@ -124,7 +124,7 @@ fn refuse_another_experiment(wanted: &Experiment, directory: &Path) -> Result<()
     let path = directory.join("experiment.toml");
     let Ok(text) = std::fs::read_to_string(&path) else { return Ok(()) };
     let made = Experiment::from_toml(&path.display().to_string(), &text)?;
-    if let Some(difference) = made.difference(wanted)? {
+    if let Some(difference) = made.differences(wanted)?.into_iter().next() {
         bail!(
             "{} was made with `{} = {}`, and the sweep now says `{}`: put the old value back, remove that directory, or \
              name another place for the sweep by --out",

@@ -31,6 +31,8 @@ pub(crate) struct Line {
     pub(crate) books: Option<Books>,
     /// Whatever the learner minimises, by name.
     pub(crate) losses: BTreeMap<String, serde_json::Value>,
+    /// In joint training the same of each task's own episodes.
+    pub(crate) tasks: BTreeMap<String, Line>,
 }
 
 impl Line {

@@ -1,0 +1,144 @@
+//! `comic-learner certs`: a certificate authority for development, and certificates of it.
+
+use std::fs::{self, OpenOptions};
+use std::io::Write as _;
+use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, Result};
+use clap::Args;
+use rcgen::{
+    BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, KeyUsagePurpose,
+};
+use time::{Duration, OffsetDateTime};
+
+use crate::options::Misuse;
+
+/// Makes an authority and certificates for a learner and its actors, or, where DIR holds an authority, renews the
+/// certificates by it: a learner and actors that run take them up by themselves.
+#[derive(Clone, Debug, Args)]
+#[command(
+    after_help = "DIR then holds ca.pem, server.pem and client.pem, each with its -key.pem, readable by their owner alone.\n\
+    The authority's key is kept beside them: this is for development, not for an authority that others rely on."
+)]
+pub struct Certs {
+    /// Where they are put.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Names and addresses by which actors reach the learner.
+    #[arg(long = "name", value_name = "NAME", num_args = 1.., default_values = ["localhost", "127.0.0.1", "::1"])]
+    pub names: Vec<String>,
+    /// Days for which the learner's and the actors' certificates hold, from now on.
+    #[arg(long, default_value_t = 90, value_parser = clap::value_parser!(u16).range(1..=3650))]
+    pub days: u16,
+}
+
+/// Days for which an authority holds.
+const AUTHORITY_DAYS: i64 = 3650;
+/// Clocks may differ by so much.
+const SKEW: Duration = Duration::minutes(5);
+
+impl Certs {
+    /// Writes the files and names them on stdout.
+    ///
+    /// # Errors
+    /// A name that is none, an authority that cannot be used, a directory that cannot be written.
+    pub fn run(&self) -> Result<()> {
+        fs::create_dir_all(&self.out).with_context(|| format!("cannot make {}", self.out.display()))?;
+        let now = OffsetDateTime::now_utc();
+        let (from, until) = (now - SKEW, now + Duration::days(self.days.into()));
+        let issuer = self.authority(now)?;
+        let server = ("server", self.names.clone(), ExtendedKeyUsagePurpose::ServerAuth);
+        let client = ("client", vec!["comic-actor".to_owned()], ExtendedKeyUsagePurpose::ClientAuth);
+        for (name, subjects, usage) in [server, client] {
+            let mut params = CertificateParams::new(subjects)
+                .map_err(|error| Misuse::new(format!("--name is no host name and no address: {error}")))?;
+            params.distinguished_name.push(DnType::CommonName, format!("CoMic {name}"));
+            params.extended_key_usages = vec![usage];
+            params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+            (params.not_before, params.not_after) = (from, until);
+            let key = KeyPair::generate()?;
+            let certificate = params.signed_by(&key, &issuer)?;
+            self.write(name, &certificate.pem(), &key)?;
+        }
+        Ok(())
+    }
+
+    /// The authority in the directory, or a new one.
+    fn authority(&self, now: OffsetDateTime) -> Result<Issuer<'static, KeyPair>> {
+        let [certificate, key] = ["ca.pem", "ca-key.pem"].map(|name| self.out.join(name));
+        if certificate.exists() || key.exists() {
+            let read = |path: &Path| {
+                let text = fs::read_to_string(path);
+                text.map_err(|error| Misuse::new(format!("half an authority: cannot read {}: {error}", path.display())))
+            };
+            let (certificate, key) = (read(&certificate)?, read(&key)?);
+            let unusable =
+                |error| Misuse::new(format!("the authority in {} cannot be used: {error}", self.out.display()));
+            let key = KeyPair::from_pem(&key).map_err(unusable)?;
+            return Ok(Issuer::from_ca_cert_pem(&certificate, key).map_err(unusable)?);
+        }
+        let mut params = CertificateParams::default();
+        params.distinguished_name.push(DnType::CommonName, "CoMic development authority");
+        params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+        params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+        (params.not_before, params.not_after) = (now - SKEW, now + Duration::days(AUTHORITY_DAYS));
+        let key = KeyPair::generate()?;
+        self.write("ca", &params.self_signed(&key)?.pem(), &key)?;
+        Ok(Issuer::new(params, key))
+    }
+
+    fn write(&self, name: &str, certificate: &str, key: &KeyPair) -> Result<()> {
+        // The key first: a learner that looks in between finds two that do not fit, and keeps what it has.
+        for (file, mode, text) in [
+            (format!("{name}-key.pem"), 0o600, key.serialize_pem()),
+            (format!("{name}.pem"), 0o644, certificate.into()),
+        ] {
+            let path = self.out.join(file);
+            let mut open = OpenOptions::new();
+            let file = open.create(true).write(true).truncate(true).mode(mode).open(&path);
+            let mut file = file.with_context(|| format!("cannot write {}", path.display()))?;
+            // A file that was there keeps its own mode.
+            file.set_permissions(fs::Permissions::from_mode(mode))?;
+            file.write_all(text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
+        }
+        // Nobody has to read it.
+        let _ = writeln!(std::io::stdout(), "{}", self.out.join(format!("{name}.pem")).display());
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::security::Tls;
+
+    fn certs(out: &Path) -> Certs {
+        Certs { out: out.into(), names: vec!["localhost".into()], days: 1 }
+    }
+
+    #[test]
+    fn what_is_made_can_be_served_and_the_keys_are_their_owners() {
+        let directory = tempfile::tempdir().unwrap();
+        certs(directory.path()).run().unwrap();
+        let file = |name: &str| directory.path().join(name);
+        Tls::new(&file("server.pem"), &file("server-key.pem"), Some(&file("ca.pem"))).unwrap();
+        assert!(Tls::new(&file("server.pem"), &file("client-key.pem"), None).is_err(), "another's key");
+        for key in ["ca-key.pem", "server-key.pem", "client-key.pem"] {
+            assert_eq!(fs::metadata(file(key)).unwrap().permissions().mode() & 0o777, 0o600, "{key}");
+        }
+    }
+
+    #[test]
+    fn a_second_time_the_certificates_are_renewed_by_the_same_authority() {
+        let directory = tempfile::tempdir().unwrap();
+        let read = |name: &str| fs::read_to_string(directory.path().join(name)).unwrap();
+        certs(directory.path()).run().unwrap();
+        let (authority, server) = (read("ca.pem"), read("server.pem"));
+        certs(directory.path()).run().unwrap();
+        assert_eq!(read("ca.pem"), authority);
+        assert_ne!(read("server.pem"), server);
+        fs::remove_file(directory.path().join("ca-key.pem")).unwrap();
+        assert!(certs(directory.path()).run().unwrap_err().is::<Misuse>());
+    }
+}

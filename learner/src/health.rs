@@ -1,0 +1,64 @@
+//! `comic-learner health`: does a learner serve?
+
+use std::io::Write as _;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, bail};
+use clap::Args;
+use comic_proto::{Access, chain};
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
+
+/// Asks a learner by the gRPC health protocol; where it wants client certificates, one has to be shown, and a token
+/// never. Exits with 0 if it serves, and with 1 whatever else is the case.
+#[derive(Clone, Debug, Args)]
+pub struct Health {
+    /// The learner's address.
+    #[arg(long, value_name = "URL", env = "COMIC_LEARNER", default_value = "http://127.0.0.1:7070")]
+    pub learner: String,
+    /// Seconds within which it has to answer.
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=600))]
+    pub timeout: u64,
+    /// How to reach it.
+    #[command(flatten)]
+    pub access: Access,
+}
+
+impl Health {
+    /// Asks and says.
+    pub fn run(&self) -> ExitCode {
+        match self.ask() {
+            Ok(()) => {
+                // Nobody has to read it.
+                let _ = writeln!(std::io::stdout(), "serving");
+                ExitCode::SUCCESS
+            }
+            Err(error) => {
+                eprintln!("comic-learner: {error:#}");
+                ExitCode::FAILURE
+            }
+        }
+    }
+
+    fn ask(&self) -> Result<()> {
+        let runtime =
+            tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start tokio")?;
+        runtime.block_on(async {
+            let limit = Duration::from_secs(self.timeout);
+            tokio::time::timeout(limit, self.check()).await.with_context(|| format!("no answer in {limit:?}"))?
+        })
+    }
+
+    async fn check(&self) -> Result<()> {
+        let channel = self.access.endpoint(&self.learner)?.connect().await?;
+        let request = HealthCheckRequest { service: "comic.v1.Learner".into() };
+        let answer = HealthClient::new(channel).check(request).await;
+        let answer = answer.map_err(|status| anyhow::Error::msg(chain(&status)))?.into_inner();
+        match answer.status() {
+            ServingStatus::Serving => Ok(()),
+            other => bail!("{} is {}", self.learner, other.as_str_name()),
+        }
+    }
+}

@@ -1,0 +1,41 @@
+//! How much of the learner its peers may take together.
+
+use clap::Args;
+
+/// Limits of the service; beyond each, peers are refused and counted, and those inside go on undisturbed.
+#[derive(Clone, Debug, Args)]
+pub struct Limits {
+    /// Actors at once; one more is told to come again later. Connections in all are twice as many and 64.
+    #[arg(long, value_name = "N", default_value_t = 4096, value_parser = positive, help_heading = "Limits")]
+    pub max_actors: usize,
+    /// Connections from one address; one more is closed at once.
+    #[arg(long, value_name = "N", default_value_t = 1024, value_parser = positive, help_heading = "Limits")]
+    pub max_connections_per_address: usize,
+    /// Calls in flight, streams included, of which an actor has two; one more is refused.
+    #[arg(long, value_name = "N", default_value_t = 16_384, value_parser = positive, help_heading = "Limits")]
+    pub max_requests: usize,
+    /// Bytes of a message to the learner; as many as an unroll takes, and at least 1 MiB, unless given.
+    #[arg(long, value_name = "BYTES", value_parser = positive, help_heading = "Limits")]
+    pub max_message_bytes: Option<usize>,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self { max_actors: 4096, max_connections_per_address: 1024, max_requests: 16_384, max_message_bytes: None }
+    }
+}
+
+impl Limits {
+    /// Connections at once, from all addresses: an actor that reconnects leaves its old one behind for a while, and
+    /// whoever asks for the status needs one too.
+    pub fn max_connections(&self) -> usize {
+        self.max_actors.saturating_mul(2).saturating_add(64)
+    }
+}
+
+fn positive(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(number @ 1..=0xffff_ffff) => Ok(number),
+        _ => Err("must be a number from 1 on".into()),
+    }
+}

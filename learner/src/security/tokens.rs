@@ -1,0 +1,59 @@
+//! Tokens, compared in a time that tells nothing about them.
+
+use std::path::Path;
+
+use anyhow::Result;
+use comic_proto::Token;
+use sha2::{Digest as _, Sha256};
+use subtle::{Choice, ConstantTimeEq as _};
+
+use super::watched::Watched;
+
+/// The tokens of a file, or the one of the environment; only their SHA-256 is kept.
+#[derive(Debug)]
+pub struct Tokens(Watched<Vec<[u8; 32]>>);
+
+impl Tokens {
+    /// The tokens in `file`, which may change later, or the one in `COMIC_TOKEN`; `None` without either.
+    ///
+    /// # Errors
+    /// [`AccessError`](comic_proto::AccessError) when there is no usable token where there should be.
+    pub fn new(file: Option<&Path>) -> Result<Option<Self>> {
+        let path = file.map(Path::to_path_buf);
+        let files = path.iter().cloned().collect();
+        let load = move || {
+            let tokens = Token::read(path.as_deref())?;
+            Ok(tokens.iter().map(|token| Sha256::digest(token.secret()).into()).collect::<Vec<[u8; 32]>>())
+        };
+        let watched = Watched::new(files, load)?;
+        Ok(if watched.current().is_empty() { None } else { Some(Self(watched)) })
+    }
+
+    /// Whether the header `authorization` bears one of the tokens. Hashes have one length and every one is compared
+    /// whole, so the time taken says neither how long a token is, nor how much of it was right, nor which it was.
+    pub fn accept(&self, authorization: Option<&[u8]>) -> bool {
+        let Some(shown) = authorization.and_then(|header| header.strip_prefix(b"Bearer ")) else { return false };
+        let shown: [u8; 32] = Sha256::digest(shown).into();
+        let tokens = self.0.current();
+        tokens.iter().fold(Choice::from(0), |found, token| found | token.ct_eq(&shown)).into()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn any_of_the_tokens_is_accepted_nothing_else_is_and_a_changed_file_counts() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), "first\nsecond\n").unwrap();
+        let tokens = Tokens::new(Some(file.path())).unwrap().unwrap();
+        assert!(tokens.accept(Some(b"Bearer first")) && tokens.accept(Some(b"Bearer second")));
+        for wrong in [&b"first"[..], b"Bearer ", b"Bearer", b"Bearer firs", b"Bearer first ", b"Basic first", b"\xff"] {
+            assert!(!tokens.accept(Some(wrong)), "{wrong:?}");
+        }
+        assert!(!tokens.accept(None));
+        std::fs::write(file.path(), "third").unwrap();
+        assert!(tokens.accept(Some(b"Bearer third")) && !tokens.accept(Some(b"Bearer first")));
+    }
+}

@@ -1,0 +1,130 @@
+//! What every call has to pass before it is looked at: the token, and the limit of calls in flight.
+
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use bytes::Bytes;
+use futures::future::BoxFuture;
+use http::header::AUTHORIZATION;
+use http::{Request, Response};
+use http_body::{Frame, SizeHint};
+use prometheus_client::metrics::gauge::Gauge;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tonic::Status;
+use tonic::body::Body;
+use tower::{Layer, Service};
+
+use crate::security::Tokens;
+use crate::telemetry::Telemetry;
+
+/// Says whether the learner serves and nothing else, so that container checks need no secret.
+const OPEN: &str = "/grpc.health.v1.Health/Check";
+
+/// Admits calls, for all connections together.
+#[derive(Clone, Debug)]
+pub(super) struct Admission {
+    tokens: Option<Arc<Tokens>>,
+    places: Arc<Semaphore>,
+    telemetry: Arc<Telemetry>,
+}
+
+impl Admission {
+    pub(super) fn new(tokens: Option<Arc<Tokens>>, max_requests: usize, telemetry: Arc<Telemetry>) -> Self {
+        let places = Arc::new(Semaphore::new(max_requests.min(Semaphore::MAX_PERMITS)));
+        Self { tokens, places, telemetry }
+    }
+
+    fn admit<B>(&self, request: &Request<B>) -> Result<Admitted, Status> {
+        let shown = request.headers().get(AUTHORIZATION).map(http::HeaderValue::as_bytes);
+        let open = request.uri().path() == OPEN;
+        if !open && self.tokens.as_ref().is_some_and(|tokens| !tokens.accept(shown)) {
+            self.telemetry.requests_refused.of("unauthenticated").inc();
+            let what = if shown.is_none() { "a token, and none was sent" } else { "another token" };
+            return Err(Status::unauthenticated(format!(
+                "this learner wants {what}: see --token-file and COMIC_TOKEN"
+            )));
+        }
+        let Ok(place) = self.places.clone().try_acquire_owned() else {
+            self.telemetry.requests_refused.of("overloaded").inc();
+            return Err(Status::resource_exhausted("too many calls are in flight: try again later"));
+        };
+        self.telemetry.requests.inc();
+        Ok(Admitted { requests: self.telemetry.requests.clone(), _place: place })
+    }
+}
+
+/// A call's place among those in flight.
+#[derive(Debug)]
+struct Admitted {
+    requests: Gauge,
+    _place: OwnedSemaphorePermit,
+}
+
+impl Drop for Admitted {
+    fn drop(&mut self) {
+        self.requests.dec();
+    }
+}
+
+impl<S> Layer<S> for Admission {
+    type Service = Gated<S>;
+
+    fn layer(&self, inner: S) -> Gated<S> {
+        Gated { admission: self.clone(), inner }
+    }
+}
+
+/// A service behind an [`Admission`].
+#[derive(Clone, Debug)]
+pub(super) struct Gated<S> {
+    admission: Admission,
+    inner: S,
+}
+
+impl<S, B> Service<Request<B>> for Gated<S>
+where
+    S: Service<Request<B>, Response = Response<Body>>,
+    S::Future: Send + 'static,
+{
+    type Response = Response<Body>;
+    type Error = S::Error;
+    type Future = BoxFuture<'static, Result<Self::Response, S::Error>>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), S::Error>> {
+        self.inner.poll_ready(context)
+    }
+
+    fn call(&mut self, request: Request<B>) -> Self::Future {
+        match self.admission.admit(&request) {
+            Err(refused) => Box::pin(async move { Ok(refused.into_http()) }),
+            Ok(admitted) => {
+                let answer = self.inner.call(request);
+                Box::pin(async move { Ok(answer.await?.map(|body| Body::new(Held { body, _admitted: admitted }))) })
+            }
+        }
+    }
+}
+
+/// An answer, or a stream of them, that keeps its place until its end.
+struct Held {
+    body: Body,
+    _admitted: Admitted,
+}
+
+impl http_body::Body for Held {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        Pin::new(&mut self.body).poll_frame(context)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}

@@ -1,0 +1,207 @@
+//! Which actors are there, and how they are.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use super::lock;
+
+/// An actor that joined has so long to open its streams.
+const JOINING: Duration = Duration::from_secs(30);
+/// Silence after which an actor that the learner waits for is slow.
+const SLOW: Duration = Duration::from_secs(60);
+/// How long a lost actor is spoken of.
+const REMEMBERED: Duration = Duration::from_secs(600);
+/// Lost actors spoken of at most.
+const LOST: usize = 65_536;
+
+/// Actors by how they are.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Census {
+    /// Connected, and heard of lately or waiting for the learner.
+    pub(crate) alive: u64,
+    /// Connected, and silent although the learner waits.
+    pub(crate) slow: u64,
+    /// Not connected any more.
+    pub(crate) lost: u64,
+    /// Unrolls that wait for a place in a batch.
+    pub(crate) waiting: u64,
+}
+
+/// The processes that joined, by incarnation.
+#[derive(Debug)]
+pub(super) struct Roster {
+    limit: usize,
+    actors: Mutex<HashMap<u64, Actor>>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Actor {
+    /// Streams of parameters that are open.
+    streams: u32,
+    /// Unrolls of it that wait for a place in a batch.
+    waiting: u32,
+    heard: Instant,
+    /// When its last stream ended, if that is all that is known of it.
+    gone: Option<Instant>,
+}
+
+impl Actor {
+    fn is_present(&self, now: Instant) -> bool {
+        self.streams > 0 || (self.gone.is_none() && now.duration_since(self.heard) < JOINING)
+    }
+
+    fn is_slow(&self, now: Instant) -> bool {
+        self.waiting == 0 && now.duration_since(self.heard) >= SLOW
+    }
+
+    fn is_remembered(&self, now: Instant) -> bool {
+        self.is_present(now) || now.duration_since(self.gone.unwrap_or(self.heard)) < REMEMBERED
+    }
+}
+
+impl Roster {
+    pub(super) fn new(limit: usize) -> Self {
+        Self { limit, actors: Mutex::default() }
+    }
+
+    /// Lets an actor in, or says that there are too many; one that is in already always stays.
+    pub(super) fn join(&self, incarnation: u64, now: Instant) -> bool {
+        let mut actors = lock(&self.actors);
+        if let Some(actor) = actors.get_mut(&incarnation).filter(|actor| actor.is_present(now)) {
+            actor.heard = now;
+            return true;
+        }
+        if actors.values().filter(|actor| actor.is_present(now)).count() >= self.limit {
+            return false;
+        }
+        if actors.len() >= LOST {
+            actors.retain(|_, actor| actor.is_present(now));
+        } else {
+            actors.retain(|_, actor| actor.is_remembered(now));
+        }
+        let actor = actors.entry(incarnation).or_insert(Actor { streams: 0, waiting: 0, heard: now, gone: None });
+        (actor.heard, actor.gone) = (now, None);
+        true
+    }
+
+    /// Notes that something came from an actor.
+    pub(super) fn heard(&self, incarnation: u64, now: Instant) {
+        if let Some(actor) = lock(&self.actors).get_mut(&incarnation) {
+            actor.heard = now;
+        }
+    }
+
+    /// Notes a stream of parameters, until what is returned is dropped. Who has not joined is not counted.
+    pub(super) fn watch(self: &Arc<Self>, incarnation: u64) -> Presence {
+        Presence::new(self, incarnation, Kind::Stream)
+    }
+
+    /// Notes an unroll that waits for a place, until what is returned is dropped.
+    pub(super) fn wait(self: &Arc<Self>, incarnation: u64) -> Presence {
+        Presence::new(self, incarnation, Kind::Waiting)
+    }
+
+    pub(super) fn census(&self, now: Instant) -> Census {
+        let mut census = Census::default();
+        for actor in lock(&self.actors).values().filter(|actor| actor.is_remembered(now)) {
+            census.waiting += u64::from(actor.waiting);
+            *match (actor.is_present(now), actor.is_slow(now)) {
+                (false, _) => &mut census.lost,
+                (true, true) => &mut census.slow,
+                (true, false) => &mut census.alive,
+            } += 1;
+        }
+        census
+    }
+}
+
+/// Something of an actor that is counted while it lasts.
+#[derive(Debug)]
+pub(super) struct Presence {
+    roster: Arc<Roster>,
+    incarnation: u64,
+    kind: Kind,
+}
+
+/// What is counted of an actor.
+#[derive(Clone, Copy, Debug)]
+enum Kind {
+    Stream,
+    Waiting,
+}
+
+impl Presence {
+    fn new(roster: &Arc<Roster>, incarnation: u64, kind: Kind) -> Self {
+        match (lock(&roster.actors).get_mut(&incarnation), kind) {
+            (Some(actor), Kind::Stream) => (actor.streams, actor.gone) = (actor.streams + 1, None),
+            (Some(actor), Kind::Waiting) => actor.waiting += 1,
+            (None, _) => {}
+        }
+        Self { roster: roster.clone(), incarnation, kind }
+    }
+}
+
+impl Drop for Presence {
+    fn drop(&mut self) {
+        // It may have joined only after this began: then this was not counted.
+        match (lock(&self.roster.actors).get_mut(&self.incarnation), self.kind) {
+            (Some(actor), Kind::Waiting) => actor.waiting = actor.waiting.saturating_sub(1),
+            (Some(actor), Kind::Stream) => {
+                actor.streams = actor.streams.saturating_sub(1);
+                if actor.streams == 0 {
+                    actor.gone = Some(Instant::now());
+                }
+            }
+            (None, _) => {}
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn census(roster: &Roster, now: Instant) -> (u64, u64, u64, u64) {
+        let Census { alive, slow, lost, waiting } = roster.census(now);
+        (alive, slow, lost, waiting)
+    }
+
+    #[test]
+    fn actors_are_alive_then_slow_then_lost_then_forgotten() {
+        let (roster, start) = (Arc::new(Roster::new(10)), Instant::now());
+        assert!(roster.join(1, start));
+        assert_eq!(census(&roster, start), (1, 0, 0, 0));
+        let watching = roster.watch(1);
+        assert_eq!(census(&roster, start + SLOW), (0, 1, 0, 0));
+        let waiting = roster.wait(1);
+        assert_eq!(census(&roster, start + SLOW), (1, 0, 0, 1), "it waits for the learner, not the learner for it");
+        drop(waiting);
+        roster.heard(1, start + SLOW);
+        assert_eq!(census(&roster, start + SLOW), (1, 0, 0, 0));
+        drop(watching);
+        assert_eq!(census(&roster, Instant::now()), (0, 0, 1, 0));
+        assert_eq!(census(&roster, Instant::now() + REMEMBERED), (0, 0, 0, 0));
+    }
+
+    #[test]
+    fn the_limit_counts_those_who_are_there_and_never_those_who_come_back() {
+        let (roster, start) = (Arc::new(Roster::new(2)), Instant::now());
+        assert!(roster.join(1, start) && roster.join(2, start));
+        assert!(!roster.join(3, start));
+        assert!(roster.join(1, start), "a reconnection");
+        assert!(roster.join(3, start + JOINING), "who joins and opens no stream gives up the place");
+    }
+
+    #[test]
+    fn who_has_not_joined_is_not_counted_and_memory_is_bounded() {
+        let roster = Arc::new(Roster::new(10));
+        drop((roster.watch(7), roster.wait(7)));
+        assert_eq!(lock(&roster.actors).len(), 0);
+        let start = Instant::now();
+        for incarnation in 0..100 {
+            assert!(roster.join(incarnation, start + (JOINING + REMEMBERED) * incarnation as u32));
+        }
+        assert!(lock(&roster.actors).len() < 3);
+    }
+}

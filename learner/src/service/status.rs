@@ -1,0 +1,52 @@
+//! The state of the learner, as `GetStatus` and `/metrics` tell it.
+
+use std::time::Instant;
+
+use comic_proto::v1;
+
+use super::roster::Census;
+use super::{Shared, lock};
+use crate::telemetry::Sample;
+
+/// What `GetStatus` answers.
+pub(super) fn of(shared: &Shared) -> v1::Status {
+    let books = shared.batcher.books();
+    let Census { alive, slow, lost, waiting } = shared.roster.census(Instant::now());
+    let ages = shared.telemetry.ages();
+    v1::Status {
+        learner_epoch: shared.publisher.epoch(),
+        books: Some(v1::Books {
+            produced: books.produced,
+            trained: books.trained,
+            dropped_stale: books.dropped.stale,
+            dropped_invalid: books.dropped.invalid,
+            dropped_superseded: books.dropped.superseded,
+            dropped_lost_at_restart: books.dropped.lost_at_restart,
+            in_flight: books.in_flight,
+            duplicates: books.duplicates,
+            unattributed: books.unattributed,
+        }),
+        metrics_json: lock(&shared.metrics).clone(),
+        run: shared.run.display().to_string(),
+        experiment: shared.name.clone(),
+        uptime_seconds: shared.since.elapsed().as_secs_f64(),
+        queue: Some(v1::Queue { unrolls: books.in_flight, capacity: shared.capacity, waiting }),
+        ages: Some(v1::Ages { median: ages.median, p99: ages.p99, max: ages.max }),
+        actors: Some(v1::Actors { alive, slow, lost }),
+    }
+}
+
+impl Shared {
+    /// What `/metrics` answers.
+    pub(crate) fn metrics_page(&self) -> String {
+        let Census { alive, slow, lost, waiting } = self.roster.census(Instant::now());
+        self.telemetry.page(&Sample {
+            books: self.batcher.books(),
+            capacity: self.capacity,
+            waiting,
+            actors: [("alive", alive), ("slow", slow), ("lost", lost)],
+            version: self.publisher.newest_version(),
+            epoch: self.publisher.epoch(),
+        })
+    }
+}

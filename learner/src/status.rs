@@ -1,0 +1,202 @@
+//! `comic-learner status`: the state of a running learner, for a person or a script.
+
+use std::fmt::{self, Write as _};
+use std::io::{IsTerminal as _, Write as _};
+use std::time::Duration;
+
+use anyhow::{Context as _, Result};
+use clap::Args;
+use comic_proto::v1::learner_client::LearnerClient;
+use comic_proto::v1::{self, StatusRequest};
+use comic_proto::{Access, chain, distrusted};
+use serde_json::{Value, json};
+use tonic::Code;
+
+use crate::options::Misuse;
+
+/// How often `--watch` asks.
+const EVERY: Duration = Duration::from_secs(2);
+/// A learner that does not answer in this time is not there.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// Prints run, speed, queue, ages, books and actors of a running learner.
+#[derive(Clone, Debug, Args)]
+pub struct Status {
+    /// The learner's address.
+    #[arg(long, value_name = "URL", env = "COMIC_LEARNER", default_value = "http://127.0.0.1:7070")]
+    pub learner: String,
+    /// One JSON object on one line.
+    #[arg(long)]
+    pub json: bool,
+    /// Again every two seconds, on the same screen; a learner that is away is waited for.
+    #[arg(long)]
+    pub watch: bool,
+    /// How to reach it.
+    #[command(flatten)]
+    pub access: Access,
+}
+
+impl Status {
+    /// Asks and prints.
+    ///
+    /// # Errors
+    /// A learner that does not answer; [`Misuse`] if it refuses the token or one side the other's certificate.
+    pub fn run(&self) -> Result<()> {
+        let runtime =
+            tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start tokio")?;
+        runtime.block_on(async {
+            if !self.watch {
+                return print(&self.render(&self.ask().await?));
+            }
+            loop {
+                match self.ask().await {
+                    Ok(status) => self.show(&self.render(&status))?,
+                    Err(error) if error.is::<Misuse>() => return Err(error),
+                    Err(error) => self.show(&format!("{error:#}\n"))?,
+                }
+                tokio::select! {
+                    () = tokio::time::sleep(EVERY) => {}
+                    _ = tokio::signal::ctrl_c() => return Ok(()),
+                }
+            }
+        })
+    }
+
+    async fn ask(&self) -> Result<v1::Status> {
+        let (endpoint, bearer) = (self.access.endpoint(&self.learner)?, self.access.bearer()?);
+        let call = async {
+            let channel = endpoint.connect().await.map_err(|error| self.judge(&error, false))?;
+            let mut client = LearnerClient::with_interceptor(channel, bearer);
+            let answer = client.get_status(StatusRequest {}).await;
+            answer.map_err(|status| self.judge(&status, status.code() == Code::Unauthenticated))
+        };
+        let answer = tokio::time::timeout(PATIENCE, call).await;
+        Ok(answer.with_context(|| format!("{} does not answer within {PATIENCE:?}", self.learner))??.into_inner())
+    }
+
+    /// What is refused now will be refused again.
+    fn judge(&self, error: &(dyn std::error::Error + 'static), refused: bool) -> anyhow::Error {
+        let said = format!("{}: {}", self.learner, chain(error));
+        if refused || distrusted(error) { Misuse::new(said).into() } else { anyhow::Error::msg(said) }
+    }
+
+    fn render(&self, status: &v1::Status) -> String {
+        if self.json { format!("{}\n", to_json(status)) } else { Text(status).to_string() }
+    }
+
+    /// On a terminal the screen is used again; elsewhere one state follows the other.
+    fn show(&self, text: &str) -> Result<()> {
+        let clear = if std::io::stdout().is_terminal() && !self.json { "\x1b[H\x1b[2J" } else { "" };
+        print(&format!("{clear}{text}"))
+    }
+}
+
+fn print(text: &str) -> Result<()> {
+    let mut stdout = std::io::stdout();
+    stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()).context("cannot write to stdout")
+}
+
+fn metrics(status: &v1::Status) -> Value {
+    serde_json::from_str(&status.metrics_json).unwrap_or_default()
+}
+
+fn to_json(status: &v1::Status) -> Value {
+    let books = status.books.unwrap_or_default();
+    let queue = status.queue.unwrap_or_default();
+    let ages = status.ages.unwrap_or_default();
+    let actors = status.actors.unwrap_or_default();
+    json!({
+        "run": status.run,
+        "experiment": status.experiment,
+        "learner_epoch": status.learner_epoch,
+        "uptime_seconds": status.uptime_seconds,
+        "metrics": metrics(status),
+        "queue": { "unrolls": queue.unrolls, "capacity": queue.capacity, "waiting": queue.waiting },
+        "ages": { "median": ages.median, "p99": ages.p99, "max": ages.max },
+        "books": {
+            "produced": books.produced,
+            "trained": books.trained,
+            "dropped": {
+                "stale": books.dropped_stale,
+                "invalid": books.dropped_invalid,
+                "superseded": books.dropped_superseded,
+                "lost_at_restart": books.dropped_lost_at_restart,
+            },
+            "in_flight": books.in_flight,
+            "duplicates": books.duplicates,
+            "unattributed": books.unattributed,
+        },
+        "actors": { "alive": actors.alive, "slow": actors.slow, "lost": actors.lost },
+    })
+}
+
+/// For a person.
+struct Text<'a>(&'a v1::Status);
+
+impl fmt::Display for Text<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let status = self.0;
+        let metrics = metrics(status);
+        let whole = |name: &str| grouped(metrics[name].as_u64().unwrap_or_default());
+        let rate = |name: &str| metrics[name].as_f64().unwrap_or_default();
+        let seconds = status.uptime_seconds as u64;
+        let (hours, minutes, seconds) = (seconds / 3600, seconds / 60 % 60, seconds % 60);
+        writeln!(f, "run       {} ({}), up {hours}:{minutes:02}:{seconds:02}", status.run, status.experiment)?;
+        writeln!(f, "          learner epoch {}, version {}", status.learner_epoch, whole("version"))?;
+        let (updates, steps) = (rate("updates_per_second"), rate("steps_per_second"));
+        writeln!(f, "training  {updates:.2} updates/s, {} environment steps/s", grouped(steps.round() as u64))?;
+        writeln!(f, "          {} updates, {} environment steps", whole("updates"), whole("environment_steps"))?;
+        let queue = status.queue.unwrap_or_default();
+        writeln!(f, "queue     {} of {} unrolls, {} more wait", queue.unrolls, queue.capacity, queue.waiting)?;
+        let ages = status.ages.unwrap_or_default();
+        writeln!(f, "ages      median {}, p99 {}, at most {} versions", ages.median, ages.p99, ages.max)?;
+        let v1::Books { produced, trained, in_flight, duplicates, unattributed, .. } = status.books.unwrap_or_default();
+        let books = status.books.unwrap_or_default();
+        let dropped = [
+            ("stale", books.dropped_stale),
+            ("invalid", books.dropped_invalid),
+            ("superseded", books.dropped_superseded),
+            ("lost at restart", books.dropped_lost_at_restart),
+        ];
+        let sum = grouped(dropped.iter().map(|(_, count)| count).sum());
+        let (produced, trained) = (grouped(produced), grouped(trained));
+        writeln!(f, "books     produced {produced} = trained {trained} + dropped {sum} + in flight {in_flight}")?;
+        let reasons: Vec<_> = dropped.iter().map(|(reason, count)| format!("{reason} {}", grouped(*count))).collect();
+        writeln!(f, "          dropped: {}", reasons.join(", "))?;
+        writeln!(f, "          beside them: duplicates {duplicates}, unattributed {unattributed}")?;
+        let actors = status.actors.unwrap_or_default();
+        writeln!(f, "actors    {} alive, {} slow, {} lost", actors.alive, actors.slow, actors.lost)
+    }
+}
+
+/// `1234567` as `1,234,567`.
+fn grouped(number: u64) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (place, digit) in digits.chars().enumerate() {
+        if place > 0 && (digits.len() - place).is_multiple_of(3) {
+            text.push(',');
+        }
+        // Writing to a string cannot fail.
+        let _ = text.write_char(digit);
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_grouped() {
+        let shown: Vec<_> = [0, 999, 1000, 1_234_567].map(grouped).into();
+        assert_eq!(shown, ["0", "999", "1,000", "1,234,567"]);
+    }
+
+    #[test]
+    fn a_learner_that_has_nothing_to_tell_yet_is_shown() {
+        let text = Text(&v1::Status::default()).to_string();
+        assert!(text.contains("0.00 updates/s") && text.contains("0 alive"), "{text}");
+        assert_eq!(to_json(&v1::Status::default())["books"]["trained"], 0);
+    }
+}

@@ -1,0 +1,100 @@
+//! Each limit refuses what is beyond it, says so, and leaves those inside undisturbed.
+
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+mod service_support;
+
+use std::time::Duration;
+
+use comic_learner::options::Misuse;
+use comic_learner::publish::Publisher;
+use comic_learner::security::{Limits, Security};
+use comic_learner::service::{Setup, Shared};
+use comic_proto::PROTOCOL_VERSION;
+use comic_proto::v1::learner_client::LearnerClient;
+use comic_proto::v1::{EvaluationReport, JoinRequest, StatusRequest, WatchRequest};
+use service_support::{EPOCH, World, within};
+use tonic::Code;
+
+const LIMIT: Duration = Duration::from_secs(10);
+
+#[tokio::test]
+async fn connections_from_one_address() {
+    let world = World::limited(Limits { max_connections_per_address: 2, ..Limits::default() }).await;
+    let (mut first, mut second) = (world.client().await, world.client().await);
+    first.get_status(StatusRequest {}).await.unwrap();
+    second.get_status(StatusRequest {}).await.unwrap();
+    let third = async {
+        let mut client = LearnerClient::connect(world.address.clone()).await?;
+        anyhow::Ok(client.get_status(StatusRequest {}).await?)
+    };
+    assert!(within(LIMIT, third).await.is_err());
+    first.get_status(StatusRequest {}).await.unwrap();
+    drop(second);
+    // The place is free when the server has seen the connection's end.
+    let again = async {
+        loop {
+            if let Ok(mut client) = LearnerClient::connect(world.address.clone()).await
+                && client.get_status(StatusRequest {}).await.is_ok()
+            {
+                break;
+            }
+            tokio::task::yield_now().await;
+        }
+    };
+    within(LIMIT, again).await;
+}
+
+#[tokio::test]
+async fn actors_in_all() {
+    let world = World::limited(Limits { max_actors: 1, ..Limits::default() }).await;
+    let mut first = world.actor(70).await;
+    let mut client = world.client().await;
+    let request = |incarnation| JoinRequest { incarnation, actor: None, protocol: PROTOCOL_VERSION };
+    let refused = client.join(request(71)).await.unwrap_err();
+    assert_eq!(refused.code(), Code::ResourceExhausted, "an actor tries again");
+    assert!(refused.message().contains("--max-actors"), "{refused}");
+    first.client.join(request(70)).await.expect("one that is there comes back");
+    assert_eq!(world.batcher.snapshot().accounts.len(), 1, "no account was opened for the one that was refused");
+}
+
+#[tokio::test]
+async fn calls_in_flight() {
+    let world = World::limited(Limits { max_requests: 2, ..Limits::default() }).await;
+    let mut client = world.client().await;
+    let watch = |mut client: LearnerClient<_>| async move { client.watch_parameters(WatchRequest::default()).await };
+    let first = watch(client.clone()).await.unwrap();
+    let second = watch(client.clone()).await.unwrap();
+    let refused = client.get_status(StatusRequest {}).await.unwrap_err();
+    assert_eq!(refused.code(), Code::ResourceExhausted);
+    drop((first, second));
+    // The places are free when the server has seen the streams' end.
+    within(LIMIT, async { while client.get_status(StatusRequest {}).await.is_err() {} }).await;
+}
+
+#[tokio::test]
+async fn bytes_of_a_message() {
+    let world = World::limited(Limits { max_message_bytes: Some(64 * 1024), ..Limits::default() }).await;
+    let mut client = world.client().await;
+    let report =
+        |bytes| EvaluationReport { learner_epoch: EPOCH, version: 1, json: format!("\"{}\"", "x".repeat(bytes)) };
+    client.report_evaluation(report(60 * 1024)).await.unwrap();
+    assert_eq!(client.report_evaluation(report(64 * 1024)).await.unwrap_err().code(), Code::OutOfRange);
+}
+
+#[tokio::test]
+async fn a_limit_through_which_no_unroll_fits_is_a_wrong_configuration() {
+    let world = World::start().await;
+    let setup = Setup {
+        run: "runs/test".into(),
+        security: Security::default(),
+        limits: Limits { max_message_bytes: Some(10), ..Limits::default() },
+        experiment: world.experiment.clone(),
+        spec: world.spec.clone(),
+        assets: Vec::new(),
+        batcher: world.batcher.clone(),
+        publisher: Publisher::new(EPOCH),
+    };
+    let refused = Shared::new(setup).unwrap_err();
+    assert!(refused.is::<Misuse>() && refused.to_string().contains("--max-message-bytes"), "{refused}");
+}

@@ -1,0 +1,77 @@
+//! Where the learner wants a token, no call gets through without one that it accepts.
+
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+mod service_support;
+
+use std::path::Path;
+
+use comic_learner::security::{Security, Tokens};
+use comic_proto::Access;
+use comic_proto::v1::{JoinRequest, StatusRequest, WatchRequest};
+use service_support::World;
+use tonic::Code;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_client::HealthClient;
+
+async fn world(tokens: &Path) -> World {
+    World::secured(Security { tls: None, tokens: Tokens::new(Some(tokens)).unwrap() }).await
+}
+
+fn access(directory: &Path, token: &str) -> Access {
+    let file = directory.join(token);
+    std::fs::write(&file, token).unwrap();
+    Access { token_file: Some(file), ..Access::default() }
+}
+
+#[tokio::test]
+async fn every_call_is_refused_without_a_token_and_with_another() {
+    let directory = tempfile::tempdir().unwrap();
+    let accepted = directory.path().join("accepted");
+    std::fs::write(&accepted, "open-sesame").unwrap();
+    let world = world(&accepted).await;
+    for shown in [Access::default(), access(directory.path(), "open-simsim")] {
+        let mut client = world.client_with(&shown).await.unwrap();
+        let refusals = [
+            client.join(JoinRequest::default()).await.unwrap_err(),
+            client.get_status(StatusRequest {}).await.unwrap_err(),
+            client.watch_parameters(WatchRequest::default()).await.unwrap_err(),
+            client.send_unrolls(futures::stream::empty()).await.unwrap_err(),
+        ];
+        for refused in refusals {
+            assert_eq!(refused.code(), Code::Unauthenticated);
+            assert!(!refused.message().contains("sesame"), "{refused}");
+        }
+    }
+    let mut client = world.client_with(&access(directory.path(), "open-sesame")).await.unwrap();
+    client.get_status(StatusRequest {}).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_renewed_token_counts_without_a_restart() {
+    let directory = tempfile::tempdir().unwrap();
+    let accepted = directory.path().join("accepted");
+    std::fs::write(&accepted, "first").unwrap();
+    let world = world(&accepted).await;
+    let mut first = world.client_with(&access(directory.path(), "first")).await.unwrap();
+    let mut second = world.client_with(&access(directory.path(), "second")).await.unwrap();
+    assert!(first.get_status(StatusRequest {}).await.is_ok());
+    assert!(second.get_status(StatusRequest {}).await.is_err());
+    std::fs::write(&accepted, "first\nsecond").unwrap();
+    assert!(first.get_status(StatusRequest {}).await.is_ok());
+    assert!(second.get_status(StatusRequest {}).await.is_ok());
+    std::fs::write(&accepted, "second").unwrap();
+    assert!(first.get_status(StatusRequest {}).await.is_err());
+}
+
+#[tokio::test]
+async fn the_health_check_needs_none() {
+    let directory = tempfile::tempdir().unwrap();
+    let accepted = directory.path().join("accepted");
+    std::fs::write(&accepted, "open-sesame").unwrap();
+    let world = world(&accepted).await;
+    let mut health = HealthClient::new(world.channel().await);
+    let request = || HealthCheckRequest { service: "comic.v1.Learner".into() };
+    health.check(request()).await.unwrap();
+    assert_eq!(health.watch(request()).await.unwrap_err().code(), Code::Unauthenticated, "a stream takes a place");
+}

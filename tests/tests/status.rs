@@ -1,0 +1,73 @@
+//! `comic-learner status` and `comic-learner health` against a learner with TLS and tokens, and its metrics over HTTP.
+
+use std::fs;
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
+use std::time::Duration;
+
+use anyhow::{Context, Result, ensure};
+use comic_tests::certificates::Authority;
+use comic_tests::system::{SMALL, System};
+use serde_json::Value;
+
+const LIMIT: Duration = Duration::from_secs(120);
+
+#[tokio::test]
+async fn a_running_learner_is_asked_how_it_is() -> Result<()> {
+    let authority = Authority::new()?;
+    authority.issue("server", 60)?;
+    let token = authority.path("token");
+    fs::write(&token, "open-sesame")?;
+    let mut options = authority.serving();
+    options.extend(["--token-file".into(), token.display().to_string(), "--metrics-port".into(), "0".into()]);
+    let options: Vec<&str> = SMALL.into_iter().chain(options.iter().map(String::as_str)).collect();
+    let mut system = System::new(&options)?;
+    system.access = authority.access(None);
+    system.access.token_file = Some(token);
+    system.start_learner(LIMIT).await?;
+    let _actor = system.start_actor()?;
+    system
+        .until("an update", LIMIT, |status| {
+            (status.books?.trained > 0 && status.metrics_json.contains("updates")).then_some(())
+        })
+        .await?;
+
+    let answer = system.ask(&["status", "--json"])?;
+    let status: Value =
+        serde_json::from_slice(&answer.stdout).context(String::from_utf8_lossy(&answer.stderr).into_owned())?;
+    ensure!(status["actors"]["alive"] == 1 && status["queue"]["capacity"].as_u64() > Some(0), "{status}");
+    ensure!(status["books"]["trained"].as_u64() > Some(0), "{status}");
+    ensure!(status["metrics"]["updates"].as_u64() > Some(0), "{status}");
+    let answer = system.ask(&["status"])?;
+    let text = String::from_utf8_lossy(&answer.stdout);
+    for word in ["run ", "updates/s", "environment steps/s", "queue ", "ages ", "books ", "1 alive"] {
+        ensure!(text.contains(word), "no `{word}` in {text}");
+    }
+    ensure!(system.ask(&["health"])?.status.code() == Some(0), "it serves");
+    let page = metrics(&system)?;
+    ensure!(
+        page.contains("comic_actors{state=\"alive\"} 1\n") && page.contains("comic_update_seconds_count"),
+        "{page}"
+    );
+
+    let token = system.access.token_file.take();
+    ensure!(system.ask(&["health"])?.status.code() == Some(0), "whether it serves is no secret");
+    ensure!(system.ask(&["status"])?.status.code() == Some(2), "the token is missing, and will be the next time");
+    system.access.token_file = token;
+    system.learner.take().context("no learner")?.kill()?;
+    ensure!(system.ask(&["health"])?.status.code() == Some(1), "it does not serve");
+    ensure!(system.ask(&["status"])?.status.code() == Some(1), "it may serve again");
+    Ok(())
+}
+
+/// The page at the address that the learner prints when it serves.
+fn metrics(system: &System) -> Result<String> {
+    let log = system.learner.as_ref().context("no learner")?.log();
+    let mut lines = log.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+    let address = lines.find_map(|line| Some(line["metrics"].as_str()?.to_owned())).context("no address")?;
+    let mut stream = TcpStream::connect(address)?;
+    stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: learner\r\n\r\n")?;
+    let mut page = String::new();
+    stream.read_to_string(&mut page)?;
+    Ok(page)
+}

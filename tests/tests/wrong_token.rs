@@ -1,0 +1,42 @@
+//! An actor with a wrong token ends at first contact, with the exit code that says: do not try again. One that was let in
+//! before waits for the renewed token.
+
+use std::fs;
+use std::time::Duration;
+
+use anyhow::{Context, Result, ensure};
+use comic_proto::Access;
+use comic_tests::system::{SMALL, System};
+
+const LIMIT: Duration = Duration::from_secs(120);
+
+#[tokio::test]
+async fn a_wrong_token_ends_an_actor_unless_it_was_let_in_before() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let [accepted, shown, wrong] = ["accepted", "shown", "wrong"].map(|name| directory.path().join(name));
+    fs::write(&accepted, "first-token\n")?;
+    fs::write(&shown, "first-token\n")?;
+    fs::write(&wrong, "wrong-token\n")?;
+    let accepted_path = accepted.display().to_string();
+    let mut system = System::new(&[&SMALL[..], &["--token-file", &accepted_path]].concat())?;
+    system.access = Access { token_file: Some(shown.clone()), ..Access::default() };
+    system.start_learner(LIMIT).await?;
+
+    for access in [Access { token_file: Some(wrong), ..Access::default() }, Access::default()] {
+        let mut refused = system.start_actor_with(&access, |_| {})?;
+        let status = refused.until_it_ends(LIMIT).await?;
+        ensure!(status.code() == Some(2), "{status}: {}", refused.log());
+        ensure!(refused.log().contains("--token-file"), "the remedy is not named: {}", refused.log());
+    }
+
+    let mut actor = system.start_actor()?;
+    actor.until_log_holds("joined the learner", LIMIT).await?;
+    // The learner's token changes, and the actor's not yet.
+    fs::write(&accepted, "second-token\n")?;
+    system.access = Access { token_file: Some(accepted), ..Access::default() };
+    system.learner.take().context("no learner")?.kill()?;
+    let restarted = system.start_learner(LIMIT).await?;
+    actor.until_log_holds("another token", LIMIT).await?;
+    fs::write(&shown, "second-token\n")?;
+    actor.until_log_holds(&format!("learner_epoch={}", restarted.learner_epoch), LIMIT).await
+}
