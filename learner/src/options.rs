@@ -129,7 +129,7 @@ Logs go to standard error; RUST_LOG chooses what (default: info).";
 /// A configuration that is wrong and stays wrong, however often it is tried: exit code 2.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
-pub struct Misuse(String);
+pub struct Misuse(pub(crate) String);
 
 impl Misuse {
     /// What is wrong, and the remedy.

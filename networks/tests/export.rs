@@ -44,7 +44,7 @@ fn policy(experiment: &Experiment) -> (nn::VarStore, Policy, TaskSpec) {
     for (name, tensor) in store.variables().into_iter().collect::<BTreeMap<_, _>>() {
         let mut noise = tensor.detach().rand_like() * 0.5 - 0.25;
         if name.ends_with("_std") {
-            noise = &noise + 1.0;
+            noise += 1.0;
         }
         tch::no_grad(|| tensor.shallow_clone().copy_(&noise));
     }

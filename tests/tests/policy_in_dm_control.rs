@@ -25,14 +25,14 @@ fn succeeds(command: &mut Command) -> Result<Output> {
     Ok(output)
 }
 
-/// A run that learnt a little, and has ended.
-async fn learnt(low_level: &str) -> Result<System> {
+/// A run that learnt for so many updates, and has ended.
+async fn learnt(low_level: &str, updates: f64) -> Result<System> {
     let low_level = format!("network.low_level={low_level}");
     let sizes = ["--set", "network.lstm.units=[32]", "--set", &low_level];
     let mut system = System::new(&[&SMALL[..], &sizes].concat())?;
     system.start_learner(LIMIT).await?;
     let actor = system.start_actor()?;
-    system.until("a little is learnt", LIMIT, |status| (metric(status, "updates") >= UPDATES).then_some(())).await?;
+    system.until("a little is learnt", LIMIT, |status| (metric(status, "updates") >= updates).then_some(())).await?;
     drop(actor);
     let status = system.learner.take().context("no learner")?.terminate(LIMIT).await?;
     ensure!(status.success(), "the learner leaves with {status}");
@@ -66,7 +66,7 @@ fn rewards(lines: &str) -> Result<Vec<(String, Vec<f64>)>> {
 #[tokio::test]
 async fn dm_control_pays_an_exported_policy_what_we_pay_it() -> Result<()> {
     for low_level in ["mlp", "lstm"] {
-        let system = learnt(low_level).await?;
+        let system = learnt(low_level, UPDATES).await?;
         let directory = tempfile::tempdir()?;
         let file = |name: &str| -> PathBuf { directory.path().join(name) };
         let (whole, script, clips, ours) =
@@ -102,7 +102,7 @@ async fn dm_control_pays_an_exported_policy_what_we_pay_it() -> Result<()> {
 
 #[tokio::test]
 async fn what_is_no_policy_is_refused_with_its_remedy() -> Result<()> {
-    let system = learnt("mlp").await?;
+    let system = learnt("mlp", 0.0).await?;
     let directory = tempfile::tempdir()?;
     let low_level = directory.path().join("low-level.safetensors");
     export(&system.run(), "low-level", &low_level)?;
