@@ -2,8 +2,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
 
 use comic_experiment::{
-    ClipSource, Difference, Error, Experiment, InitialPose, LowLevelName, Prior, TRACKING_OBSERVATIONS,
-    TerminationError, find_field, presets, resolve,
+    ClipSource, Error, Experiment, InitialPose, LowLevelName, Prior, TRACKING_OBSERVATIONS, TerminationError, presets,
+    resolve,
 };
 use proptest::prelude::*;
 
@@ -289,49 +289,6 @@ fn an_override_of_the_wrong_type_names_itself_and_the_field() {
     assert!(message.starts_with("--set unroll.length=1.5: invalid type: floating point"), "{message}");
     let message = refused("name.first=x");
     assert!(message.starts_with("--set name.first=x: invalid type: map"), "{message}");
-}
-
-// Names and differences
-
-#[test]
-fn a_field_is_known_by_the_end_of_its_name_where_no_other_ends_like_it() {
-    for (name, field) in [
-        ("network.latent.beta", "network.latent.beta"),
-        ("latent.beta", "network.latent.beta"),
-        ("beta", "network.latent.beta"),
-        ("clips.0.weight", "clips.0.weight"),
-        ("latent.initial_std", "network.latent.initial_std"),
-    ] {
-        assert_eq!(find_field("sweep.toml", name).unwrap(), field);
-    }
-}
-
-#[test]
-fn the_end_of_several_names_is_refused_with_all_of_them() {
-    assert_eq!(
-        find_field("sweep.toml", "initial_std").unwrap_err().to_string(),
-        "sweep.toml: `initial_std` could be `network.initial_std` or `network.latent.initial_std`: write one of them"
-    );
-}
-
-#[test]
-fn the_end_of_no_name_is_refused_with_the_nearest() {
-    for (name, nearest) in [("latent.bata", "network.latent.beta"), ("epsilon_etaa", "vmpo.epsilon_eta")] {
-        assert_eq!(
-            find_field("sweep.toml", name).unwrap_err().to_string(),
-            format!("sweep.toml: unknown field `{name}`; did you mean `{nearest}`?")
-        );
-    }
-}
-
-#[test]
-fn experiments_differ_by_name_and_both_values() {
-    let [ours, theirs] = ["1e-3", "0.5"].map(|beta| set(&[&format!("network.latent.beta={beta}")]).unwrap());
-    assert_eq!(ours.differences(&ours).unwrap(), []);
-    let expected = Difference { field: "network.latent.beta".into(), ours: "0.001".into(), theirs: "0.5".into() };
-    assert_eq!(ours.differences(&theirs).unwrap(), [expected]);
-    let theirs = ours.clone().with_clips(&["builtin:run".into()]);
-    assert_eq!(ours.differences(&theirs).unwrap()[0].field, "clips");
 }
 
 // Values
