@@ -29,7 +29,8 @@ const ENVIRONMENTS: usize = 16;
 /// `ratio` is always value / floor. `actor.env`, `actor.policy`: steps/s, resets included, against the same controls
 /// through the physics alone. `actor.threads`: steps/s of two threads against one. `actor.reset`: ms. `actor.wire`: ms
 /// of one core that an update's worth of unrolls costs between a worker and a batch, against one second.
-/// `actor.vision`: ms an image. `actor.memory`: MiB held after 10,000 resets against those after 1,000.
+/// `actor.vision`: ms an image. `actor.memory`: MiB held after 10,000 resets against those after 1,000, and
+/// `actor.memory.reset` what one of the last thousand cost against one of the first.
 #[derive(Args, Clone, Debug)]
 pub struct Bench {
     /// Seconds for each figure.
@@ -90,16 +91,18 @@ impl Bench {
             figures => figures.contains(name),
         };
         for name in Name::value_variants().iter().filter(wanted) {
-            let figure = match name {
-                Name::Env => physics::environment(&subject)?,
-                Name::Policy => acting::policy(&subject)?,
-                Name::Threads => acting::threads(&subject)?,
-                Name::Reset => physics::reset(&subject)?,
-                Name::Wire => wire::wire(&subject)?,
-                Name::Vision => vision::vision(&subject)?,
-                Name::Memory => memory::memory(&subject)?,
+            let figures = match name {
+                Name::Env => vec![physics::environment(&subject)?],
+                Name::Policy => vec![acting::policy(&subject)?],
+                Name::Threads => vec![acting::threads(&subject)?],
+                Name::Reset => vec![physics::reset(&subject)?],
+                Name::Wire => vec![wire::wire(&subject)?],
+                Name::Vision => vec![vision::vision(&subject)?],
+                Name::Memory => memory::memory(&subject)?.into(),
             };
-            figure.of(self.low_level).print()?;
+            for figure in figures {
+                figure.of(self.low_level).print()?;
+            }
         }
         Ok(())
     }

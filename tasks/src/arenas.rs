@@ -37,7 +37,10 @@ fn set_sizes(spec: &mut MjSpec) {
 }
 
 /// Puts the humanoid into an arena, free to move: what `composer.Entity.attach` and `add_free_entity` do.
-pub(crate) fn attach(arena: &mut MjSpec, walker: &mut MjSpec) -> Result<(), Error> {
+pub(crate) fn attach(arena: &mut MjSpec, walker: &MjSpec) -> Result<(), Error> {
+    // MuJoCo wraps what it attaches in one more frame, in the original too: only a copy of it keeps a humanoid that is
+    // attached thousands of times as flat as it was.
+    let mut walker = walker.try_clone().map_err(refused("copying the humanoid"))?;
     // In dm_control the arena's compiler settings (`composer/arena.xml`) hold for everything; in MuJoCo elements keep
     // those they came with, so the humanoid gets the arena's.
     let settings = arena.compiler();
@@ -48,5 +51,5 @@ pub(crate) fn attach(arena: &mut MjSpec, walker: &mut MjSpec) -> Result<(), Erro
     let place = arena.world_body_mut().add_body();
     place.set_name(PREFIX).map_err(refused("adding the humanoid's place"))?;
     place.add_free_joint().set_name(PREFIX).map_err(refused("freeing the humanoid"))?;
-    place.attach_by_deep_copy(walker, PREFIX, "").map_err(refused("putting the humanoid into its arena"))
+    place.attach_by_deep_copy(&mut walker, PREFIX, "").map_err(refused("putting the humanoid into its arena"))
 }

@@ -31,7 +31,7 @@ pub const END_EFFECTORS: [&str; 4] = ["rradius", "lradius", "rfoot", "lfoot"];
 pub fn build(model: WalkerModel) -> Result<MjModel, Error> {
     silence::install();
     let directory = assets::directory()?;
-    compile(&mut body::humanoid(&directory, model)?, arenas::floor::floor(&directory)?, |_| Ok(()))
+    compile(&body::humanoid(&directory, model)?, arenas::floor::floor(&directory)?, |_| Ok(()))
 }
 
 thread_local! {
@@ -63,7 +63,7 @@ pub(crate) fn build_with(
 }
 
 fn compile(
-    humanoid: &mut MjSpec,
+    humanoid: &MjSpec,
     mut arena: MjSpec,
     add: impl FnOnce(&mut MjSpec) -> Result<(), Error>,
 ) -> Result<MjModel, Error> {

@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::sync::Arc;
+use std::time::Instant;
 
 use comic_clips::Catalogue;
 
@@ -16,21 +17,26 @@ const RESETS: usize = 10_000;
 
 /// The process's resident memory after many resets, against that after a tenth of them. Corridors are drawn and compiled
 /// at every one.
-pub(super) fn memory(subject: &Subject) -> Result<Figure, Error> {
+pub(super) fn memory(subject: &Subject) -> Result<[Figure; 2], Error> {
     let mut experiment = subject.experiment.clone();
     experiment.gaps.corridor.arena_steps = 0;
     experiment.walls.corridor.arena_steps = 0;
     let task = comic_tasks::build(&experiment, &Catalogue::open(&experiment.clips)?)?;
     let mut environment = Arc::clone(&task).environment(1)?;
-    for _ in 0..WARM {
-        environment.reset();
-    }
+    let mut milliseconds = |resets: usize| {
+        let begun = Instant::now();
+        (0..resets).for_each(|_| environment.reset());
+        begun.elapsed().as_secs_f64() * 1000.0 / resets as f64
+    };
+    let first = milliseconds(WARM);
     let floor = resident()?;
-    for _ in WARM..RESETS {
-        environment.reset();
-    }
+    let _ = milliseconds(RESETS - 2 * WARM);
+    let last = milliseconds(WARM);
     let note = "resident memory after 10,000 resets, arenas compiled at each; floor: after 1,000";
-    Ok(Figure::new("actor.memory", "MiB", Medians { value: resident()?, floor }, note))
+    let memory = Figure::new("actor.memory", "MiB", Medians { value: resident()?, floor }, note);
+    // What is held need not be much to be walked through at every reset.
+    let note = "a reset of the last thousand, its arena compiled; floor: of the first thousand";
+    Ok([memory, Figure::new("actor.memory.reset", "ms", Medians { value: last, floor: first }, note)])
 }
 
 /// Resident memory, MiB.
