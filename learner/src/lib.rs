@@ -11,7 +11,7 @@
 //! - [`metrics`] is what a person sees of learning, [`telemetry`] what Prometheus sees of the service, by way of [`probes`].
 //! - [`security`] is who may talk to it; [`certs`] makes certificates for trying that out.
 //! - [`status`] and [`health`] are commands that ask another learner how it is.
-//! - [`sizes`] counts parameters.
+//! - [`sizes`] counts parameters, [`bench`] times the update, [`load`] the service.
 //!
 //! There is no MuJoCo here: whatever needs a simulator is done by actors.
 
@@ -21,6 +21,7 @@ pub mod certs;
 pub mod checkpoint;
 pub mod export;
 pub mod health;
+pub mod load;
 pub mod metrics;
 pub mod options;
 pub mod probes;

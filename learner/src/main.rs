@@ -31,6 +31,7 @@ fn main() -> ExitCode {
         Some(Command::Status(status)) => status.run(),
         Some(Command::Health(health)) => return health.run(),
         Some(Command::Certs(certs)) => certs.run(),
+        Some(Command::Load(load)) => load.run(),
         Some(Command::Metrics) => comic_learner::telemetry::print_reference(),
         None => comic_learner::run::run(&options),
     };

@@ -9,6 +9,7 @@ use comic_networks::export::Part;
 
 use crate::certs::Certs;
 use crate::health::Health;
+use crate::load::Load;
 use crate::security::{Limits, SecurityOptions};
 use crate::status::Status;
 
@@ -55,7 +56,7 @@ pub struct Options {
 /// The experiment and what changes it.
 #[derive(Clone, Debug, Args)]
 pub struct Document {
-    /// A preset's name (quickstart, quickstart-from-zero, tracking-mlp) or the path of an experiment file.
+    /// A preset's name, as README lists them, or the path of an experiment file.
     #[arg(long, value_name = "NAME|FILE", default_value = "tracking-mlp", global = true)]
     pub preset: String,
     /// Clips to track instead of the experiment's: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP.
@@ -101,6 +102,8 @@ pub enum Command {
     Health(Health),
     /// Make a development authority, and certificates for a learner and its actors.
     Certs(Certs),
+    /// Measure what the service carries under many actors that are not real.
+    Load(Load),
     /// Print what each metric means, as docs/metrics.md has it.
     Metrics,
     /// Time the update against its bare matrix products; one JSON line per figure.

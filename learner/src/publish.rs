@@ -1,44 +1,72 @@
-//! Parameters down to the actors: always the newest version, one copy in memory for all who read it.
+//! Parameters down to the actors: always the newest version, encoded once and one copy in memory for all who read it.
+//!
+//! An actor that reads on finishes the version it began, however many come meanwhile: if it started over with each of
+//! them, a slow one would never have any. An actor that stalls must not keep its version alive. So a few versions are
+//! *held* for their readers, readers themselves hold nothing, and the place of a version nobody gets on with is given to
+//! a newer one when it is needed.
 
-use std::collections::VecDeque;
 use std::fmt;
-use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use comic_proto::frame;
 use comic_proto::v1::{Behaviour, ParametersChunk};
-use tokio::sync::watch;
+use tokio::sync::{Notify, watch};
 
-/// Bytes of a piece. Measured with 1000 readers: 64 KiB pieces are the fastest, and a stalled reader holds one.
-const CHUNK: usize = 64 * 1024;
-/// Versions kept for readers in the middle of them. One that falls further behind starts over with the newest, so
-/// memory is bounded however many readers stall.
-const KEPT: usize = 8;
+/// Bytes of parameters in a piece. Each piece is memory of its own, so a reader that stalls for ever holds one or two
+/// pieces and never the version they are of.
+pub(crate) const PIECE: usize = 32 * 1024;
 
-/// One version of the parameters, as actors get it.
-#[derive(Clone, Debug)]
+/// How many versions are held for their readers, and how long.
+#[derive(Clone, Copy, Debug)]
+pub struct Holding {
+    /// Versions that readers can be in the middle of. With the newest one, and one that is just being made, they are the
+    /// memory that parameters take, however many read.
+    pub versions: usize,
+    /// A version of which nobody took a piece for so long gives its place to a newer one.
+    pub idle: Duration,
+    /// A version that was begun so long ago gives its place to a newer one, though somebody still reads it.
+    pub longest: Duration,
+}
+
+impl Default for Holding {
+    fn default() -> Self {
+        Self { versions: 6, idle: Duration::from_secs(2), longest: Duration::from_secs(60) }
+    }
+}
+
+/// One version of the parameters, encoded once for everybody.
+#[derive(Debug)]
 pub struct Published {
-    /// The life of the learner that made it.
-    pub epoch: u64,
     /// Counts publications.
     pub version: u64,
     /// How actors act with it.
     pub behaviour: Behaviour,
-    /// The policy's parameters, safetensors.
-    pub payload: Bytes,
+    /// Grows with every publication, of the same version again too.
+    serial: u64,
+    /// Every [`ParametersChunk`] as gRPC sends it, at least one.
+    frames: Vec<Bytes>,
+    /// Who is in the middle of it.
+    readers: AtomicUsize,
 }
 
 impl Published {
-    /// The piece that starts at `offset`; every payload has one at 0, an empty payload too.
-    fn chunk(&self, offset: usize) -> ParametersChunk {
-        let end = offset.saturating_add(CHUNK).min(self.payload.len());
-        ParametersChunk {
-            learner_epoch: self.epoch,
-            version: self.version,
-            behaviour: self.behaviour.into(),
-            total: self.payload.len() as u64,
-            offset: offset as u64,
-            data: self.payload.slice(offset.min(end)..end),
-        }
+    fn new(learner_epoch: u64, version: u64, behaviour: Behaviour, serial: u64, payload: &Bytes) -> Self {
+        // An empty payload has a piece too: it says how to act.
+        let offsets = (0..payload.len().max(1)).step_by(PIECE);
+        let frames = offsets.map(|offset| {
+            frame(&ParametersChunk {
+                learner_epoch,
+                version,
+                behaviour: behaviour.into(),
+                total: payload.len() as u64,
+                offset: offset as u64,
+                data: payload.slice(offset..payload.len().min(offset + PIECE)),
+            })
+        });
+        Self { version, behaviour, serial, frames: frames.collect(), readers: AtomicUsize::new(0) }
     }
 }
 
@@ -50,32 +78,50 @@ pub struct Publisher {
 
 struct Inner {
     epoch: u64,
+    holding: Holding,
     newest: watch::Sender<Option<Arc<Published>>>,
-    kept: Mutex<VecDeque<Arc<Published>>>,
+    held: Mutex<Vec<Held>>,
+    /// A place among the held is free.
+    freed: Notify,
+}
+
+/// A version that somebody reads.
+struct Held {
+    published: Arc<Published>,
+    begun: Instant,
+    /// When the last piece of it was taken.
+    touched: Instant,
+}
+
+impl Inner {
+    fn held(&self) -> MutexGuard<'_, Vec<Held>> {
+        // Nothing panics while it holds this lock.
+        self.held.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 impl Publisher {
     /// A publisher that has published nothing yet, in this life of the learner.
     pub fn new(epoch: u64) -> Self {
-        let inner = Inner { epoch, newest: watch::Sender::new(None), kept: Mutex::new(VecDeque::new()) };
-        Self { inner: Arc::new(inner) }
+        Self::holding(epoch, Holding::default())
+    }
+
+    /// One that holds versions otherwise than by default.
+    pub fn holding(epoch: u64, holding: Holding) -> Self {
+        let (newest, held) = (watch::Sender::new(None), Mutex::default());
+        Self { inner: Arc::new(Inner { epoch, holding, newest, held, freed: Notify::new() }) }
     }
 
     /// Makes this the newest version; nobody waits for anybody. Versions grow, except that the same version may come
     /// again with another behaviour ([`Behaviour::Leave`] at the end); an older one is refused with an error in the log.
-    pub fn publish(&self, version: u64, behaviour: Behaviour, payload: Bytes) {
-        let published = Arc::new(Published { epoch: self.inner.epoch, version, behaviour, payload });
-        let mut kept = self.inner.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        let newest = self.newest_version();
+    pub fn publish(&self, version: u64, behaviour: Behaviour, payload: &Bytes) {
+        let (newest, serial) = self.newest().map_or((0, 0), |published| (published.version, published.serial));
         if version < newest {
             tracing::error!(version, newest, "an older version is not published");
             return;
         }
-        if kept.len() == KEPT {
-            kept.pop_front();
-        }
-        kept.push_back(published.clone());
-        self.inner.newest.send_replace(Some(published));
+        let published = Published::new(self.inner.epoch, version, behaviour, serial + 1, payload);
+        self.inner.newest.send_replace(Some(Arc::new(published)));
     }
 
     /// The newest version; 0 before the first.
@@ -88,6 +134,11 @@ impl Publisher {
         self.inner.newest.borrow().clone()
     }
 
+    /// Versions that are in memory because somebody reads them, or began to.
+    pub fn held(&self) -> usize {
+        self.inner.held().len()
+    }
+
     /// The life of the learner it belongs to.
     pub fn epoch(&self) -> u64 {
         self.inner.epoch
@@ -95,9 +146,8 @@ impl Publisher {
 
     /// A reader that begins with the newest version.
     pub fn subscribe(&self) -> Subscription {
-        let mut newest = self.inner.newest.subscribe();
-        newest.mark_changed();
-        Subscription { newest, reading: None, left: false }
+        let newest = self.inner.newest.subscribe();
+        Subscription { inner: Arc::clone(&self.inner), newest, finished: 0, reading: None, left: false }
     }
 }
 
@@ -108,63 +158,142 @@ impl fmt::Debug for Publisher {
     }
 }
 
+/// A piece of a version, ready to be sent.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Piece {
+    /// The version it is of.
+    pub version: u64,
+    /// A [`ParametersChunk`], length-prefixed as gRPC sends it.
+    pub frame: Bytes,
+}
+
 /// One actor's view of the parameters, in pieces. The versions that came and went while it read are skipped.
-#[derive(Debug)]
 pub struct Subscription {
+    inner: Arc<Inner>,
     newest: watch::Receiver<Option<Arc<Published>>>,
-    /// The version being read and where its next piece starts. Weak, so that a stalled reader keeps nothing alive.
-    reading: Option<(Weak<Published>, usize)>,
+    /// The last publication it read to its end.
+    finished: u64,
+    reading: Option<Reading>,
     left: bool,
+}
+
+/// A version being read, counted among its readers.
+struct Reading {
+    inner: Arc<Inner>,
+    /// Weak, so that a stalled reader keeps nothing alive.
+    published: Weak<Published>,
+    /// Of its next piece.
+    index: usize,
+}
+
+impl Drop for Reading {
+    fn drop(&mut self) {
+        let Some(published) = self.published.upgrade() else { return };
+        if published.readers.fetch_sub(1, Ordering::AcqRel) == 1 {
+            self.inner.held().retain(|held| held.published.readers.load(Ordering::Acquire) > 0);
+            self.inner.freed.notify_waiters();
+        }
+    }
+}
+
+/// Whether a reader could begin.
+enum Begun {
+    Yes,
+    NothingNew,
+    NoRoom,
 }
 
 impl Subscription {
     /// The next piece: the rest of a version begun, then the newest one not seen yet, waiting for it if need be.
     /// `None` after the last piece of a [`Behaviour::Leave`], or when there is no publisher any more. Cancel-safe.
-    pub async fn next(&mut self) -> Option<ParametersChunk> {
+    pub async fn next(&mut self) -> Option<Piece> {
         loop {
-            if let Some(chunk) = self.piece() {
-                return Some(chunk);
+            if let Some(piece) = self.piece() {
+                return Some(piece);
             }
             if self.left {
                 return None;
             }
-            self.newest.changed().await.ok()?;
-            self.begin_newest();
+            let inner = Arc::clone(&self.inner);
+            // From here on, before looking: a place that becomes free in between is not missed.
+            let freed = inner.freed.notified();
+            match self.begin() {
+                Begun::Yes => {}
+                Begun::NothingNew => self.newest.changed().await.ok()?,
+                Begun::NoRoom => tokio::select! {
+                    () = freed => {}
+                    () = tokio::time::sleep(inner.holding.idle) => {}
+                },
+            }
         }
     }
 
     /// The next piece of [`Behaviour::Leave`], if that is what was published last: what is still worth sending when
     /// the server closes.
-    pub fn farewell(&mut self) -> Option<ParametersChunk> {
+    pub fn farewell(&mut self) -> Option<Piece> {
         let leaving = |published: &Arc<Published>| published.behaviour == Behaviour::Leave;
         if !self.newest.borrow().as_ref().is_some_and(leaving) {
             return None;
         }
-        if self.newest.has_changed().unwrap_or(false) {
-            self.begin_newest();
-        }
+        self.begin();
         self.piece()
     }
 
-    fn begin_newest(&mut self) {
-        let newest = self.newest.borrow_and_update();
-        self.reading = newest.as_ref().map(|published| (Arc::downgrade(published), 0));
+    /// Begins the newest version if there is room to hold it, or else the newest that is held already.
+    fn begin(&mut self) -> Begun {
+        let Some(newest) = self.newest.borrow_and_update().clone() else { return Begun::NothingNew };
+        if newest.serial == self.finished {
+            return Begun::NothingNew;
+        }
+        let (now, holding) = (Instant::now(), self.inner.holding);
+        let mut held = self.inner.held();
+        if held.iter().all(|held| held.published.serial != newest.serial) {
+            // The last word is one piece, and heard by everybody.
+            let small = newest.frames.len() == 1;
+            let given_up = |held: &Held| {
+                now.duration_since(held.touched) >= holding.idle || now.duration_since(held.begun) >= holding.longest
+            };
+            if held.len() >= holding.versions
+                && let Some(place) = held.iter().position(given_up)
+            {
+                held.remove(place);
+            }
+            if held.len() < holding.versions || small {
+                held.push(Held { published: newest, begun: now, touched: now });
+            }
+        }
+        let unseen = held.iter_mut().filter(|held| held.published.serial > self.finished);
+        let Some(best) = unseen.max_by_key(|held| held.published.serial) else { return Begun::NoRoom };
+        // Under the lock: it is let go of when its last reader is done.
+        best.published.readers.fetch_add(1, Ordering::AcqRel);
+        let published = Arc::downgrade(&best.published);
+        drop(held);
+        self.reading = Some(Reading { inner: Arc::clone(&self.inner), published, index: 0 });
+        Begun::Yes
     }
 
-    fn piece(&mut self) -> Option<ParametersChunk> {
-        let (reading, offset) = self.reading.take()?;
-        let Some(published) = reading.upgrade() else {
-            // Too far behind: this version is gone, and there is a newer one.
-            self.begin_newest();
-            return self.piece();
+    fn piece(&mut self) -> Option<Piece> {
+        let reading = self.reading.as_mut()?;
+        let Some(published) = reading.published.upgrade() else {
+            // It stalled, and its version had to make room.
+            self.reading = None;
+            return None;
         };
-        let chunk = published.chunk(offset);
-        let next = offset + chunk.data.len();
-        if next < published.payload.len() {
-            self.reading = Some((reading, next));
-        } else {
+        let frame = published.frames.get(reading.index)?.clone();
+        reading.index += 1;
+        if reading.index == published.frames.len() {
+            self.reading = None;
+            self.finished = published.serial;
             self.left = published.behaviour == Behaviour::Leave;
+        } else if let Some(held) = self.inner.held().iter_mut().find(|held| held.published.serial == published.serial) {
+            held.touched = Instant::now();
         }
-        Some(chunk)
+        Some(Piece { version: published.version, frame })
+    }
+}
+
+impl fmt::Debug for Subscription {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.debug_struct("Subscription").field("finished", &self.finished).finish_non_exhaustive()
     }
 }

@@ -15,6 +15,7 @@ use comic_proto::{UnrollLayout, UnrollShape};
 use comic_replay::{Batcher, Config, Ledger, Phase};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
+use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
 
@@ -41,13 +42,17 @@ pub fn run(options: &Options) -> Result<()> {
         return std::io::stdout().write_all(experiment.to_toml()?.as_bytes()).context("cannot write to stdout");
     }
     tch::set_num_threads(experiment.learner.threads as i32);
+    service_runtime()?.block_on(live(options, experiment))
+}
+
+/// The threads that serve.
+pub(crate) fn service_runtime() -> Result<Runtime> {
     let workers = std::thread::available_parallelism().map_or(2, usize::from).clamp(1, 4);
     tokio::runtime::Builder::new_multi_thread()
         .worker_threads(workers)
         .enable_all()
         .build()
-        .context("cannot start tokio")?
-        .block_on(live(options, experiment))
+        .context("cannot start tokio")
 }
 
 async fn live(options: &Options, experiment: Experiment) -> Result<()> {
@@ -101,7 +106,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     if let Ok(Ok(Ending::Budget)) = &ending
         && let Some(newest) = publisher.newest()
     {
-        publisher.publish(newest.version, Behaviour::Leave, Bytes::new());
+        publisher.publish(newest.version, Behaviour::Leave, &Bytes::new());
         tokio::time::sleep(FAREWELL).await;
     }
     batcher.close();
@@ -117,7 +122,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
 }
 
 /// A connection is a file descriptor, and systems give 1024 unless asked for more.
-fn allow_descriptors(wanted: u64) {
+pub(crate) fn allow_descriptors(wanted: u64) {
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
     if current.is_none_or(|current| current >= wanted) {
         return;

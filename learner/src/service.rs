@@ -4,8 +4,8 @@
 //! - [`Shared`] is what all calls have in common: the experiment, the batcher, the publisher.
 //! - [`serve`] is the server, up to its graceful end.
 //! - `incoming` lets connections in, `admission` calls: TLS, tokens and limits are theirs, and nobody else's.
-//! - `calls` answers each call; `unrolls` and `assets` are the two streams with a life of their own, and
-//!   [`publish`](crate::publish) the third. `status` tells how things are, `roster` how the actors are.
+//! - `calls` answers each call; `unrolls` and `assets` are the two streams with a life of their own, and `broadcast` of
+//!   what is [published](crate::publish) the third. `status` tells how things are, `roster` how the actors are.
 //!   `complaints` keeps the log readable when a peer misbehaves.
 //!
 //! Streams are pulled: nothing is read from an actor until the unroll before it has a slot in a batch, so HTTP/2 flow
@@ -13,6 +13,7 @@
 
 mod admission;
 mod assets;
+mod broadcast;
 mod calls;
 mod complaints;
 mod incoming;
@@ -43,6 +44,7 @@ use crate::publish::Publisher;
 use crate::security::{Limits, Security, Tls, Tokens};
 use crate::telemetry::Telemetry;
 use admission::Admission;
+use broadcast::Broadcast;
 use calls::Calls;
 use complaints::Complaints;
 use incoming::Door;
@@ -227,6 +229,18 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// HTTP/2 as actors meet it.
+pub(crate) fn server() -> Server {
+    Server::builder()
+        .http2_keepalive_interval(Some(KEEPALIVE))
+        .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
+        .initial_stream_window_size(STREAM_WINDOW)
+        .initial_connection_window_size(CONNECTION_WINDOW)
+        .max_frame_size(FRAME_SIZE)
+        .max_concurrent_streams(MAX_STREAMS)
+        .timeout(ANSWER_TIMEOUT)
+}
+
 /// Serves actors on this listener until `shutdown`, then ends every stream and returns, after a second at most.
 ///
 /// `Shared` is served once: after `shutdown` its streams stay ended.
@@ -246,16 +260,9 @@ pub async fn serve(listener: TcpListener, shared: Arc<Shared>, shutdown: impl Fu
     let admission = Admission::new(shared.tokens.clone(), shared.limits.max_requests, telemetry.clone());
     let door = Door::new(shared.tls.clone(), &shared.limits, telemetry.clone());
     let mut closing = shared.closing();
-    let server = Server::builder()
-        .http2_keepalive_interval(Some(KEEPALIVE))
-        .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
-        .initial_stream_window_size(STREAM_WINDOW)
-        .initial_connection_window_size(CONNECTION_WINDOW)
-        .max_frame_size(FRAME_SIZE)
-        .max_concurrent_streams(MAX_STREAMS)
-        .timeout(ANSWER_TIMEOUT)
+    let server = server()
         .layer(admission)
-        .add_service(calls)
+        .add_service(Broadcast::new(calls, shared.clone()))
         .add_service(health)
         .add_service(reflection)
         .serve_with_incoming_shutdown(door.open(listener), async move {

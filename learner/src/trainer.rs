@@ -313,7 +313,7 @@ impl Trainer {
         let version = self.progress.version;
         let demonstration = behaviour == Behaviour::Demonstrate;
         self.batcher.set_phase(Phase { epoch: self.epoch, version, oldest: self.oldest, demonstration });
-        self.publisher.publish(version, behaviour, self.target.clone());
+        self.publisher.publish(version, behaviour, &self.target);
     }
 
     fn normalises(&self) -> bool {

@@ -58,9 +58,9 @@ async fn the_farewell_is_still_delivered() {
     let mut world = World::start().await;
     let mut client = world.client().await;
     let mut watch = client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
-    world.publisher.publish(1, Behaviour::Policy, parameters(1, 10));
+    world.publisher.publish(1, Behaviour::Policy, &parameters(1, 10));
     assert_eq!(watch.message().await.unwrap().unwrap().behaviour(), Behaviour::Policy);
-    world.publisher.publish(1, Behaviour::Leave, parameters(1, 0));
+    world.publisher.publish(1, Behaviour::Leave, &parameters(1, 0));
     world.begin_shutdown();
     let farewell = within(SECOND, watch.message()).await.unwrap().unwrap();
     assert_eq!(farewell.behaviour(), Behaviour::Leave);
@@ -71,7 +71,7 @@ async fn the_farewell_is_still_delivered() {
 async fn an_actor_that_does_not_read_cannot_hold_up_the_end() {
     let mut world = World::start().await;
     let mut client = world.client().await;
-    world.publisher.publish(1, Behaviour::Policy, parameters(1, 64 * 1024 * 1024));
+    world.publisher.publish(1, Behaviour::Policy, &parameters(1, 64 * 1024 * 1024));
     let unread = client.watch_parameters(WatchRequest::default()).await.unwrap();
     let begun = Instant::now();
     world.begin_shutdown();

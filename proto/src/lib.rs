@@ -19,6 +19,7 @@ compile_error!("the payload of an unroll is little-endian and is copied, not con
 
 mod access;
 mod buffer;
+mod frame;
 mod layout;
 mod token;
 mod validate;
@@ -31,6 +32,7 @@ pub mod v1 {
 
 pub use access::{Access, AccessError, Authorised, Bearer, Client, chain, distrusted};
 pub use buffer::UnrollBuffer;
+pub use frame::frame;
 pub use layout::{Field, UnrollLayout, UnrollShape};
 pub use token::{TOKEN_VARIABLE, Token};
 pub use validate::{Expected, Invalid, MAX_SEQUENCE, validate};

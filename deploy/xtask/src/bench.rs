@@ -27,6 +27,12 @@ enum Side {
     Learner,
     /// Images of what the humanoid sees
     Vision,
+    /// Unrolls into batches, from 32 connections and from 1000
+    Ingest,
+    /// Parameters to 1000 connections, and to some that stop reading
+    Publish,
+    /// 4000 actors for 20 minutes
+    Swarm,
 }
 
 /// One figure; ratio = value / floor.
@@ -58,7 +64,18 @@ pub(crate) fn run(options: &Options) -> Result<()> {
             show(&figures(bench.args(["bench", "vision"]).args(&options.arguments))?)
         }
         Side::Learner => learner(options.threads, &options.arguments),
+        Side::Ingest => load("ingest", &options.arguments),
+        Side::Publish => load("publish", &options.arguments),
+        Side::Swarm => load("swarm", &options.arguments),
     }
+}
+
+/// The service under actors that are not real; each figure is printed when it is there.
+fn load(figure: &str, arguments: &[String]) -> Result<()> {
+    let mut load = Command::new(workspace::program("comic-learner")?);
+    // Thousands of actors come and go: what the log says of each is no news.
+    load.args(["load", figure]).args(arguments).env("RUST_LOG", "warn");
+    workspace::run(&mut load)
 }
 
 /// Our update and the same update in Python PyTorch, by turns, so that a busy moment of the machine meets both.

@@ -13,10 +13,8 @@ use futures::stream::{self, BoxStream, StreamExt as _};
 use serde::de::IgnoredAny;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::roster::Presence;
 use super::unrolls::UnrollStream;
-use super::{Closing, Evaluation, Shared, assets, status};
-use crate::publish::Subscription;
+use super::{Evaluation, Shared, assets, status};
 
 /// The service, as tonic wants it: one per server, shared by every connection.
 #[derive(Debug)]
@@ -82,13 +80,12 @@ impl Learner for Calls {
         Ok(Response::new(stream::unfold(unrolls, UnrollStream::next).boxed()))
     }
 
+    /// [`broadcast`](super::broadcast) answers this call before it comes here.
     async fn watch_parameters(
         &self,
-        request: Request<WatchRequest>,
+        _: Request<WatchRequest>,
     ) -> Result<Response<Self::WatchParametersStream>, Status> {
-        let present = self.shared.roster.watch(request.into_inner().incarnation);
-        let watch = (self.shared.publisher.subscribe(), self.shared.closing(), present);
-        Ok(Response::new(stream::unfold(watch, next_parameters).boxed()))
+        Err(Status::internal("WatchParameters has missed its way"))
     }
 
     async fn report_evaluation(&self, request: Request<EvaluationReport>) -> Result<Response<EvaluationAck>, Status> {
@@ -106,24 +103,6 @@ impl Learner for Calls {
     async fn get_status(&self, _: Request<StatusRequest>) -> Result<Response<v1::Status>, Status> {
         Ok(Response::new(status::of(&self.shared)))
     }
-}
-
-type Watch = (Subscription, Closing, Presence);
-
-/// The next piece of the newest parameters. At the server's end only a farewell is still sent.
-async fn next_parameters(
-    (mut parameters, mut closing, present): Watch,
-) -> Option<(Result<ParametersChunk, Status>, Watch)> {
-    let chunk = if closing.has_begun() {
-        parameters.farewell()?
-    } else {
-        tokio::select! {
-            biased;
-            () = closing.begun() => parameters.farewell()?,
-            chunk = parameters.next() => chunk?,
-        }
-    };
-    Some((Ok(chunk), (parameters, closing, present)))
 }
 
 /// An actor's seed: the same for the same index of the same experiment, whatever process has it (SplitMix64).

@@ -1,0 +1,18 @@
+//! Messages that are encoded before anybody asks for them.
+
+use bytes::{BufMut as _, Bytes, BytesMut};
+use prost::Message;
+
+/// A message as gRPC sends it: the byte 0 for "not compressed", the length in four bytes, big end first, the message.
+///
+/// # Panics
+/// When the message has 4 GiB or more.
+pub fn frame(message: &impl Message) -> Bytes {
+    let length = message.encoded_len();
+    let prefix = u32::try_from(length).expect("a message is smaller than 4 GiB");
+    let mut frame = BytesMut::with_capacity(5 + length);
+    frame.put_u8(0);
+    frame.put_u32(prefix);
+    message.encode_raw(&mut frame);
+    frame.freeze()
+}
