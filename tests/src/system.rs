@@ -91,6 +91,8 @@ pub fn python() -> Result<PathBuf> {
 /// A learner and actors that share one run; whatever is still there at the end of the test is killed.
 pub struct System {
     directory: TempDir,
+    /// Where the learner listens; this machine alone unless given.
+    pub host: String,
     port: u16,
     arguments: Vec<String>,
     /// How actors and the tests themselves reach the learner; with an authority, by https.
@@ -110,6 +112,7 @@ impl System {
     pub fn new(arguments: &[&str]) -> Result<Self> {
         Ok(Self {
             directory: tempfile::tempdir().context("cannot make a directory")?,
+            host: String::from("127.0.0.1"),
             port: free_port()?,
             arguments: arguments.iter().map(|argument| (*argument).to_owned()).collect(),
             access: Access::default(),
@@ -122,7 +125,7 @@ impl System {
     /// The learner's address.
     pub fn url(&self) -> String {
         let scheme = if self.access.ca.is_some() { "https" } else { "http" };
-        format!("{scheme}://127.0.0.1:{}", self.port)
+        format!("{scheme}://{}:{}", self.host, self.port)
     }
 
     /// The run's directory.
@@ -165,6 +168,35 @@ impl System {
         self.spawn("actor", command)
     }
 
+    /// Starts an actor in this network namespace.
+    ///
+    /// # Errors
+    /// When it cannot be started.
+    pub fn start_actor_on(&mut self, host: &str) -> Result<Process> {
+        let mut command = Command::new("ip");
+        command.args(["netns", "exec", host]).arg(program("comic-actor")?).args(["--learner", &self.url()]);
+        self.spawn("actor", command)
+    }
+
+    /// Starts a process that is many actors, which are not real: they send unrolls of zeros as fast as they are taken, and
+    /// read parameters.
+    ///
+    /// # Errors
+    /// When it cannot be started.
+    pub fn start_crowd(&mut self, actors: usize) -> Result<Process> {
+        let mut command = Command::new(program("comic-learner")?);
+        command.args([
+            "load",
+            "crowd",
+            "--host",
+            &format!("{}:{}", self.host, self.port),
+            "--actors",
+            &actors.to_string(),
+        ]);
+        command.args(["--window", "1", "--watch"]);
+        self.spawn("crowd", command)
+    }
+
     /// Runs `comic-learner COMMAND` against the learner and waits for its end.
     ///
     /// # Errors
@@ -192,7 +224,8 @@ impl System {
         if !command.get_envs().any(|(name, _)| name == "RUST_LOG") {
             command.env_remove("RUST_LOG");
         }
-        let child = command.stdin(Stdio::null()).stdout(output.try_clone()?).stderr(output).spawn();
+        // A crowd goes on until its input ends, which is when the test lets go of it.
+        let child = command.stdin(Stdio::piped()).stdout(output.try_clone()?).stderr(output).spawn();
         let child = child.with_context(|| format!("cannot start the {kind}"))?;
         Ok(Process { child, log })
     }
@@ -294,13 +327,32 @@ impl Process {
         Ok(())
     }
 
+    /// Sends a signal.
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn signal(&self, signal: Signal) -> Result<()> {
+        let pid = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw).context("no process id")?;
+        kill_process(pid, signal).context("cannot signal")
+    }
+
+    /// Bytes of memory it has.
+    ///
+    /// # Errors
+    /// When the system does not say.
+    pub fn resident(&self) -> Result<u64> {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.child.id())).context("no such process")?;
+        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).context("no VmRSS")?;
+        let kilobytes: u64 = line.trim().trim_end_matches(" kB").parse().context("VmRSS is no number")?;
+        Ok(kilobytes * 1024)
+    }
+
     /// Asks it to leave (SIGTERM) and waits.
     ///
     /// # Errors
     /// When it is still there after `limit`.
     pub async fn terminate(mut self, limit: Duration) -> Result<ExitStatus> {
-        let pid = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw).context("no process id")?;
-        kill_process(pid, Signal::TERM).context("cannot signal")?;
+        self.signal(Signal::TERM)?;
         let deadline = Instant::now() + limit;
         while Instant::now() < deadline {
             if let Some(status) = self.ended()? {

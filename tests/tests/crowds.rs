@@ -1,0 +1,63 @@
+//! Hundreds and thousands of actors, which are not real: one process carries many, each with a connection of its own.
+
+use std::process::Command;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, ensure};
+use comic_tests::steps::{LIMIT, the_books_balance_at_the_end, trains_on};
+use comic_tests::system::{SMALL, System, program};
+use serde_json::Value;
+
+const MEGABYTE: u64 = 1_000_000;
+/// Hundreds of connections are made and noticed in this time, whatever else the machine does.
+const CROWD_LIMIT: Duration = Duration::from_secs(120);
+
+#[tokio::test]
+async fn actors_become_a_hundred_times_as_many_and_few_again() -> Result<()> {
+    let mut system = System::new(&SMALL)?;
+    system.start_learner(LIMIT).await?;
+    let few = system.start_crowd(5)?;
+    trains_on(&mut system, "five actors' unrolls are trained on").await?;
+    let before = resident(&system)?;
+
+    let many = system.start_crowd(495)?;
+    actors(&mut system, 500).await?;
+    trains_on(&mut system, "five hundred actors' unrolls are trained on").await?;
+    many.kill()?;
+
+    actors(&mut system, 5).await?;
+    trains_on(&mut system, "the five that stayed are trained on").await?;
+    let after = resident(&system)?;
+    ensure!(
+        after < before + 50 * MEGABYTE,
+        "each of those who left keeps 100 KB: {before} bytes before, {after} after"
+    );
+    drop(few);
+    the_books_balance_at_the_end(system).await
+}
+
+async fn actors(system: &mut System, wanted: u64) -> Result<()> {
+    let what = format!("{wanted} actors are there");
+    let alive = |status: &comic_proto::v1::Status| status.actors.is_some_and(|actors| actors.alive == wanted);
+    system.until(&what, CROWD_LIMIT, |status| alive(status).then_some(())).await
+}
+
+fn resident(system: &System) -> Result<u64> {
+    system.learner.as_ref().context("no learner")?.resident()
+}
+
+#[test]
+fn a_thousand_readers_that_stop_cost_less_than_60_mb_and_delay_nobody() -> Result<()> {
+    let output = Command::new(program("comic-learner")?)
+        .args(["load", "stalled", "--connections", "1000", "--parameters", "5000000"])
+        .env("RUST_LOG", "warn")
+        .output()?;
+    ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let figure: Value = serde_json::from_slice(&output.stdout).context("no figure")?;
+    let number = |name: &str| figure[name].as_f64().with_context(|| format!("no `{name}` in {figure}"));
+    ensure!(number("stalled")? == 1000.0, "{figure}");
+    ensure!(number("value")? < 60.0, "more than 60 MB: {figure}");
+    // A place among the versions that are held is free after two seconds without a reader that gets on.
+    ensure!(number("a_healthy_reader_waits_s")? < 5.0, "{figure}");
+    Ok(())
+}

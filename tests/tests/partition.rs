@@ -1,0 +1,122 @@
+//! A learner and an actor on hosts of their own, and a network between them that loses everything for a while.
+//!
+//! Hosts are network namespaces, which take root: `cargo xtask test` runs these where it is, and says so where it is not.
+
+use std::process::Command;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, ensure};
+use comic_tests::steps::{LIMIT, leaves, the_books_balance_at_the_end, trains_on};
+use comic_tests::system::{SMALL, System};
+
+/// Thirty seconds are promised; the rest is for a busy machine.
+const NOTICED: Duration = Duration::from_secs(60);
+
+/// The actor's host, at the other end of a cable.
+struct Host {
+    name: String,
+    /// The learner's end.
+    cable: String,
+    /// The first three numbers of both addresses; the learner's ends with 1, the actor's with 2.
+    network: String,
+}
+
+impl Host {
+    /// `number` keeps the tests' hosts apart.
+    fn new(number: u8) -> Result<Self> {
+        let name = format!("comic-{}-{number}", std::process::id());
+        let (cable, end) = (format!("cl{}{number}", std::process::id()), format!("ca{}{number}", std::process::id()));
+        let host = Self { name, cable, network: format!("10.213.{number}") };
+        let Self { name, cable, network } = &host;
+        for command in [
+            format!("netns add {name}"),
+            format!("link add {cable} type veth peer name {end} netns {name}"),
+            format!("address add {network}.1/24 dev {cable}"),
+            format!("link set {cable} up"),
+            format!("-n {name} address add {network}.2/24 dev {end}"),
+            format!("-n {name} link set {end} name cable"),
+            format!("-n {name} link set cable up"),
+        ] {
+            ip(&command)?;
+        }
+        Ok(host)
+    }
+
+    /// What is sent to this host gets lost from now on, or no more.
+    fn lose_what_comes(&self, lost: bool) -> Result<()> {
+        ip(&format!("neighbour {} dev {}", self.misdirected(2, lost), self.cable))
+    }
+
+    /// What this host sends gets lost from now on, or no more.
+    fn lose_what_goes(&self, lost: bool) -> Result<()> {
+        ip(&format!("-n {} neighbour {} dev cable", self.name, self.misdirected(1, lost)))
+    }
+
+    /// Packets for a hardware address that nobody has vanish without a word.
+    fn misdirected(&self, end: u8, lost: bool) -> String {
+        let address = format!("{}.{end}", self.network);
+        match lost {
+            true => format!("replace {address} lladdr 02:00:00:00:00:99 nud permanent"),
+            false => format!("delete {address}"),
+        }
+    }
+}
+
+impl Drop for Host {
+    fn drop(&mut self) {
+        // The cable goes with it.
+        let _ = ip(&format!("netns delete {}", self.name));
+    }
+}
+
+fn ip(arguments: &str) -> Result<()> {
+    let output = Command::new("ip").args(arguments.split(' ')).output();
+    let output = output.context("cannot start `ip`: Debian's package is iproute2")?;
+    let said = String::from_utf8_lossy(&output.stderr);
+    ensure!(output.status.success(), "ip {arguments}: {said}");
+    Ok(())
+}
+
+/// Cuts the network, waits until both sides have given the other up, mends it, and sees that nothing was lost.
+async fn a_partition_heals(number: u8, cut: impl Fn(&Host, bool) -> Result<()>) -> Result<()> {
+    let host = Host::new(number)?;
+    let learner = format!("{}.1", host.network);
+    let mut system = System::new(&[&SMALL[..], &["--address", &learner, "--insecure"]].concat())?;
+    system.host = learner;
+    system.start_learner(LIMIT).await?;
+    let mut actor = system.start_actor_on(&host.name)?;
+    trains_on(&mut system, "the actor's unrolls are trained on").await?;
+
+    cut(&host, true)?;
+    actor.until_log_holds("no connection to the learner", NOTICED).await?;
+    let lost = |status: &comic_proto::v1::Status| status.actors.is_some_and(|actors| actors.lost == 1);
+    system.until("the learner gives the actor up", NOTICED, |status| lost(status).then_some(())).await?;
+    cut(&host, false)?;
+
+    actor.until_log_holds("reconnected to the learner", LIMIT).await?;
+    trains_on(&mut system, "the actor's unrolls are trained on again").await?;
+    leaves(actor).await?;
+    the_books_balance_at_the_end(system).await
+}
+
+#[tokio::test]
+#[ignore = "makes network namespaces, which takes root; `cargo xtask test` runs it as root"]
+async fn a_network_that_is_cut_heals() -> Result<()> {
+    a_partition_heals(1, |host, lost| {
+        host.lose_what_comes(lost)?;
+        host.lose_what_goes(lost)
+    })
+    .await
+}
+
+#[tokio::test]
+#[ignore = "makes network namespaces, which takes root; `cargo xtask test` runs it as root"]
+async fn a_network_that_loses_what_the_actor_sends_heals() -> Result<()> {
+    a_partition_heals(2, Host::lose_what_goes).await
+}
+
+#[tokio::test]
+#[ignore = "makes network namespaces, which takes root; `cargo xtask test` runs it as root"]
+async fn a_network_that_loses_what_the_learner_sends_heals() -> Result<()> {
+    a_partition_heals(3, Host::lose_what_comes).await
+}
