@@ -252,7 +252,7 @@ fn lag(connections: usize, parameters: usize, target_period: usize, every: f64) 
 
 /// Readers that stop, each in another version, and one among them that goes on.
 fn stalled(connections: usize, parameters: usize) -> Result<()> {
-    const VERSIONS: usize = 30;
+    const VERSIONS: usize = 8;
     let size = parameters.to_string();
     let mut host = Process::host(&["--kind", "learner", "--parameters", &size])?;
     let everybody = connections.to_string();

