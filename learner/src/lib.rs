@@ -6,6 +6,7 @@
 //! - [`trainer`] is the OS thread that owns the device: batches in, gradient steps, parameters out. [`warm_start`] is what
 //!   it does before.
 //! - [`vmpo`] is the algorithm: losses, and the gradient step. [`adam`] is its optimiser.
+//! - `setbacks` counts gradient steps that were skipped, and leads back to the last good state.
 //! - `state` turns the trainer into a snapshot and back. [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
 //! - [`export`] makes a checkpoint's policy a file that others read.
 //! - [`metrics`] is what a person sees of learning, [`telemetry`] what Prometheus sees of the service, by way of [`probes`].
@@ -28,6 +29,7 @@ pub mod publish;
 pub mod run;
 pub mod security;
 pub mod service;
+mod setbacks;
 pub mod sizes;
 mod state;
 pub mod statistics;

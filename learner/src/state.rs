@@ -1,5 +1,6 @@
 //! The trainer's whole state as a snapshot, and back: everything that changes the future.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
@@ -15,9 +16,18 @@ impl Trainer {
         if !final_one && self.writer.is_busy() {
             return Ok(());
         }
-        self.writer.write(Name::Updates(self.progress.updates), self.snapshot()?)?;
+        self.keep(Name::Updates(self.progress.updates))
+    }
+
+    /// Has the state written, and keeps it in memory to turn back to; only a sound one.
+    pub(crate) fn keep(&mut self, name: Name) -> Result<()> {
+        if !self.is_sound() {
+            tracing::warn!(checkpoint = %name, "not written: the last gradient steps were not finite");
+            return Ok(());
+        }
+        self.good = Arc::new(self.snapshot()?);
         self.checkpointed = Instant::now();
-        Ok(())
+        self.writer.write(name, self.good.clone())
     }
 
     pub(crate) fn snapshot(&self) -> Result<Snapshot> {
@@ -40,12 +50,17 @@ impl Trainer {
     }
 
     pub(crate) fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let mut tensors = crate::tensors::from_bytes(snapshot.part("learner.safetensors")?)?;
-        self.statistics.restore(&mut tensors)?;
-        self.learner.load_state(&tensors).context("the checkpoint does not fit the experiment's networks")?;
+        self.restore_learner(snapshot)?;
         self.target = Bytes::copy_from_slice(snapshot.part("target.safetensors")?);
         self.progress =
             serde_json::from_slice(snapshot.part("progress.json")?).context("the checkpoint's progress is damaged")?;
         Ok(())
+    }
+
+    /// What was learnt, without what counts.
+    pub(crate) fn restore_learner(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let mut tensors = crate::tensors::from_bytes(snapshot.part("learner.safetensors")?)?;
+        self.statistics.restore(&mut tensors)?;
+        self.learner.load_state(&tensors).context("the checkpoint does not fit the experiment's networks")
     }
 }

@@ -108,6 +108,8 @@ pub struct Telemetry {
     catalogue: Catalogue,
     ages: Mutex<Ages>,
     pub(crate) updates: Counter,
+    pub(crate) updates_skipped: Counter,
+    pub(crate) restores: Counter,
     pub(crate) update_seconds: Histogram,
     pub(crate) unroll_age: Histogram,
     pub(crate) unroll_bytes: Histogram,
@@ -185,6 +187,14 @@ impl Default for Telemetry {
         let all = &mut catalogue;
         Self {
             updates: all.counter("comic_updates", "Batches that V-MPO trained on"),
+            updates_skipped: all.counter(
+                "comic_updates_skipped",
+                "Gradient steps that changed nothing, since a loss or gradient was not finite",
+            ),
+            restores: all.counter(
+                "comic_restores",
+                "Returns to the last good state, after learner.restore_after skipped gradient steps in a row",
+            ),
             update_seconds: all.histogram(
                 "comic_update_seconds",
                 "Seconds of an update: tensors, gradient steps, publication",

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
-use anyhow::{Result, bail};
+use anyhow::Result;
 use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_networks::to_safetensors;
@@ -15,15 +15,16 @@ use rand::SeedableRng as _;
 use rand::seq::SliceRandom as _;
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value, json};
+use serde_json::{Map, Value};
 use tch::Device;
 
 use crate::checkpoint::{Name, Snapshot, Store};
 use crate::metrics::{Metrics, Position};
 use crate::publish::Publisher;
 use crate::service::Shared;
+use crate::setbacks::Setbacks;
 use crate::statistics::ObservationStatistics;
-use crate::vmpo::{self, Losses, MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
+use crate::vmpo::{Losses, MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
 use crate::writer::Writer;
 
 /// How often a trainer without batches looks at the clock.
@@ -90,15 +91,18 @@ pub struct Trainer {
     pub(crate) progress: Progress,
     /// Since when this life counts time, and what had been counted then.
     clock: Option<(Instant, f64)>,
-    losses: Map<String, Value>,
+    pub(crate) losses: Map<String, Value>,
     pub(crate) batcher: Batcher,
     publisher: Publisher,
-    shared: Arc<Shared>,
+    pub(crate) shared: Arc<Shared>,
     /// Unrolls of versions before this one are superseded.
-    oldest: u64,
+    pub(crate) oldest: u64,
     pub(crate) metrics: Metrics,
     pub(crate) writer: Writer,
     pub(crate) checkpointed: Instant,
+    /// The newest checkpoint, in memory: where a learner turns back to that lost its way.
+    pub(crate) good: Arc<Snapshot>,
+    pub(crate) setbacks: Setbacks,
 }
 
 impl Trainer {
@@ -129,6 +133,8 @@ impl Trainer {
             metrics: Metrics::open(&run, &spec)?,
             writer: Writer::start(store, shared.telemetry.clone())?,
             checkpointed: Instant::now(),
+            good: Arc::default(),
+            setbacks: Setbacks::new(experiment.learner.restore_after),
             experiment,
             spec,
             epoch,
@@ -138,8 +144,11 @@ impl Trainer {
             shared,
         };
         match resume {
-            Some(snapshot) => trainer.restore(&snapshot)?,
-            None => trainer.writer.write(Name::Initial, trainer.snapshot()?)?,
+            Some(snapshot) => {
+                trainer.restore(&snapshot)?;
+                trainer.good = Arc::new(snapshot);
+            }
+            None => trainer.keep(Name::Initial)?,
         }
         Ok(trainer)
     }
@@ -147,7 +156,7 @@ impl Trainer {
     /// Demonstrations and regression if the experiment wants them, then V-MPO, then a last checkpoint.
     ///
     /// # Errors
-    /// When a number is no longer finite, or the disk refuses.
+    /// When gradient steps go on being skipped after a return to the last good state, or the disk refuses.
     pub fn run(mut self) -> Result<Ending> {
         let ending = match self.train() {
             Ok(ending) => ending,
@@ -301,7 +310,12 @@ impl Trainer {
     }
 
     /// Publishes the online policy as the next version: from now on it is the target network, with which actors act.
+    /// One that is not sound stays here: from actors that cannot act nothing comes that would show it.
     pub(crate) fn publish(&mut self, behaviour: Behaviour) -> Result<()> {
+        if !self.is_sound() {
+            tracing::warn!(update = self.progress.updates, "not published: the last gradient steps were not finite");
+            return Ok(());
+        }
         self.target = Bytes::from(to_safetensors(self.learner.policy_store())?);
         self.progress.version += 1;
         self.announce(behaviour);
@@ -330,24 +344,6 @@ impl Trainer {
 
     pub(crate) fn set_normaliser(&mut self) -> Result<()> {
         Ok(self.learner.set_normaliser(&self.statistics.to_normaliser()?)?)
-    }
-
-    /// Keeps the newest losses for the metrics, and refuses to go on with numbers that are none.
-    pub(crate) fn report(&mut self, losses: &vmpo::Metrics) -> Result<()> {
-        if !losses.is_finite() {
-            bail!(
-                "update {}: a loss is not finite ({losses:?}); the last checkpoint is from before, a lower learning \
-                 rate or vmpo.epsilon_mean is the usual remedy",
-                self.progress.updates
-            );
-        }
-        self.losses = losses.entries().into_iter().map(|(name, value)| (name.to_string(), json!(value))).collect();
-        if self.spec.tasks.len() > 1 && losses.temperatures.len() == self.spec.tasks.len() {
-            let names = self.spec.tasks.iter().map(|task| task.name.clone());
-            let temperatures: Map<_, _> = names.zip(losses.temperatures.iter().map(|eta| json!(eta))).collect();
-            self.losses.insert("temperatures".to_string(), Value::Object(temperatures));
-        }
-        Ok(())
     }
 
     pub(crate) fn seconds(&self) -> f64 {

@@ -13,7 +13,7 @@ use crate::telemetry::Telemetry;
 /// The writing thread. At most one snapshot waits behind the one being written.
 #[derive(Debug)]
 pub struct Writer {
-    queue: SyncSender<(Name, Snapshot)>,
+    queue: SyncSender<(Name, Arc<Snapshot>)>,
     /// Snapshots handed over and not yet written.
     pending: Arc<AtomicUsize>,
     thread: JoinHandle<Result<()>>,
@@ -44,7 +44,7 @@ impl Writer {
     ///
     /// # Errors
     /// When the thread is gone.
-    pub fn write(&self, name: Name, snapshot: Snapshot) -> Result<()> {
+    pub fn write(&self, name: Name, snapshot: Arc<Snapshot>) -> Result<()> {
         self.pending.fetch_add(1, Ordering::AcqRel);
         self.queue.send((name, snapshot)).map_err(|_| anyhow!("the checkpoint thread is gone"))
     }
@@ -62,7 +62,7 @@ impl Writer {
 /// A disk that refuses once may take the next one: training goes on, and the log says so. The last one counts.
 fn write_all(
     store: &Store,
-    queue: &Receiver<(Name, Snapshot)>,
+    queue: &Receiver<(Name, Arc<Snapshot>)>,
     pending: &AtomicUsize,
     telemetry: &Telemetry,
 ) -> Result<()> {
