@@ -38,6 +38,7 @@ use tokio::sync::watch;
 use tonic::transport::Server;
 use tonic_health::ServingStatus;
 
+use crate::checkpoint::Evaluated;
 use crate::options::Misuse;
 use crate::publish::Publisher;
 use crate::security::{Limits, Security, Tls, Tokens};
@@ -100,6 +101,15 @@ pub struct Evaluation {
     pub version: u64,
     /// As `comic-actor evaluate --json` prints it.
     pub json: String,
+}
+
+impl Evaluation {
+    /// What it says of the parameters; `None` of a report without a mean.
+    pub(crate) fn evaluated(&self) -> Option<Evaluated> {
+        let report: serde_json::Value = serde_json::from_str(&self.json).ok()?;
+        let normalised_reward = report["overall"]["normalised_reward"].as_f64()?;
+        Some(Evaluated { epoch: self.epoch, version: self.version, normalised_reward })
+    }
 }
 
 /// What all calls, and the trainer, have in common.
@@ -191,8 +201,8 @@ impl Shared {
         *self.closing.borrow()
     }
 
-    /// False when too many wait already.
-    fn keep_evaluation(&self, evaluation: Evaluation) -> bool {
+    /// Keeps an evaluation for the trainer. False when too many wait already.
+    pub fn keep_evaluation(&self, evaluation: Evaluation) -> bool {
         let mut waiting = lock(&self.evaluations);
         let room = waiting.len() < EVALUATIONS;
         if room {

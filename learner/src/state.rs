@@ -7,7 +7,7 @@ use anyhow::{Context as _, Result};
 use bytes::Bytes;
 use comic_networks::to_safetensors;
 
-use crate::checkpoint::{Name, Snapshot};
+use crate::checkpoint::{Name, PROGRESS, Snapshot};
 use crate::trainer::{Progress, Trainer};
 
 impl Trainer {
@@ -41,7 +41,7 @@ impl Trainer {
             ("policy.safetensors", to_safetensors(self.learner.policy_store())?),
             ("target.safetensors", self.target.to_vec()),
             ("learner.safetensors", crate::tensors::to_bytes(&tensors)?),
-            ("progress.json", serde_json::to_vec_pretty(&progress)?),
+            (PROGRESS, serde_json::to_vec_pretty(&progress)?),
             ("books.json", serde_json::to_vec_pretty(&self.batcher.snapshot())?),
         ] {
             snapshot.parts.insert(name.to_string(), bytes);
@@ -53,7 +53,7 @@ impl Trainer {
         self.restore_learner(snapshot)?;
         self.target = Bytes::copy_from_slice(snapshot.part("target.safetensors")?);
         self.progress =
-            serde_json::from_slice(snapshot.part("progress.json")?).context("the checkpoint's progress is damaged")?;
+            serde_json::from_slice(snapshot.part(PROGRESS)?).context("the checkpoint's progress is damaged")?;
         Ok(())
     }
 

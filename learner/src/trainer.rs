@@ -166,6 +166,7 @@ impl Trainer {
                 return Err(error);
             }
         };
+        self.take_evaluations()?;
         self.write_metrics()?;
         self.checkpoint(true)?;
         self.writer.finish()?;
@@ -386,10 +387,22 @@ impl Trainer {
         if self.metrics.elapsed() < self.experiment.learner.metrics_seconds {
             return Ok(());
         }
-        for evaluation in self.shared.take_evaluations() {
-            self.metrics.keep_evaluation(&evaluation);
+        // Otherwise they wait where they are, and training goes on.
+        if !self.writer.is_busy() {
+            self.take_evaluations()?;
         }
         if self.metrics.has_news(&self.books()?) { self.write_metrics() } else { Ok(()) }
+    }
+
+    /// Keeps what actors found out about checkpoints.
+    fn take_evaluations(&self) -> Result<()> {
+        for evaluation in self.shared.take_evaluations() {
+            self.metrics.keep_evaluation(&evaluation);
+            if let Some(evaluated) = evaluation.evaluated() {
+                self.writer.judge(evaluated)?;
+            }
+        }
+        Ok(())
     }
 
     fn books(&self) -> Result<Value> {
@@ -405,9 +418,6 @@ impl Trainer {
             epoch: self.epoch,
         };
         let books = self.books()?;
-        for evaluation in self.shared.take_evaluations() {
-            self.metrics.keep_evaluation(&evaluation);
-        }
         let line = self.metrics.write(position, books, self.losses.clone());
         tracing::info!(target: "metrics", "{line}");
         self.shared.set_metrics(line);

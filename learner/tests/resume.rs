@@ -7,10 +7,10 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 
 use comic_experiment::{Experiment, TaskSpec, resolve};
-use comic_learner::checkpoint::{Snapshot, Store};
+use comic_learner::checkpoint::{Snapshot, Store, find, read};
 use comic_learner::publish::{Published, Publisher};
 use comic_learner::security::{Limits, Security};
-use comic_learner::service::{self, Shared};
+use comic_learner::service::{self, Evaluation, Shared};
 use comic_learner::trainer::{Ending, Setup, Trainer};
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
@@ -99,6 +99,17 @@ struct Life {
 
 /// One life of the learner, fed with the recording from where its books say up to `unrolls`, altered.
 fn live(experiment: &Experiment, run: &Path, unrolls: u64, alter: fn(u64, &mut UnrollBuffer)) -> Life {
+    live_evaluated(experiment, run, unrolls, alter, &[])
+}
+
+/// The same, and these evaluations are reported at its beginning.
+fn live_evaluated(
+    experiment: &Experiment,
+    run: &Path,
+    unrolls: u64,
+    alter: fn(u64, &mut UnrollBuffer),
+    evaluations: &[Evaluation],
+) -> Life {
     let experiment = experiment.clone();
     let spec = spec(&experiment);
     let store = Store::open(run, 3).unwrap();
@@ -122,6 +133,7 @@ fn live(experiment: &Experiment, run: &Path, unrolls: u64, alter: fn(u64, &mut U
         publisher: publisher.clone(),
     })
     .unwrap();
+    assert!(evaluations.iter().all(|evaluation| shared.keep_evaluation(evaluation.clone())));
     let pose = vec![0.1; spec.action];
     let run = run.to_path_buf();
     let joined = batcher.join(INCARNATION, None).unwrap();
@@ -215,8 +227,31 @@ fn training_changes_the_parameters() {
     let _alone = ONE_AT_A_TIME.lock();
     let run = tempfile::tempdir().unwrap();
     let trained = trained("tracking-mlp", run.path(), 1);
-    let initial = comic_learner::checkpoint::read(&run.path().join("checkpoints/initial")).unwrap();
+    let initial = read(&run.path().join("checkpoints/initial")).unwrap();
     assert_ne!(trained.part("policy.safetensors").unwrap(), initial.part("policy.safetensors").unwrap());
+}
+
+#[test]
+fn the_checkpoint_of_the_best_evaluation_outlives_the_newest_few() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let run = tempfile::tempdir().unwrap();
+    let checkpoints = run.path().join("checkpoints");
+    let life = |updates: u64, report: &str| {
+        let experiment = experiment("tracking-mlp", updates);
+        // One version in the first life, which begins with epoch 1.
+        let evaluation = Evaluation { epoch: 1, version: 2, json: report.into() };
+        let unrolls = (updates + 1) * BATCH;
+        live_evaluated(&experiment, run.path(), unrolls, |_, _| {}, &[evaluation]).ended.unwrap();
+    };
+    life(1, "[]");
+    assert!(!checkpoints.join("best.json").exists(), "that report says nothing");
+    for updates in 2..6 {
+        life(updates, r#"{"overall": {"normalised_reward": 0.25}}"#);
+    }
+    let best = find(&checkpoints.join("best")).unwrap().1;
+    assert_eq!(best, read(&checkpoints.join("checkpoint-0000000001")).unwrap());
+    assert!(!checkpoints.join("checkpoint-0000000002").exists());
+    assert_eq!(std::fs::read_to_string(run.path().join("evaluations.jsonl")).unwrap().lines().count(), 5);
 }
 
 /// Rewards whose squares overflow; the wire would not let them through.
@@ -249,7 +284,7 @@ fn after_too_many_skipped_steps_a_learner_is_back_where_it_was_last_good() {
         }
     });
     assert_eq!(ended.unwrap(), Ending::Budget);
-    let initial = comic_learner::checkpoint::read(&run.path().join("checkpoints/initial")).unwrap();
+    let initial = read(&run.path().join("checkpoints/initial")).unwrap();
     let last = last_checkpoint(run.path());
     for part in ["learner.safetensors", "policy.safetensors"] {
         assert!(last.part(part).unwrap() == initial.part(part).unwrap(), "{part} is not the last good one");
@@ -278,6 +313,6 @@ fn a_learning_rate_that_ruins_the_parameters_is_not_tried_for_ever() {
     experiment.optimiser.learning_rate = 1e38;
     let Life { ended, published, .. } = live(&experiment, run.path(), u64::MAX, |_, _| {});
     assert!(ended.is_err());
-    let initial = comic_learner::checkpoint::read(&run.path().join("checkpoints/initial")).unwrap();
+    let initial = read(&run.path().join("checkpoints/initial")).unwrap();
     assert_eq!(published.payload, initial.part("policy.safetensors").unwrap(), "ruins were published");
 }
