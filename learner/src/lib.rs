@@ -12,7 +12,7 @@
 //! - [`metrics`] is what a person sees of learning, [`telemetry`] what Prometheus sees of the service, by way of [`probes`].
 //! - [`security`] is who may talk to it; [`certs`] makes certificates for trying that out.
 //! - [`status`] and [`health`] are commands that ask another learner how it is.
-//! - [`sizes`] counts parameters.
+//! - [`sizes`] counts parameters, [`memory`] the bytes that buffers can take.
 //!
 //! There is no MuJoCo here: whatever needs a simulator is done by actors.
 
@@ -22,6 +22,7 @@ pub mod certs;
 pub mod checkpoint;
 pub mod export;
 pub mod health;
+pub mod memory;
 pub mod metrics;
 pub mod options;
 pub mod probes;

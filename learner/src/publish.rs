@@ -9,10 +9,10 @@ use comic_proto::v1::{Behaviour, ParametersChunk};
 use tokio::sync::watch;
 
 /// Bytes of a piece. Measured with 1000 readers: 64 KiB pieces are the fastest, and a stalled reader holds one.
-const CHUNK: usize = 64 * 1024;
+pub(crate) const CHUNK: usize = 64 * 1024;
 /// Versions kept for readers in the middle of them. One that falls further behind starts over with the newest, so
 /// memory is bounded however many readers stall.
-const KEPT: usize = 8;
+pub(crate) const KEPT: usize = 8;
 
 /// One version of the parameters, as actors get it.
 #[derive(Clone, Debug)]

@@ -61,7 +61,7 @@ const STREAM_WINDOW: u32 = 512 * 1024;
 const FRAME_SIZE: u32 = 256 * 1024;
 /// Bytes an unread connection may have under way. Above the stream's, or a full unroll stream would stall every other
 /// call of its actor.
-const CONNECTION_WINDOW: u32 = 1024 * 1024;
+pub(crate) const CONNECTION_WINDOW: u32 = 1024 * 1024;
 /// Streams a connection may have open; an actor needs three.
 const MAX_STREAMS: u32 = 64;
 /// The decoding limit when unrolls are smaller than that: a report on many clips is JSON of some hundred KB.
@@ -194,6 +194,11 @@ impl Shared {
     /// Takes the evaluations reported since the last time, oldest first.
     pub fn take_evaluations(&self) -> Vec<Evaluation> {
         lock(&self.evaluations).drain(..).collect()
+    }
+
+    /// How many may be connected, how many calls may be in flight, and how many bytes a message may have.
+    pub(crate) fn ingest(&self) -> (usize, usize, usize) {
+        (self.limits.max_connections(), self.limits.max_requests, self.message_limit)
     }
 
     /// Whether the server goes down.

@@ -8,6 +8,7 @@ use bytes::Bytes;
 use comic_networks::to_safetensors;
 
 use crate::checkpoint::{Name, PROGRESS, Snapshot};
+use crate::memory::{Bounds, Sizes};
 use crate::trainer::{Progress, Trainer};
 
 impl Trainer {
@@ -28,6 +29,21 @@ impl Trainer {
         self.good = Arc::new(self.snapshot()?);
         self.checkpointed = Instant::now();
         self.writer.write(name, self.good.clone())
+    }
+
+    /// How much memory the learner's buffers can take, now that every size is known.
+    pub(crate) fn memory(&self) -> Bounds {
+        let (connections, requests, message) = self.shared.ingest();
+        Bounds::new(&Sizes {
+            ahead: self.experiment.unroll.ahead,
+            batch: self.experiment.unroll.batch,
+            unroll: self.batcher.layout().size(),
+            connections,
+            requests,
+            message,
+            parameters: self.target.len(),
+            snapshot: self.good.parts.values().map(Vec::len).sum(),
+        })
     }
 
     pub(crate) fn snapshot(&self) -> Result<Snapshot> {

@@ -150,6 +150,7 @@ impl Trainer {
             }
             None => trainer.keep(Name::Initial)?,
         }
+        tracing::info!("buffers take {}", trainer.memory());
         Ok(trainer)
     }
 
