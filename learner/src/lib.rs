@@ -10,6 +10,7 @@
 //! - `state` turns the trainer into a snapshot and back. [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
 //! - [`export`] makes a checkpoint's policy a file that others read.
 //! - [`metrics`] is what a person sees of learning, [`telemetry`] what Prometheus sees of the service, by way of [`probes`].
+//! - [`quarantine`] keeps unrolls that were refused, for whoever looks into it.
 //! - [`security`] is who may talk to it; [`certs`] makes certificates for trying that out.
 //! - [`status`] and [`health`] are commands that ask another learner how it is.
 //! - [`sizes`] counts parameters, [`memory`] the bytes that buffers can take.
@@ -27,6 +28,7 @@ pub mod metrics;
 pub mod options;
 pub mod probes;
 pub mod publish;
+pub mod quarantine;
 pub mod run;
 pub mod security;
 pub mod service;

@@ -20,6 +20,8 @@ pub struct Sizes {
     pub requests: usize,
     /// Bytes of the largest message that is taken.
     pub message: usize,
+    /// Refused messages that may wait for the disk.
+    pub quarantined: usize,
     /// Bytes of the parameters that actors get.
     pub parameters: usize,
     /// Bytes of a checkpoint.
@@ -37,6 +39,8 @@ pub struct Bounds {
     pub messages: u64,
     /// Versions of the parameters that are kept for readers, and a piece of them for each call.
     pub parameters: u64,
+    /// Refused messages on their way to the disk.
+    pub quarantine: u64,
     /// Checkpoints: one being written, one that waits, and the newest, to turn back to.
     pub snapshots: u64,
 }
@@ -45,23 +49,25 @@ impl Bounds {
     /// The bounds of these sizes.
     pub fn new(sizes: &Sizes) -> Self {
         let product = |factors: &[usize]| factors.iter().fold(1u64, |all, factor| all.saturating_mul(*factor as u64));
-        let Sizes { ahead, batch, unroll, connections, requests, message, parameters, snapshot } = *sizes;
+        let Sizes { ahead, batch, unroll, connections, requests, message, quarantined, parameters, snapshot } = *sizes;
         Self {
             batches: product(&[ahead + 1, batch, unroll]),
             windows: product(&[connections, CONNECTION_WINDOW as usize]),
             messages: product(&[requests, message]),
             parameters: product(&[KEPT, parameters]).saturating_add(product(&[requests, CHUNK])),
+            quarantine: product(&[quarantined, message]),
             snapshots: product(&[3, snapshot]),
         }
     }
 
-    fn parts(&self) -> [(&'static str, u64); 5] {
-        let Self { batches, windows, messages, parameters, snapshots } = *self;
+    fn parts(&self) -> [(&'static str, u64); 6] {
+        let Self { batches, windows, messages, parameters, quarantine, snapshots } = *self;
         [
             ("batches", batches),
             ("connection windows", windows),
             ("messages", messages),
             ("parameters", parameters),
+            ("quarantine", quarantine),
             ("checkpoints", snapshots),
         ]
     }
@@ -95,6 +101,7 @@ mod tests {
         connections: 100,
         requests: 300,
         message: 1 << 20,
+        quarantined: 9,
         parameters: 5_000_000,
         snapshot: 40_000_000,
     };
@@ -107,13 +114,14 @@ mod tests {
             windows: 100 * 1024 * 1024,
             messages: 300 * 1024 * 1024,
             parameters: 8 * 5_000_000 + 300 * 65_536,
+            quarantine: 9 * 1024 * 1024,
             snapshots: 3 * 40_000_000,
         };
         assert_eq!(bounds, expected);
-        assert_eq!(bounds.sum(), 51_200_000 + 400 * 1_048_576 + 59_660_800 + 120_000_000);
+        assert_eq!(bounds.sum(), 51_200_000 + 409 * 1_048_576 + 59_660_800 + 120_000_000);
         assert_eq!(
             bounds.to_string(),
-            "at most 621 MiB: batches 49, connection windows 100, messages 300, parameters 57, checkpoints 115"
+            "at most 630 MiB: batches 49, connection windows 100, messages 300, parameters 57, quarantine 9, checkpoints 115"
         );
     }
 

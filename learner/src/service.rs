@@ -14,7 +14,7 @@
 mod admission;
 mod assets;
 mod calls;
-mod complaints;
+pub(crate) mod complaints;
 mod incoming;
 mod roster;
 mod status;
@@ -41,6 +41,7 @@ use tonic_health::ServingStatus;
 use crate::checkpoint::Evaluated;
 use crate::options::Misuse;
 use crate::publish::Publisher;
+use crate::quarantine::{Quarantine, QuarantineOptions};
 use crate::security::{Limits, Security, Tls, Tokens};
 use crate::telemetry::Telemetry;
 use admission::Admission;
@@ -90,6 +91,8 @@ pub struct Setup {
     pub batcher: Batcher,
     /// Where parameters come from; its epoch is the service's.
     pub publisher: Publisher,
+    /// Where invalid unrolls go.
+    pub quarantine: QuarantineOptions,
 }
 
 /// An evaluation that an actor reported.
@@ -137,6 +140,7 @@ pub struct Shared {
     limits: Limits,
     message_limit: usize,
     roster: Arc<Roster>,
+    quarantine: Option<Quarantine>,
     pub(crate) telemetry: Arc<Telemetry>,
     closing: watch::Sender<bool>,
 }
@@ -146,9 +150,9 @@ impl Shared {
     ///
     /// # Errors
     /// [`Misuse`] when no unroll fits the limit of a message; otherwise when the batcher's layout or epoch are not those
-    /// of the rest, or experiment or spec cannot be written as TOML.
+    /// of the rest, experiment or spec cannot be written as TOML, or there is no quarantine where one was asked for.
     pub fn new(setup: Setup) -> Result<Arc<Self>> {
-        let Setup { run, security, limits, experiment, spec, assets, batcher, publisher } = setup;
+        let Setup { run, security, limits, experiment, spec, assets, batcher, publisher, quarantine } = setup;
         let shape = UnrollShape::new(&spec, &experiment);
         let found = *batcher.layout().shape();
         ensure!(shape == found, "the batcher takes unrolls of {found:?}, the experiment makes {shape:?}");
@@ -160,6 +164,7 @@ impl Shared {
             let remedy = format!("--max-message-bytes {message_limit} lets no unroll through: it takes {needed}");
             return Err(Misuse::new(remedy).into());
         }
+        let telemetry = Arc::<Telemetry>::default();
         let buffers = experiment.unroll.ahead as u64 + 1;
         Ok(Arc::new(Self {
             name: experiment.name.clone(),
@@ -171,7 +176,8 @@ impl Shared {
             message_limit,
             roster: Arc::new(Roster::new(limits.max_actors)),
             limits,
-            telemetry: Arc::default(),
+            quarantine: Quarantine::start(&quarantine, &telemetry)?,
+            telemetry,
             task_spec: toml::to_string(&spec).context("the task's spec cannot be written as TOML")?,
             seed: experiment.seed,
             experiment: experiment.to_toml()?,
@@ -196,9 +202,11 @@ impl Shared {
         lock(&self.evaluations).drain(..).collect()
     }
 
-    /// How many may be connected, how many calls may be in flight, and how many bytes a message may have.
-    pub(crate) fn ingest(&self) -> (usize, usize, usize) {
-        (self.limits.max_connections(), self.limits.max_requests, self.message_limit)
+    /// How many may be connected, how many calls may be in flight, how many bytes a message may have, and how many
+    /// refused ones may wait for the disk.
+    pub(crate) fn ingest(&self) -> (usize, usize, usize, usize) {
+        let held = if self.quarantine.is_some() { Quarantine::HELD } else { 0 };
+        (self.limits.max_connections(), self.limits.max_requests, self.message_limit, held)
     }
 
     /// Whether the server goes down.

@@ -1,16 +1,12 @@
 //! Gradient steps that were skipped, since a loss or gradient was not finite, and what they lead to.
 
-use std::time::{Duration, Instant};
-
 use anyhow::{Result, bail};
 use comic_proto::v1::Behaviour;
 use serde_json::{Map, Value, json};
 
+use crate::service::complaints::Complaints;
 use crate::trainer::Trainer;
 use crate::vmpo;
-
-/// Silence after a complaint.
-const QUIET: Duration = Duration::from_secs(60);
 
 /// Counts skipped steps. Too many in a row lead back to the last good state; as many again, before as many were taken,
 /// are the end: what goes wrong then goes wrong there too.
@@ -21,7 +17,7 @@ pub(crate) struct Setbacks {
     in_row: u64,
     /// Steps taken since the last return, until there are enough of them.
     since_return: Option<u64>,
-    complained: Option<Instant>,
+    complaints: Complaints<()>,
 }
 
 /// What a learner does next.
@@ -34,7 +30,7 @@ enum Way {
 
 impl Setbacks {
     pub(crate) fn new(limit: u64) -> Self {
-        Self { limit, in_row: 0, since_return: None, complained: None }
+        Self { limit, in_row: 0, since_return: None, complaints: Complaints::default() }
     }
 
     /// Counts `steps`, of which so many were skipped, and so many after the last one that was taken.
@@ -47,15 +43,6 @@ impl Setbacks {
         }
         self.in_row = 0;
         if self.since_return.replace(0).is_none() { Way::Back } else { Way::Nowhere }
-    }
-
-    /// Whether it is time to complain again.
-    fn complain(&mut self) -> bool {
-        let due = self.complained.is_none_or(|last| last.elapsed() >= QUIET);
-        if due {
-            self.complained = Some(Instant::now());
-        }
-        due
     }
 }
 
@@ -75,7 +62,7 @@ impl Trainer {
         let update = self.progress.updates;
         self.metrics.count_skipped(skipped);
         self.shared.telemetry.updates_skipped.inc_by(skipped);
-        if skipped > 0 && self.setbacks.complain() {
+        if skipped > 0 && self.setbacks.complaints.due(()).is_some() {
             tracing::warn!(update, skipped, of = steps, "gradient steps skipped: a loss or gradient is not finite");
         }
         match self.setbacks.count(steps, skipped, skipped_last) {

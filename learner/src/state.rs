@@ -33,7 +33,7 @@ impl Trainer {
 
     /// How much memory the learner's buffers can take, now that every size is known.
     pub(crate) fn memory(&self) -> Bounds {
-        let (connections, requests, message) = self.shared.ingest();
+        let (connections, requests, message, quarantined) = self.shared.ingest();
         Bounds::new(&Sizes {
             ahead: self.experiment.unroll.ahead,
             batch: self.experiment.unroll.batch,
@@ -41,6 +41,7 @@ impl Trainer {
             connections,
             requests,
             message,
+            quarantined,
             parameters: self.target.len(),
             snapshot: self.good.parts.values().map(Vec::len).sum(),
         })

@@ -121,6 +121,7 @@ pub struct Telemetry {
     pub(crate) connections_refused: Labelled<Counter>,
     pub(crate) requests: Gauge,
     pub(crate) requests_refused: Labelled<Counter>,
+    pub(crate) quarantined: Labelled<Counter>,
     sampled: Sampled,
 }
 
@@ -237,6 +238,12 @@ impl Default for Telemetry {
                 ("comic_requests_refused", "reason"),
                 &["unauthenticated", "overloaded"],
                 "Calls refused: no accepted token, or --max-requests in flight",
+            ),
+            quarantined: all.labelled(
+                "counter",
+                ("comic_quarantined", "result"),
+                &["kept", "full", "busy", "failed"],
+                "Invalid unrolls by what became of them with --quarantine: on disk, beyond --quarantine-bytes, too many at once, not written",
             ),
             sampled: Sampled::new(all),
             catalogue,

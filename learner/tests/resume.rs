@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex};
 use comic_experiment::{Experiment, TaskSpec, resolve};
 use comic_learner::checkpoint::{Snapshot, Store, find, read};
 use comic_learner::publish::{Published, Publisher};
+use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{self, Evaluation, Shared};
 use comic_learner::trainer::{Ending, Setup, Trainer};
@@ -131,6 +132,7 @@ fn live_evaluated(
         assets: Vec::new(),
         batcher: batcher.clone(),
         publisher: publisher.clone(),
+        quarantine: QuarantineOptions::default(),
     })
     .unwrap();
     assert!(evaluations.iter().all(|evaluation| shared.keep_evaluation(evaluation.clone())));
