@@ -114,6 +114,7 @@ pub struct Telemetry {
     pub(crate) unroll_age: Histogram,
     pub(crate) unroll_bytes: Histogram,
     pub(crate) environment_steps: Counter,
+    pub(crate) episodes_diverged: Counter,
     pub(crate) evaluations: Counter,
     pub(crate) checkpoints: Labelled<Counter>,
     pub(crate) joins: Labelled<Counter>,
@@ -212,6 +213,10 @@ impl Default for Telemetry {
                 exponential_buckets(1024.0, 4.0, 9),
             ),
             environment_steps: all.counter("comic_environment_steps", "Environment steps trained on"),
+            episodes_diverged: all.counter(
+                "comic_episodes_diverged",
+                "Episodes trained on that ended since the simulation diverged; see comic-actor --dump-diverged",
+            ),
             evaluations: all.counter("comic_evaluations", "Evaluations that actors reported"),
             checkpoints: all.labelled(
                 "counter",

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_networks::to_safetensors;
 use comic_proto::Field;
-use comic_proto::v1::Behaviour;
+use comic_proto::v1::{Behaviour, EpisodeEnd};
 use comic_replay::{Batch, Batcher, Next, Phase, Reason};
 use rand::SeedableRng as _;
 use rand::seq::SliceRandom as _;
@@ -302,12 +302,15 @@ impl Trainer {
         (0..steps).map(move |step| tensors.select(&order[step * size..(step + 1) * size]))
     }
 
-    /// Counts a batch's steps, and gives its memory back.
+    /// Counts a batch's steps and diverged episodes, and gives its memory back.
     pub(crate) fn book(&mut self, batch: Batch) {
         let tasks = tasks_of_unrolls(&batch, &self.spec);
         let steps = self.metrics.count_steps(&batch, &tasks);
         self.progress.environment_steps += steps;
         self.shared.telemetry.environment_steps.inc_by(steps);
+        let episodes = batch.headers().iter().flat_map(|header| &header.episodes);
+        let diverged = episodes.filter(|episode| episode.end() == EpisodeEnd::Diverged).count();
+        self.shared.telemetry.episodes_diverged.inc_by(diverged as u64);
         self.batcher.trained(batch);
     }
 
