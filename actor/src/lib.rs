@@ -6,6 +6,7 @@
 //! - [`mailbox`] hands the newest parameters to the workers, who look at unroll boundaries only.
 //! - [`session`] is the connection to the learner: it joins, fetches assets, watches parameters, sends unrolls until
 //!   each is acknowledged, and comes back by itself after every loss.
+//! - [`dump`] keeps episodes whose simulation diverged, and plays them again.
 //! - [`run`] puts these together into an actor process.
 //! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads what the learner wrote.
 //! - [`render`] films a policy at work, or shows it in a window.
@@ -19,6 +20,7 @@ pub mod acting;
 pub mod bench;
 pub mod checkpoint;
 pub mod clips;
+pub mod dump;
 mod error;
 pub mod evaluate;
 pub mod mailbox;

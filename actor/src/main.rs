@@ -7,6 +7,7 @@ use std::process::ExitCode;
 use anyhow::Context as _;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use comic_actor::clips::Clips;
+use comic_actor::dump;
 use comic_actor::evaluate::command::Evaluate;
 use comic_actor::render::command::Render;
 use comic_actor::render::view::View;
@@ -43,6 +44,8 @@ enum Command {
     View(View),
     /// Lists, checks, imports, merges and fetches motion capture.
     Clips(Clips),
+    /// Plays a diverged episode again, as --dump-diverged wrote it down.
+    Replay(dump::Command),
     /// Measures how fast an actor is, one JSON line a figure.
     #[command(hide = true)]
     Bench(bench::Bench),
@@ -64,6 +67,9 @@ struct Act {
     /// Where files from the learner are kept; `comic` in the user's cache directory unless given.
     #[arg(long, value_name = "DIR", env = "COMIC_CACHE")]
     cache: Option<PathBuf>,
+    /// Write episodes whose simulation diverged there, at most 16; see `comic-actor replay`.
+    #[arg(long, value_name = "DIR")]
+    dump_diverged: Option<PathBuf>,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -98,14 +104,16 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
         Some(Command::Render(render)) => render.run().context("cannot film"),
         Some(Command::View(view)) => view.run().context("cannot show"),
         Some(Command::Clips(clips)) => clips.run().map_err(anyhow::Error::from),
+        Some(Command::Replay(replay)) => replay.run().context("cannot replay"),
         Some(Command::Bench(bench)) => bench.run().context("cannot measure"),
         None => {
-            let Act { learner, access, threads, environments, cache } = arguments.act;
+            let Act { learner, access, threads, environments, cache, dump_diverged } = arguments.act;
             let learner = learner.ok_or_else(|| {
                 Error::Usage("no learner: give its address with --learner http://host:7070, or see --help".into())
             })?;
             let (threads, environments) = (threads.map(usize::from), environments.map(usize::from));
-            run::run(&run::Options { learner, access, threads, environments, cache }).context("cannot act")
+            run::run(&run::Options { learner, access, threads, environments, cache, dump_diverged })
+                .context("cannot act")
         }
     }
 }

@@ -8,12 +8,12 @@ use std::time::{Duration, Instant};
 
 use comic_clips::Catalogue;
 use comic_proto::Access;
-use comic_tasks::Simulated;
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{mpsc, watch};
 
 use crate::Error;
+use crate::dump::{Dumps, Watched};
 use crate::mailbox::Mailbox;
 use crate::policy::TorchPolicy;
 use crate::seeds::derive;
@@ -43,9 +43,11 @@ pub struct Options {
     pub environments: Option<usize>,
     /// Directory of the asset cache; the user's own when absent.
     pub cache: Option<PathBuf>,
+    /// Directory for episodes that diverged, if they are to be kept.
+    pub dump_diverged: Option<PathBuf>,
 }
 
-type TaskWorker = Worker<Box<dyn Simulated>, TorchPolicy>;
+type TaskWorker = Worker<Watched, TorchPolicy>;
 
 /// Acts for a learner until the run is over.
 ///
@@ -78,7 +80,9 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
     let joined = runtime.block_on(session::join(&session, stop.clone()))?;
     let threads = options.threads.unwrap_or(joined.experiment.actor.threads).max(1);
     let environments = options.environments.unwrap_or(joined.experiment.actor.environments).max(1);
-    let (workers, parameters) = build(&joined, threads, environments)?;
+    let dumps = options.dump_diverged.as_deref();
+    let dumps = dumps.map(|directory| Dumps::new(directory, &joined.experiment, &joined.spec)).transpose()?;
+    let (workers, parameters) = build(&joined, threads, environments, dumps.as_ref())?;
     tracing::info!(experiment = joined.experiment.name, threads, environments, "acting");
 
     let unacknowledged = (2 * threads).saturating_mul(environments).clamp(FEWEST_UNACKNOWLEDGED, MOST_UNACKNOWLEDGED);
@@ -121,7 +125,12 @@ fn stop_on_signal(runtime: &Runtime, closing: Closing) -> Result<(), Error> {
 }
 
 /// The workers, and the bytes that the acting parameters take.
-fn build(joined: &Joined, threads: usize, environments: usize) -> Result<(Vec<TaskWorker>, u64), Error> {
+fn build(
+    joined: &Joined,
+    threads: usize,
+    environments: usize,
+    dumps: Option<&Arc<Dumps>>,
+) -> Result<(Vec<TaskWorker>, u64), Error> {
     let (experiment, spec) = (&joined.experiment, &joined.spec);
     let catalogue = Catalogue::open_with(&experiment.clips, |source| joined.assets.get(source).cloned())?;
     let task = comic_tasks::build(experiment, &catalogue)?;
@@ -133,8 +142,11 @@ fn build(joined: &Joined, threads: usize, environments: usize) -> Result<(Vec<Ta
     for thread in 0..threads as u64 {
         let seed = derive(joined.seed, thread);
         let environments = (1..=environments as u64)
-            .map(|environment| Arc::clone(&task).environment(derive(seed, environment)))
-            .collect::<Result<_, _>>()?;
+            .map(|environment| {
+                let seed = derive(seed, environment);
+                Ok(Watched::new(Arc::clone(&task).environment(seed)?, dumps.cloned(), seed))
+            })
+            .collect::<Result<_, comic_tasks::Error>>()?;
         // The first parameters off the wire replace what it starts with.
         let policy = TorchPolicy::untrained(spec, experiment, seed, || Ok([0.0; 56]))?;
         parameters = policy.to_parameters()?.len() as u64;

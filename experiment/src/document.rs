@@ -290,11 +290,14 @@ pub struct Learner {
     pub checkpoints_kept: usize,
     /// Seconds between metric lines.
     pub metrics_seconds: f64,
+    /// So many gradient steps in a row that were skipped, since a loss or gradient was not finite, lead back to the last
+    /// good state (D).
+    pub restore_after: u64,
 }
 
 impl Default for Learner {
     fn default() -> Self {
-        Self { threads: 1, checkpoint_seconds: 60.0, checkpoints_kept: 3, metrics_seconds: 5.0 }
+        Self { threads: 1, checkpoint_seconds: 60.0, checkpoints_kept: 3, metrics_seconds: 5.0, restore_after: 10 }
     }
 }
 

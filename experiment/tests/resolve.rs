@@ -341,6 +341,7 @@ fn values_outside_their_meaning_are_refused_by_name() {
         ("learner.checkpoint_seconds=0.0", "must be positive"),
         ("learner.checkpoints_kept=0", "must be at least 1"),
         ("learner.metrics_seconds=-1.0", "must be positive"),
+        ("learner.restore_after=0", "must be at least 1"),
         ("budget.minutes=-1.0", "must be 0, which is no limit, or more"),
     ] {
         let (field, value) = argument.split_once('=').unwrap();

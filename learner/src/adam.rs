@@ -1,12 +1,15 @@
 //! Adam (Kingma & Ba, 2015), with a state that can be saved and restored bit for bit.
 //!
 //! libtorch's own optimiser keeps its moments where no checkpoint reaches them. Here they are plain tensors, one pair a
-//! parameter, updated in place; the update is written so that a parameter takes seven passes over memory.
+//! parameter, updated in place; the update is written so that a parameter takes eight passes over memory.
+//!
+//! Whether a step counts is decided on the device: the step is computed either way, and one that does not count adds
+//! nothing. So nobody waits for the device within an update.
 
 use std::collections::HashMap;
 
 use comic_experiment::Optimiser;
-use tch::{Kind, Tensor};
+use tch::{Device, Kind, Tensor};
 
 /// What can go wrong when a state is restored.
 #[derive(Debug, thiserror::Error)]
@@ -49,9 +52,9 @@ struct Group {
     first: Vec<Tensor>,
     /// v, the mean of the squared gradient.
     second: Vec<Tensor>,
-    /// Steps taken, int64, a tensor so that it is saved like everything else.
+    /// Steps that counted, int64: only the device knows how many they are.
     steps: Tensor,
-    /// Float64, for the same reason.
+    /// Float64, a tensor so that it is saved like everything else.
     learning_rate: Tensor,
 }
 
@@ -75,13 +78,14 @@ impl Adam {
     pub fn add_group(&mut self, name: &str, parameters: Vec<(String, Tensor)>, learning_rate: f64) -> usize {
         let (names, parameters): (Vec<_>, Vec<_>) = parameters.into_iter().unzip();
         let zeros = || parameters.iter().map(|parameter| parameter.detach().zeros_like()).collect::<Vec<_>>();
+        let device = parameters.first().map_or(Device::Cpu, Tensor::device);
         self.groups.push(Group {
             name: name.to_string(),
             first: zeros(),
             second: zeros(),
             names,
             parameters,
-            steps: Tensor::from(0i64),
+            steps: Tensor::from(0i64).to_device(device),
             learning_rate: Tensor::from(learning_rate),
         });
         self.groups.len() - 1
@@ -110,29 +114,39 @@ impl Adam {
             for moment in group.first.iter_mut().chain(&mut group.second) {
                 let _ = moment.zero_();
             }
-            group.steps = Tensor::from(0i64);
+            let _ = group.steps.zero_();
         }
     }
 
-    /// One step of a group: θ ← θ − lr · m̂ / (√v̂ + ε), with gradients in the order of [`Adam::parameters`].
-    pub fn step(&mut self, group: usize, gradients: &[Tensor]) {
+    /// One step of a group: θ ← θ − lr · m̂ / (√v̂ + ε), with gradients in the order of [`Adam::parameters`]. Where
+    /// `counts`, a boolean scalar, is false, nothing changes, whatever the gradients are.
+    pub fn step(&mut self, group: usize, gradients: &[Tensor], counts: &Tensor) {
         let (beta1, beta2, epsilon) = (self.beta1, self.beta2, self.epsilon);
         let Some(group) = self.groups.get_mut(group) else { return };
-        let steps = group.steps.int64_value(&[]) + 1;
-        group.steps = Tensor::from(steps);
-        let bias1 = 1.0 - beta1.powf(steps as f64);
-        let bias2_root = (1.0 - beta2.powf(steps as f64)).sqrt();
-        // lr · (m / bias1) / (√v / bias2_root + ε) with both corrections moved into two scalars.
-        let step_size = group.learning_rate.double_value(&[]) * bias2_root / bias1;
-        let epsilon = epsilon * bias2_root;
+        let learning_rate = group.learning_rate.double_value(&[]);
         tch::no_grad(|| {
+            let _ = group.steps.g_add_(&counts.to_kind(Kind::Int64));
+            // Before the first step that counts there is nothing to correct.
+            let steps = group.steps.clamp_min(1).to_kind(Kind::Double);
+            let bias1: Tensor = 1.0 - Tensor::pow_scalar(beta1, &steps);
+            let bias2: Tensor = 1.0 - Tensor::pow_scalar(beta2, &steps);
+            let bias2_root = bias2.sqrt();
+            // lr · (m / bias1) / (√v / bias2_root + ε) with both corrections moved into two scalars.
+            let step_size = learning_rate * &bias2_root / bias1;
+            let epsilon = bias2_root * epsilon;
+            // A step that does not count divides by infinity and blends in zeros by −0, which unlike 0 leaves −0 as it is.
+            let scale = (-step_size.reciprocal()).where_scalarother(counts, f64::NEG_INFINITY);
+            let scalar = (Kind::Float, counts.device());
+            let [weight1, weight2] = [1.0 - beta1, 1.0 - beta2]
+                .map(|weight| Tensor::full([0i64; 0], weight, scalar).where_scalarother(counts, -0.0));
             let moments = group.first.iter_mut().zip(&mut group.second);
             for ((parameter, gradient), (first, second)) in group.parameters.iter_mut().zip(gradients).zip(moments) {
-                let _ = first.lerp_(gradient, 1.0 - beta1);
-                let _ = second.lerp_(&gradient.square(), 1.0 - beta2);
+                let gradient = gradient.where_scalarother(counts, 0.0);
+                let _ = first.lerp_tensor_(&gradient, &weight1);
+                let _ = second.lerp_tensor_(&gradient.square(), &weight2);
                 let mut divisor = second.sqrt();
-                let _ = divisor.g_add_scalar_(epsilon);
-                let _ = divisor.g_mul_scalar_(-1.0 / step_size);
+                let _ = divisor.g_add_(&epsilon);
+                let _ = divisor.g_mul_(&scale);
                 let _ = parameter.addcdiv_(first, &divisor);
             }
         });

@@ -3,7 +3,7 @@
 //! A checkpoint is a directory `checkpoint-NNNNNNNNNN` (the number of updates) with one file per part and a
 //! `MANIFEST.json` that holds each part's SHA-256. It is written beside its final name, synced, renamed, and the parent
 //! synced, so that a crash leaves either the whole checkpoint or none. Two more, `initial` and `warm-started`, are kept
-//! for comparison.
+//! for comparison. `best.json` says which one was evaluated best; it is kept, too, and the link `best` leads to it.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -11,10 +11,15 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail};
+use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
 const MANIFEST: &str = "MANIFEST.json";
 const EPOCH: &str = "epoch";
+const BEST: &str = "best";
+const BEST_RECORD: &str = "best.json";
+/// The part that says which life of the learner made a checkpoint, and what it had published.
+pub(crate) const PROGRESS: &str = "progress.json";
 
 /// A host snapshot of everything that changes the future: file names and their bytes.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -62,6 +67,45 @@ impl std::fmt::Display for Name {
     }
 }
 
+/// The parameters that an evaluation is about, as its report names them, and how good they are.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Evaluated {
+    /// The life of the learner.
+    pub epoch: u64,
+    /// The version.
+    pub version: u64,
+    /// Mean over the episodes of return / the most they could have paid.
+    pub normalised_reward: f64,
+}
+
+/// What an evaluation says of a checkpoint.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Judgement {
+    /// None was better: this one is kept from now on.
+    Best(Name),
+    /// A better one is kept already.
+    NotBetter,
+    /// It is not here any more.
+    Gone,
+}
+
+/// `best.json`.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Best {
+    /// The number of updates, by which checkpoints are named.
+    updates: u64,
+    learner_epoch: u64,
+    version: u64,
+    normalised_reward: f64,
+}
+
+impl Best {
+    fn name(self) -> Name {
+        Name::Updates(self.updates)
+    }
+}
+
 /// A run's checkpoint directory.
 #[derive(Debug)]
 pub struct Store {
@@ -93,7 +137,8 @@ impl Store {
         Ok(file)
     }
 
-    /// Begins a new life of the learner: an epoch larger than every earlier one, on disk before it is returned.
+    /// Begins a new life of the learner: an epoch larger than every earlier one, on disk before it is returned. What an
+    /// earlier life left half-done is put right.
     ///
     /// # Errors
     /// When the epoch file is unreadable or cannot be written.
@@ -110,7 +155,83 @@ impl Store {
         let temporary = self.directory.join(".epoch");
         write_synced(&temporary, epoch.to_string().as_bytes())?;
         self.put(&temporary, &path)?;
+        if let Some(best) = self.best() {
+            self.lead_to(best.name())?;
+        }
         Ok(epoch)
+    }
+
+    /// Keeps the checkpoint that was evaluated, besides the newest few, if none was better. Of several of the same version
+    /// the newest is meant.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn judge(&self, evaluated: Evaluated) -> Result<Judgement> {
+        let Evaluated { epoch: learner_epoch, version, normalised_reward } = evaluated;
+        let of_version = |updates: &u64| {
+            let position = position(&self.path(Name::Updates(*updates)));
+            position.is_some_and(|found| (found.epoch, found.version) == (learner_epoch, version))
+        };
+        let Some(updates) = numbered(&self.directory)?.into_iter().map(|(updates, _)| updates).rev().find(of_version)
+        else {
+            return Ok(Judgement::Gone);
+        };
+        if self.best().is_some_and(|best| best.normalised_reward >= normalised_reward) {
+            return Ok(Judgement::NotBetter);
+        }
+        let best = Best { updates, learner_epoch, version, normalised_reward };
+        let temporary = self.directory.join(".best.json");
+        write_synced(&temporary, &serde_json::to_vec_pretty(&best)?)?;
+        self.put(&temporary, &self.directory.join(BEST_RECORD))?;
+        self.lead_to(best.name())?;
+        Ok(Judgement::Best(best.name()))
+    }
+
+    /// What `best.json` says. A damaged one is complained about, and the next evaluation replaces it.
+    fn best(&self) -> Option<Best> {
+        let path = self.directory.join(BEST_RECORD);
+        let text = match fs::read(&path) {
+            Ok(text) => text,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return None,
+            Err(error) => {
+                tracing::warn!("{} cannot be read and is ignored: {error}", path.display());
+                return None;
+            }
+        };
+        let best = serde_json::from_slice::<Best>(&text);
+        match best {
+            Ok(best) if self.has(best.name()) => Some(best),
+            Ok(best) => {
+                tracing::warn!("{} names {}, which is not there, and is ignored", path.display(), best.name());
+                None
+            }
+            Err(error) => {
+                tracing::warn!("{} is damaged and is ignored: {error}", path.display());
+                None
+            }
+        }
+    }
+
+    /// Has the link `best` lead to a checkpoint.
+    fn lead_to(&self, name: Name) -> Result<()> {
+        let (link, temporary) = (self.directory.join(BEST), self.directory.join(".best"));
+        let target = name.to_string();
+        if fs::read_link(&link).is_ok_and(|found| found == Path::new(&target)) {
+            return Ok(());
+        }
+        match fs::remove_file(&temporary) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                return Err(error).with_context(|| format!("cannot remove {}", temporary.display()));
+            }
+            _ => {}
+        }
+        std::os::unix::fs::symlink(&target, &temporary)
+            .with_context(|| format!("cannot link {}", temporary.display()))?;
+        self.put(&temporary, &link)
+    }
+
+    fn path(&self, name: Name) -> PathBuf {
+        self.directory.join(name.to_string())
     }
 
     /// Writes a checkpoint whole, and forgets the oldest beyond the number kept.
@@ -118,7 +239,7 @@ impl Store {
     /// # Errors
     /// When the disk refuses; earlier checkpoints stay as they were.
     pub fn write(&self, name: Name, snapshot: &Snapshot) -> Result<PathBuf> {
-        let path = self.directory.join(name.to_string());
+        let path = self.path(name);
         let temporary = self.directory.join(format!(".{name}"));
         remove_if_there(&temporary)?;
         fs::create_dir(&temporary).with_context(|| format!("cannot make {}", temporary.display()))?;
@@ -148,7 +269,7 @@ impl Store {
     /// beside them would be a loss nobody asked for.
     pub fn newest(&self) -> Result<Option<(PathBuf, Snapshot)>> {
         let numbered = numbered(&self.directory)?;
-        for path in numbered.iter().rev() {
+        for (_, path) in numbered.iter().rev() {
             match read(path) {
                 Ok(snapshot) => return Ok(Some((path.clone(), snapshot))),
                 Err(error) => self.put_aside(path, &error)?,
@@ -170,14 +291,18 @@ impl Store {
 
     /// Whether a checkpoint of this name is there.
     pub fn has(&self, name: Name) -> bool {
-        self.directory.join(name.to_string()).is_dir()
+        self.path(name).is_dir()
     }
 
-    /// Keeps the newest few, and in any case the one just written.
+    /// Keeps the newest few, the best, and in any case the one just written.
     fn forget_oldest(&self, written: &Path) -> Result<()> {
         let numbered = numbered(&self.directory)?;
         let oldest = &numbered[..numbered.len().saturating_sub(self.kept)];
-        oldest.iter().filter(|path| *path != written).try_for_each(|path| remove_if_there(path))
+        let best = self.best().map(|best| best.updates);
+        oldest
+            .iter()
+            .filter(|(updates, path)| path != written && Some(*updates) != best)
+            .try_for_each(|(_, path)| remove_if_there(path))
     }
 
     #[allow(clippy::disallowed_methods, reason = "the one durable rename: contents synced before, directory after")]
@@ -187,22 +312,38 @@ impl Store {
     }
 }
 
-/// Numbered checkpoints, oldest first.
-fn numbered(directory: &Path) -> Result<Vec<PathBuf>> {
+/// Where a run stood when a checkpoint was made, as far as an evaluation names it.
+#[derive(Deserialize)]
+struct Position {
+    epoch: u64,
+    version: u64,
+}
+
+fn position(checkpoint: &Path) -> Option<Position> {
+    serde_json::from_slice(&fs::read(checkpoint.join(PROGRESS)).ok()?).ok()
+}
+
+/// Numbered checkpoints and their numbers, oldest first.
+fn numbered(directory: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(directory).with_context(|| format!("cannot list {}", directory.display()))? {
         let path = entry?.path();
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let digits = name.strip_prefix("checkpoint-").unwrap_or_default();
-        if digits.len() == 10 && digits.bytes().all(|byte| byte.is_ascii_digit()) && path.is_dir() {
-            found.push(path);
+        let well_formed = digits.len() == 10 && digits.bytes().all(|byte| byte.is_ascii_digit());
+        if let Ok(updates) = digits.parse()
+            && well_formed
+            && path.is_dir()
+        {
+            found.push((updates, path));
         }
     }
     found.sort();
     Ok(found)
 }
 
-/// The newest whole checkpoint that `path` names, and where it lies: a run's directory, its `checkpoints`, or one of them.
+/// The newest whole checkpoint that `path` names, and where it lies: a run's directory, its `checkpoints`, or one of them,
+/// `checkpoints/best` for instance.
 /// Of several, a damaged one is passed over with a warning; nothing is changed.
 ///
 /// # Errors
@@ -213,7 +354,7 @@ pub fn find(path: &Path) -> Result<(PathBuf, Snapshot)> {
     }
     let below = path.join("checkpoints");
     let directory = if below.is_dir() { below } else { path.to_path_buf() };
-    for path in numbered(&directory)?.into_iter().rev() {
+    for (_, path) in numbered(&directory)?.into_iter().rev() {
         match read(&path) {
             Ok(snapshot) => return Ok((path, snapshot)),
             Err(error) => tracing::warn!(checkpoint = %path.display(), "passed over a damaged checkpoint: {error:#}"),

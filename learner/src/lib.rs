@@ -6,12 +6,15 @@
 //! - [`trainer`] is the OS thread that owns the device: batches in, gradient steps, parameters out. [`warm_start`] is what
 //!   it does before.
 //! - [`vmpo`] is the algorithm: losses, and the gradient step. [`adam`] is its optimiser.
+//! - `setbacks` counts gradient steps that were skipped, and leads back to the last good state.
 //! - `state` turns the trainer into a snapshot and back. [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
 //! - [`export`] makes a checkpoint's policy a file that others read.
 //! - [`metrics`] is what a person sees of learning, [`telemetry`] what Prometheus sees of the service, by way of [`probes`].
+//! - [`quarantine`] keeps unrolls that were refused, for whoever looks into it.
 //! - [`security`] is who may talk to it; [`certs`] makes certificates for trying that out.
 //! - [`status`] and [`health`] are commands that ask another learner how it is.
-//! - [`sizes`] counts parameters, [`bench`] times the update, [`load`] the service.
+//! - [`sizes`] counts parameters, [`memory`] the bytes that buffers can take; [`bench`] times the update, [`load`] the
+//!   service.
 //!
 //! There is no MuJoCo here: whatever needs a simulator is done by actors.
 
@@ -22,13 +25,16 @@ pub mod checkpoint;
 pub mod export;
 pub mod health;
 pub mod load;
+pub mod memory;
 pub mod metrics;
 pub mod options;
 pub mod probes;
 pub mod publish;
+pub mod quarantine;
 pub mod run;
 pub mod security;
 pub mod service;
+mod setbacks;
 pub mod sizes;
 mod state;
 pub mod statistics;

@@ -24,6 +24,7 @@ struct Window {
     unrolls: u64,
     age: u64,
     updates: u64,
+    updates_skipped: u64,
 }
 
 /// Sums over episodes.
@@ -182,6 +183,11 @@ impl Metrics {
         self.window.updates += 1;
     }
 
+    /// Counts gradient steps that were skipped.
+    pub fn count_skipped(&mut self, steps: u64) {
+        self.window.updates_skipped += steps;
+    }
+
     /// Counts a batch's episodes, and the age of its unrolls where `version` is the newest.
     pub fn absorb(&mut self, headers: &[UnrollHeader], version: u64) {
         let window = &mut self.window;
@@ -221,6 +227,7 @@ impl Metrics {
             "environment_steps": position.environment_steps,
             "updates": position.updates,
             "version": position.version,
+            "updates_skipped": window.updates_skipped,
             "steps_per_second": environment_steps as f64 / seconds,
             "updates_per_second": window.updates as f64 / seconds,
             "unroll_age": per(window.age as f64, window.unrolls),

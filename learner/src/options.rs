@@ -10,6 +10,7 @@ use comic_networks::export::Part;
 use crate::certs::Certs;
 use crate::health::Health;
 use crate::load::Load;
+use crate::quarantine::QuarantineOptions;
 use crate::security::{Limits, SecurityOptions};
 use crate::status::Status;
 
@@ -38,6 +39,9 @@ pub struct Options {
     /// How many get in.
     #[command(flatten)]
     pub limits: Limits,
+    /// What becomes of invalid unrolls.
+    #[command(flatten)]
+    pub quarantine: QuarantineOptions,
     /// The run's directory: checkpoints, metrics.jsonl, the resolved experiment. A directory that holds checkpoints is
     /// resumed.
     #[arg(long, value_name = "DIR", default_value = "runs/default")]

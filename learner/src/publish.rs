@@ -18,12 +18,15 @@ use tokio::sync::{Notify, watch};
 /// Bytes of parameters in a piece. Each piece is memory of its own, so a reader that stalls for ever holds one or two
 /// pieces and never the version they are of.
 pub(crate) const PIECE: usize = 32 * 1024;
+/// Versions that readers can be in the middle of.
+const HELD: usize = 6;
+/// Versions in memory: those held, the newest, the one that is just being made, and what it is made of.
+pub(crate) const VERSIONS: usize = HELD + 3;
 
 /// How many versions are held for their readers, and how long.
 #[derive(Clone, Copy, Debug)]
 pub struct Holding {
-    /// Versions that readers can be in the middle of. With the newest one, and one that is just being made, they are the
-    /// memory that parameters take, however many read.
+    /// Versions that readers can be in the middle of: what parameters take of memory, however many read.
     pub versions: usize,
     /// A version of which nobody took a piece for so long gives its place to a newer one.
     pub idle: Duration,
@@ -33,7 +36,7 @@ pub struct Holding {
 
 impl Default for Holding {
     fn default() -> Self {
-        Self { versions: 6, idle: Duration::from_secs(2), longest: Duration::from_secs(60) }
+        Self { versions: HELD, idle: Duration::from_secs(2), longest: Duration::from_secs(60) }
     }
 }
 
@@ -46,7 +49,6 @@ pub struct Published {
     pub behaviour: Behaviour,
     /// Grows with every publication, of the same version again too.
     serial: u64,
-    /// Every [`ParametersChunk`] as gRPC sends it, at least one.
     frames: Vec<Bytes>,
     /// Who is in the middle of it.
     readers: AtomicUsize,
@@ -67,6 +69,11 @@ impl Published {
             })
         });
         Self { version, behaviour, serial, frames: frames.collect(), readers: AtomicUsize::new(0) }
+    }
+
+    /// Every [`ParametersChunk`] as gRPC sends it, at least one.
+    pub fn frames(&self) -> &[Bytes] {
+        &self.frames
     }
 }
 

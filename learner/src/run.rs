@@ -196,6 +196,7 @@ fn prepare(options: &Options, experiment: Experiment, security: Security) -> Res
         assets: catalogue.assets()?,
         batcher: batcher.clone(),
         publisher: publisher.clone(),
+        quarantine: options.quarantine.clone(),
     })?;
     let run = options.run.clone();
     let setup = Setup { experiment, spec, pose, run, epoch, resume, batcher, publisher, shared: shared.clone() };

@@ -15,7 +15,7 @@ mod admission;
 mod assets;
 mod broadcast;
 mod calls;
-mod complaints;
+pub(crate) mod complaints;
 mod incoming;
 mod roster;
 mod status;
@@ -39,8 +39,10 @@ use tokio::sync::watch;
 use tonic::transport::Server;
 use tonic_health::ServingStatus;
 
+use crate::checkpoint::Evaluated;
 use crate::options::Misuse;
 use crate::publish::Publisher;
+use crate::quarantine::{Quarantine, QuarantineOptions};
 use crate::security::{Limits, Security, Tls, Tokens};
 use crate::telemetry::Telemetry;
 use admission::Admission;
@@ -62,7 +64,7 @@ const STREAM_WINDOW: u32 = 512 * 1024;
 const FRAME_SIZE: u32 = 256 * 1024;
 /// Bytes an unread connection may have under way. Above the stream's, or a full unroll stream would stall every other
 /// call of its actor.
-const CONNECTION_WINDOW: u32 = 1024 * 1024;
+pub(crate) const CONNECTION_WINDOW: u32 = 1024 * 1024;
 /// Streams a connection may have open; an actor needs three.
 const MAX_STREAMS: u32 = 64;
 /// The decoding limit when unrolls are smaller than that: a report on many clips is JSON of some hundred KB.
@@ -91,6 +93,8 @@ pub struct Setup {
     pub batcher: Batcher,
     /// Where parameters come from; its epoch is the service's.
     pub publisher: Publisher,
+    /// Where invalid unrolls go.
+    pub quarantine: QuarantineOptions,
 }
 
 /// An evaluation that an actor reported.
@@ -102,6 +106,15 @@ pub struct Evaluation {
     pub version: u64,
     /// As `comic-actor evaluate --json` prints it.
     pub json: String,
+}
+
+impl Evaluation {
+    /// What it says of the parameters; `None` of a report without a mean.
+    pub(crate) fn evaluated(&self) -> Option<Evaluated> {
+        let report: serde_json::Value = serde_json::from_str(&self.json).ok()?;
+        let normalised_reward = report["overall"]["normalised_reward"].as_f64()?;
+        Some(Evaluated { epoch: self.epoch, version: self.version, normalised_reward })
+    }
 }
 
 /// What all calls, and the trainer, have in common.
@@ -129,6 +142,7 @@ pub struct Shared {
     limits: Limits,
     message_limit: usize,
     roster: Arc<Roster>,
+    quarantine: Option<Quarantine>,
     pub(crate) telemetry: Arc<Telemetry>,
     closing: watch::Sender<bool>,
 }
@@ -138,9 +152,9 @@ impl Shared {
     ///
     /// # Errors
     /// [`Misuse`] when no unroll fits the limit of a message; otherwise when the batcher's layout or epoch are not those
-    /// of the rest, or experiment or spec cannot be written as TOML.
+    /// of the rest, experiment or spec cannot be written as TOML, or there is no quarantine where one was asked for.
     pub fn new(setup: Setup) -> Result<Arc<Self>> {
-        let Setup { run, security, limits, experiment, spec, assets, batcher, publisher } = setup;
+        let Setup { run, security, limits, experiment, spec, assets, batcher, publisher, quarantine } = setup;
         let shape = UnrollShape::new(&spec, &experiment);
         let found = *batcher.layout().shape();
         ensure!(shape == found, "the batcher takes unrolls of {found:?}, the experiment makes {shape:?}");
@@ -152,6 +166,7 @@ impl Shared {
             let remedy = format!("--max-message-bytes {message_limit} lets no unroll through: it takes {needed}");
             return Err(Misuse::new(remedy).into());
         }
+        let telemetry = Arc::<Telemetry>::default();
         let buffers = experiment.unroll.ahead as u64 + 1;
         Ok(Arc::new(Self {
             name: experiment.name.clone(),
@@ -163,7 +178,8 @@ impl Shared {
             message_limit,
             roster: Arc::new(Roster::new(limits.max_actors)),
             limits,
-            telemetry: Arc::default(),
+            quarantine: Quarantine::start(&quarantine, &telemetry)?,
+            telemetry,
             task_spec: toml::to_string(&spec).context("the task's spec cannot be written as TOML")?,
             seed: experiment.seed,
             experiment: experiment.to_toml()?,
@@ -188,13 +204,20 @@ impl Shared {
         lock(&self.evaluations).drain(..).collect()
     }
 
+    /// How many may be connected, how many calls may be in flight, how many bytes a message may have, and how many
+    /// refused ones may wait for the disk.
+    pub(crate) fn ingest(&self) -> (usize, usize, usize, usize) {
+        let held = if self.quarantine.is_some() { Quarantine::HELD } else { 0 };
+        (self.limits.max_connections(), self.limits.max_requests, self.message_limit, held)
+    }
+
     /// Whether the server goes down.
     pub(crate) fn is_closing(&self) -> bool {
         *self.closing.borrow()
     }
 
-    /// False when too many wait already.
-    fn keep_evaluation(&self, evaluation: Evaluation) -> bool {
+    /// Keeps an evaluation for the trainer. False when too many wait already.
+    pub fn keep_evaluation(&self, evaluation: Evaluation) -> bool {
         let mut waiting = lock(&self.evaluations);
         let room = waiting.len() < EVALUATIONS;
         if room {

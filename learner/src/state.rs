@@ -1,12 +1,14 @@
 //! The trainer's whole state as a snapshot, and back: everything that changes the future.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 use bytes::Bytes;
 use comic_networks::to_safetensors;
 
-use crate::checkpoint::{Name, Snapshot};
+use crate::checkpoint::{Name, PROGRESS, Snapshot};
+use crate::memory::{Bounds, Sizes};
 use crate::trainer::{Progress, Trainer};
 
 impl Trainer {
@@ -15,9 +17,34 @@ impl Trainer {
         if !final_one && self.writer.is_busy() {
             return Ok(());
         }
-        self.writer.write(Name::Updates(self.progress.updates), self.snapshot()?)?;
+        self.keep(Name::Updates(self.progress.updates))
+    }
+
+    /// Has the state written, and keeps it in memory to turn back to; only a sound one.
+    pub(crate) fn keep(&mut self, name: Name) -> Result<()> {
+        if !self.is_sound() {
+            tracing::warn!(checkpoint = %name, "not written: the last gradient steps were not finite");
+            return Ok(());
+        }
+        self.good = Arc::new(self.snapshot()?);
         self.checkpointed = Instant::now();
-        Ok(())
+        self.writer.write(name, self.good.clone())
+    }
+
+    /// How much memory the learner's buffers can take, now that every size is known.
+    pub(crate) fn memory(&self) -> Bounds {
+        let (connections, requests, message, quarantined) = self.shared.ingest();
+        Bounds::new(&Sizes {
+            ahead: self.experiment.unroll.ahead,
+            batch: self.experiment.unroll.batch,
+            unroll: self.batcher.layout().size(),
+            connections,
+            requests,
+            message,
+            quarantined,
+            parameters: self.target.len(),
+            snapshot: self.good.parts.values().map(Vec::len).sum(),
+        })
     }
 
     pub(crate) fn snapshot(&self) -> Result<Snapshot> {
@@ -31,7 +58,7 @@ impl Trainer {
             ("policy.safetensors", to_safetensors(self.learner.policy_store())?),
             ("target.safetensors", self.target.to_vec()),
             ("learner.safetensors", crate::tensors::to_bytes(&tensors)?),
-            ("progress.json", serde_json::to_vec_pretty(&progress)?),
+            (PROGRESS, serde_json::to_vec_pretty(&progress)?),
             ("books.json", serde_json::to_vec_pretty(&self.batcher.snapshot())?),
         ] {
             snapshot.parts.insert(name.to_string(), bytes);
@@ -40,12 +67,17 @@ impl Trainer {
     }
 
     pub(crate) fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let mut tensors = crate::tensors::from_bytes(snapshot.part("learner.safetensors")?)?;
-        self.statistics.restore(&mut tensors)?;
-        self.learner.load_state(&tensors).context("the checkpoint does not fit the experiment's networks")?;
+        self.restore_learner(snapshot)?;
         self.target = Bytes::copy_from_slice(snapshot.part("target.safetensors")?);
         self.progress =
-            serde_json::from_slice(snapshot.part("progress.json")?).context("the checkpoint's progress is damaged")?;
+            serde_json::from_slice(snapshot.part(PROGRESS)?).context("the checkpoint's progress is damaged")?;
         Ok(())
+    }
+
+    /// What was learnt, without what counts.
+    pub(crate) fn restore_learner(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let mut tensors = crate::tensors::from_bytes(snapshot.part("learner.safetensors")?)?;
+        self.statistics.restore(&mut tensors)?;
+        self.learner.load_state(&tensors).context("the checkpoint does not fit the experiment's networks")
     }
 }

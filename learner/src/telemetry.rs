@@ -108,10 +108,13 @@ pub struct Telemetry {
     catalogue: Catalogue,
     ages: Mutex<Ages>,
     pub(crate) updates: Counter,
+    pub(crate) updates_skipped: Counter,
+    pub(crate) restores: Counter,
     pub(crate) update_seconds: Histogram,
     pub(crate) unroll_age: Histogram,
     pub(crate) unroll_bytes: Histogram,
     pub(crate) environment_steps: Counter,
+    pub(crate) episodes_diverged: Counter,
     pub(crate) evaluations: Counter,
     pub(crate) checkpoints: Labelled<Counter>,
     pub(crate) joins: Labelled<Counter>,
@@ -119,6 +122,7 @@ pub struct Telemetry {
     pub(crate) connections_refused: Labelled<Counter>,
     pub(crate) requests: Gauge,
     pub(crate) requests_refused: Labelled<Counter>,
+    pub(crate) quarantined: Labelled<Counter>,
     sampled: Sampled,
 }
 
@@ -185,6 +189,14 @@ impl Default for Telemetry {
         let all = &mut catalogue;
         Self {
             updates: all.counter("comic_updates", "Batches that V-MPO trained on"),
+            updates_skipped: all.counter(
+                "comic_updates_skipped",
+                "Gradient steps that changed nothing, since a loss or gradient was not finite",
+            ),
+            restores: all.counter(
+                "comic_restores",
+                "Returns to the last good state, after learner.restore_after skipped gradient steps in a row",
+            ),
             update_seconds: all.histogram(
                 "comic_update_seconds",
                 "Seconds of an update: tensors, gradient steps, publication",
@@ -201,6 +213,10 @@ impl Default for Telemetry {
                 exponential_buckets(1024.0, 4.0, 9),
             ),
             environment_steps: all.counter("comic_environment_steps", "Environment steps trained on"),
+            episodes_diverged: all.counter(
+                "comic_episodes_diverged",
+                "Episodes trained on that ended since the simulation diverged; see comic-actor --dump-diverged",
+            ),
             evaluations: all.counter("comic_evaluations", "Evaluations that actors reported"),
             checkpoints: all.labelled(
                 "counter",
@@ -227,6 +243,12 @@ impl Default for Telemetry {
                 ("comic_requests_refused", "reason"),
                 &["unauthenticated", "overloaded"],
                 "Calls refused: no accepted token, or --max-requests in flight",
+            ),
+            quarantined: all.labelled(
+                "counter",
+                ("comic_quarantined", "result"),
+                &["kept", "full", "busy", "failed"],
+                "Invalid unrolls by what became of them with --quarantine: on disk, beyond --quarantine-bytes, too many at once, not written",
             ),
             sampled: Sampled::new(all),
             catalogue,

@@ -4,26 +4,27 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
-use anyhow::{Result, bail};
+use anyhow::Result;
 use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_networks::to_safetensors;
 use comic_proto::Field;
-use comic_proto::v1::Behaviour;
+use comic_proto::v1::{Behaviour, EpisodeEnd};
 use comic_replay::{Batch, Batcher, Next, Phase, Reason};
 use rand::SeedableRng as _;
 use rand::seq::SliceRandom as _;
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value, json};
+use serde_json::{Map, Value};
 use tch::Device;
 
 use crate::checkpoint::{Name, Snapshot, Store};
 use crate::metrics::{Metrics, Position};
 use crate::publish::Publisher;
 use crate::service::Shared;
+use crate::setbacks::Setbacks;
 use crate::statistics::ObservationStatistics;
-use crate::vmpo::{self, Losses, MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
+use crate::vmpo::{Losses, MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
 use crate::writer::Writer;
 
 /// How often a trainer without batches looks at the clock.
@@ -90,15 +91,18 @@ pub struct Trainer {
     pub(crate) progress: Progress,
     /// Since when this life counts time, and what had been counted then.
     clock: Option<(Instant, f64)>,
-    losses: Map<String, Value>,
+    pub(crate) losses: Map<String, Value>,
     pub(crate) batcher: Batcher,
     publisher: Publisher,
-    shared: Arc<Shared>,
+    pub(crate) shared: Arc<Shared>,
     /// Unrolls of versions before this one are superseded.
-    oldest: u64,
+    pub(crate) oldest: u64,
     pub(crate) metrics: Metrics,
     pub(crate) writer: Writer,
     pub(crate) checkpointed: Instant,
+    /// The newest checkpoint, in memory: where a learner turns back to that lost its way.
+    pub(crate) good: Arc<Snapshot>,
+    pub(crate) setbacks: Setbacks,
 }
 
 impl Trainer {
@@ -129,6 +133,8 @@ impl Trainer {
             metrics: Metrics::open(&run, &spec)?,
             writer: Writer::start(store, shared.telemetry.clone())?,
             checkpointed: Instant::now(),
+            good: Arc::default(),
+            setbacks: Setbacks::new(experiment.learner.restore_after),
             experiment,
             spec,
             epoch,
@@ -138,16 +144,20 @@ impl Trainer {
             shared,
         };
         match resume {
-            Some(snapshot) => trainer.restore(&snapshot)?,
-            None => trainer.writer.write(Name::Initial, trainer.snapshot()?)?,
+            Some(snapshot) => {
+                trainer.restore(&snapshot)?;
+                trainer.good = Arc::new(snapshot);
+            }
+            None => trainer.keep(Name::Initial)?,
         }
+        tracing::info!("buffers take {}", trainer.memory());
         Ok(trainer)
     }
 
     /// Demonstrations and regression if the experiment wants them, then V-MPO, then a last checkpoint.
     ///
     /// # Errors
-    /// When a number is no longer finite, or the disk refuses.
+    /// When gradient steps go on being skipped after a return to the last good state, or the disk refuses.
     pub fn run(mut self) -> Result<Ending> {
         let ending = match self.train() {
             Ok(ending) => ending,
@@ -157,6 +167,7 @@ impl Trainer {
                 return Err(error);
             }
         };
+        self.take_evaluations()?;
         self.write_metrics()?;
         self.checkpoint(true)?;
         self.writer.finish()?;
@@ -291,17 +302,25 @@ impl Trainer {
         (0..steps).map(move |step| tensors.select(&order[step * size..(step + 1) * size]))
     }
 
-    /// Counts a batch's steps, and gives its memory back.
+    /// Counts a batch's steps and diverged episodes, and gives its memory back.
     pub(crate) fn book(&mut self, batch: Batch) {
         let tasks = tasks_of_unrolls(&batch, &self.spec);
         let steps = self.metrics.count_steps(&batch, &tasks);
         self.progress.environment_steps += steps;
         self.shared.telemetry.environment_steps.inc_by(steps);
+        let episodes = batch.headers().iter().flat_map(|header| &header.episodes);
+        let diverged = episodes.filter(|episode| episode.end() == EpisodeEnd::Diverged).count();
+        self.shared.telemetry.episodes_diverged.inc_by(diverged as u64);
         self.batcher.trained(batch);
     }
 
     /// Publishes the online policy as the next version: from now on it is the target network, with which actors act.
+    /// One that is not sound stays here: from actors that cannot act nothing comes that would show it.
     pub(crate) fn publish(&mut self, behaviour: Behaviour) -> Result<()> {
+        if !self.is_sound() {
+            tracing::warn!(update = self.progress.updates, "not published: the last gradient steps were not finite");
+            return Ok(());
+        }
         self.target = Bytes::from(to_safetensors(self.learner.policy_store())?);
         self.progress.version += 1;
         self.announce(behaviour);
@@ -330,24 +349,6 @@ impl Trainer {
 
     pub(crate) fn set_normaliser(&mut self) -> Result<()> {
         Ok(self.learner.set_normaliser(&self.statistics.to_normaliser()?)?)
-    }
-
-    /// Keeps the newest losses for the metrics, and refuses to go on with numbers that are none.
-    pub(crate) fn report(&mut self, losses: &vmpo::Metrics) -> Result<()> {
-        if !losses.is_finite() {
-            bail!(
-                "update {}: a loss is not finite ({losses:?}); the last checkpoint is from before, a lower learning \
-                 rate or vmpo.epsilon_mean is the usual remedy",
-                self.progress.updates
-            );
-        }
-        self.losses = losses.entries().into_iter().map(|(name, value)| (name.to_string(), json!(value))).collect();
-        if self.spec.tasks.len() > 1 && losses.temperatures.len() == self.spec.tasks.len() {
-            let names = self.spec.tasks.iter().map(|task| task.name.clone());
-            let temperatures: Map<_, _> = names.zip(losses.temperatures.iter().map(|eta| json!(eta))).collect();
-            self.losses.insert("temperatures".to_string(), Value::Object(temperatures));
-        }
-        Ok(())
     }
 
     pub(crate) fn seconds(&self) -> f64 {
@@ -390,10 +391,22 @@ impl Trainer {
         if self.metrics.elapsed() < self.experiment.learner.metrics_seconds {
             return Ok(());
         }
-        for evaluation in self.shared.take_evaluations() {
-            self.metrics.keep_evaluation(&evaluation);
+        // Otherwise they wait where they are, and training goes on.
+        if !self.writer.is_busy() {
+            self.take_evaluations()?;
         }
         if self.metrics.has_news(&self.books()?) { self.write_metrics() } else { Ok(()) }
+    }
+
+    /// Keeps what actors found out about checkpoints.
+    fn take_evaluations(&self) -> Result<()> {
+        for evaluation in self.shared.take_evaluations() {
+            self.metrics.keep_evaluation(&evaluation);
+            if let Some(evaluated) = evaluation.evaluated() {
+                self.writer.judge(evaluated)?;
+            }
+        }
+        Ok(())
     }
 
     fn books(&self) -> Result<Value> {
@@ -409,9 +422,6 @@ impl Trainer {
             epoch: self.epoch,
         };
         let books = self.books()?;
-        for evaluation in self.shared.take_evaluations() {
-            self.metrics.keep_evaluation(&evaluation);
-        }
         let line = self.metrics.write(position, books, self.losses.clone());
         tracing::info!(target: "metrics", "{line}");
         self.shared.set_metrics(line);

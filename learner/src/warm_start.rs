@@ -1,5 +1,7 @@
 //! The warm start: regression towards the servo action on demonstrations that actors make.
 
+use std::sync::Arc;
+
 use anyhow::Result;
 use comic_proto::v1::Behaviour;
 use rand::Rng as _;
@@ -7,7 +9,7 @@ use rand::seq::index::sample;
 
 use crate::checkpoint::Name;
 use crate::trainer::{Trainer, Wait};
-use crate::vmpo::MinibatchTensors;
+use crate::vmpo::{Losses, MinibatchTensors};
 
 impl Trainer {
     /// Gathers demonstrations, regresses on them, and leaves the checkpoint `warm-started`. `None` when the learner was
@@ -19,12 +21,17 @@ impl Trainer {
         if self.experiment.network.normaliser_steps > 0 {
             self.set_normaliser()?;
         }
+        // Without the scale of the observations there would be no way on from the state before.
+        self.good = Arc::new(self.snapshot()?);
         let config = self.experiment.warm_start.clone();
         tracing::info!(steps = config.steps, "regressing on them");
-        self.learner.set_learning_rates(config.learning_rate, self.experiment.optimiser.multiplier_learning_rate);
+        let mut unreported = Vec::new();
         for step in 0..config.steps {
-            let losses = self.regress(&mut demonstrations, config.minibatch_unrolls)?;
-            if step % 50 == 0 || step + 1 == config.steps {
+            self.learner.set_learning_rates(config.learning_rate, self.experiment.optimiser.multiplier_learning_rate);
+            unreported.push(self.regress(&mut demonstrations, config.minibatch_unrolls)?);
+            if (step % 50 == 0 || step + 1 == config.steps)
+                && let Some(losses) = Losses::mean(&std::mem::take(&mut unreported))
+            {
                 let losses = losses.to_metrics();
                 self.report(&losses)?;
                 tracing::info!(step, regression = losses.regression_loss, latent_kl = losses.latent_kl, "regressing");
@@ -37,7 +44,7 @@ impl Trainer {
         self.learner.reset_optimiser();
         self.progress.warm_started = true;
         self.publish(Behaviour::Policy)?;
-        self.writer.write(Name::WarmStarted, self.snapshot()?)?;
+        self.keep(Name::WarmStarted)?;
         Ok(Some(()))
     }
 
@@ -71,7 +78,7 @@ impl Trainer {
 
     /// One step on some unrolls of one batch. The demonstrator has no latent, so z_{t−1} is this encoder's own: what it
     /// gave when it last saw these unrolls.
-    fn regress(&mut self, demonstrations: &mut [MinibatchTensors], unrolls: usize) -> Result<crate::vmpo::Losses> {
+    fn regress(&mut self, demonstrations: &mut [MinibatchTensors], unrolls: usize) -> Result<Losses> {
         let random = &mut self.progress.random;
         let batch = &mut demonstrations[random.random_range(0..demonstrations.len())];
         let of = batch.shape().unrolls;

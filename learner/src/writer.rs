@@ -1,4 +1,5 @@
-//! Checkpoints are written by a thread of their own, so that training goes on.
+//! Checkpoints are written by a thread of their own, so that training goes on. It alone changes the checkpoint directory
+//! while the trainer lives.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -7,14 +8,21 @@ use std::thread::JoinHandle;
 
 use anyhow::{Context as _, Result, anyhow};
 
-use crate::checkpoint::{Name, Snapshot, Store};
+use crate::checkpoint::{Evaluated, Judgement, Name, Snapshot, Store};
 use crate::telemetry::Telemetry;
 
-/// The writing thread. At most one snapshot waits behind the one being written.
+/// What the thread is asked to do.
+#[derive(Debug)]
+enum Order {
+    Write(Name, Arc<Snapshot>),
+    Judge(Evaluated),
+}
+
+/// The writing thread. At most one order waits behind the one being carried out.
 #[derive(Debug)]
 pub struct Writer {
-    queue: SyncSender<(Name, Snapshot)>,
-    /// Snapshots handed over and not yet written.
+    queue: SyncSender<Order>,
+    /// Orders given and not yet carried out.
     pending: Arc<AtomicUsize>,
     thread: JoinHandle<Result<()>>,
 }
@@ -30,23 +38,35 @@ impl Writer {
         let shared = Arc::clone(&pending);
         let thread = std::thread::Builder::new()
             .name("checkpoints".into())
-            .spawn(move || write_all(&store, &received, &shared, &telemetry))
+            .spawn(move || obey(&store, &received, &shared, &telemetry))
             .context("cannot start the checkpoint thread")?;
         Ok(Self { queue, pending, thread })
     }
 
-    /// Whether a snapshot is still being written.
+    /// Whether an order is still being carried out: until then another one may have to wait.
     pub fn is_busy(&self) -> bool {
         self.pending.load(Ordering::Acquire) > 0
     }
 
-    /// Has `snapshot` written; waits while another one waits.
+    /// Has `snapshot` written; waits while another order waits.
     ///
     /// # Errors
     /// When the thread is gone.
-    pub fn write(&self, name: Name, snapshot: Snapshot) -> Result<()> {
+    pub fn write(&self, name: Name, snapshot: Arc<Snapshot>) -> Result<()> {
+        self.order(Order::Write(name, snapshot))
+    }
+
+    /// Has the checkpoint that was evaluated kept if it is the best; waits while another order waits.
+    ///
+    /// # Errors
+    /// When the thread is gone.
+    pub fn judge(&self, evaluated: Evaluated) -> Result<()> {
+        self.order(Order::Judge(evaluated))
+    }
+
+    fn order(&self, order: Order) -> Result<()> {
         self.pending.fetch_add(1, Ordering::AcqRel);
-        self.queue.send((name, snapshot)).map_err(|_| anyhow!("the checkpoint thread is gone"))
+        self.queue.send(order).map_err(|_| anyhow!("the checkpoint thread is gone"))
     }
 
     /// Waits until everything is on disk.
@@ -60,20 +80,34 @@ impl Writer {
 }
 
 /// A disk that refuses once may take the next one: training goes on, and the log says so. The last one counts.
-fn write_all(
-    store: &Store,
-    queue: &Receiver<(Name, Snapshot)>,
-    pending: &AtomicUsize,
-    telemetry: &Telemetry,
-) -> Result<()> {
+fn obey(store: &Store, queue: &Receiver<Order>, pending: &AtomicUsize, telemetry: &Telemetry) -> Result<()> {
     let mut last = Ok(());
-    while let Ok((name, snapshot)) = queue.recv() {
-        last = store.write(name, &snapshot).map(|path| tracing::info!(checkpoint = %path.display(), "written"));
-        telemetry.checkpoints.of(if last.is_ok() { "written" } else { "failed" }).inc();
-        if let Err(error) = &last {
-            tracing::error!(checkpoint = %name, "checkpoint not written: {error:#}");
+    while let Ok(order) = queue.recv() {
+        match order {
+            Order::Write(name, snapshot) => {
+                last = store.write(name, &snapshot).map(|path| tracing::info!(checkpoint = %path.display(), "written"));
+                telemetry.checkpoints.of(if last.is_ok() { "written" } else { "failed" }).inc();
+                if let Err(error) = &last {
+                    tracing::error!(checkpoint = %name, "checkpoint not written: {error:#}");
+                }
+            }
+            Order::Judge(evaluated) => judge(store, evaluated),
         }
         pending.fetch_sub(1, Ordering::AcqRel);
     }
     last
+}
+
+fn judge(store: &Store, evaluated: Evaluated) {
+    let Evaluated { epoch, version, normalised_reward } = evaluated;
+    match store.judge(evaluated) {
+        Ok(Judgement::Best(name)) => {
+            tracing::info!(checkpoint = %name, normalised_reward, "the best checkpoint so far")
+        }
+        Ok(Judgement::NotBetter) => {}
+        Ok(Judgement::Gone) => {
+            tracing::warn!(epoch, version, normalised_reward, "the checkpoint that was evaluated is not kept any more");
+        }
+        Err(error) => tracing::error!(normalised_reward, "the best checkpoint is not noted: {error:#}"),
+    }
 }

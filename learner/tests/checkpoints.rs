@@ -1,6 +1,8 @@
 //! Checkpoints are whole or not there, and a damaged one costs no more than itself.
 
-use comic_learner::checkpoint::{Name, Snapshot, Store, find, read};
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
+use comic_learner::checkpoint::{Evaluated, Judgement, Name, Snapshot, Store, find, read};
 
 fn snapshot(content: &str) -> Snapshot {
     let mut snapshot = Snapshot::default();
@@ -135,4 +137,84 @@ fn a_damaged_epoch_is_an_error_that_names_the_file() {
     let store = Store::open(run.path(), 1).unwrap();
     std::fs::write(run.path().join("checkpoints/epoch"), "many").unwrap();
     assert!(format!("{:#}", store.begin_life().unwrap_err()).contains("epoch"));
+}
+
+/// A run of which every checkpoint published a version of its own, a tenth of its updates.
+fn evaluated_run(updates: &[u64]) -> (tempfile::TempDir, Store) {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 2).unwrap();
+    updates.iter().for_each(|updates| write_evaluated(&store, *updates));
+    (run, store)
+}
+
+fn write_evaluated(store: &Store, updates: u64) {
+    let mut snapshot = snapshot("policy");
+    let progress = format!("{{\"epoch\": 3, \"version\": {}, \"updates\": {updates}}}", updates / 10);
+    snapshot.parts.insert("progress.json".into(), progress.into_bytes());
+    store.write(Name::Updates(updates), &snapshot).unwrap();
+}
+
+fn judge(store: &Store, version: u64, normalised_reward: f64) -> Judgement {
+    store.judge(Evaluated { epoch: 3, version, normalised_reward }).unwrap()
+}
+
+#[test]
+fn the_best_is_kept_besides_the_newest_until_another_is_better() {
+    let (run, store) = evaluated_run(&[10, 20]);
+    assert_eq!(judge(&store, 1, 0.3), Judgement::Best(Name::Updates(10)));
+    assert_eq!(judge(&store, 2, 0.2), Judgement::NotBetter);
+    write_evaluated(&store, 30);
+    write_evaluated(&store, 40);
+    let there = |updates| store.has(Name::Updates(updates));
+    assert_eq!([10, 20, 30, 40].map(there), [true, false, true, true]);
+    let best = run.path().join("checkpoints/best");
+    assert_eq!(find(&best).unwrap().1, read(&run.path().join("checkpoints/checkpoint-0000000010")).unwrap());
+    assert_eq!(judge(&store, 4, 0.4), Judgement::Best(Name::Updates(40)));
+    write_evaluated(&store, 50);
+    assert_eq!([10, 40, 50].map(there), [false, true, true]);
+    assert_eq!(std::fs::read_link(&best).unwrap().to_str(), Some("checkpoint-0000000040"));
+    assert_eq!(store.newest().unwrap().unwrap().0, run.path().join("checkpoints/checkpoint-0000000050"));
+}
+
+#[test]
+fn which_one_is_the_best_survives_a_restart_in_the_middle_of_noting_it() {
+    let (run, store) = evaluated_run(&[10, 20]);
+    judge(&store, 1, 0.3);
+    // As a crash leaves it: the record is written, and the link is not, or half.
+    let best = run.path().join("checkpoints/best");
+    std::fs::remove_file(&best).unwrap();
+    std::os::unix::fs::symlink("checkpoint-0000000020", run.path().join("checkpoints/.best")).unwrap();
+    drop(store);
+    let store = Store::open(run.path(), 1).unwrap();
+    store.begin_life().unwrap();
+    assert_eq!(std::fs::read_link(&best).unwrap().to_str(), Some("checkpoint-0000000010"));
+    assert_eq!(judge(&store, 2, 0.2), Judgement::NotBetter);
+    write_evaluated(&store, 30);
+    assert!(store.has(Name::Updates(10)));
+}
+
+#[test]
+fn an_evaluation_of_a_checkpoint_that_is_gone_or_of_another_life_changes_nothing() {
+    let (run, store) = evaluated_run(&[10, 20, 30]);
+    assert_eq!(judge(&store, 1, 0.9), Judgement::Gone);
+    assert_eq!(store.judge(Evaluated { epoch: 2, version: 3, normalised_reward: 0.9 }).unwrap(), Judgement::Gone);
+    assert!(!run.path().join("checkpoints/best.json").exists());
+}
+
+#[test]
+fn of_several_with_the_same_version_the_newest_was_meant() {
+    let (_run, store) = evaluated_run(&[11, 12]);
+    assert_eq!(judge(&store, 1, 0.1), Judgement::Best(Name::Updates(12)));
+}
+
+#[test]
+fn a_damaged_record_of_the_best_is_ignored_and_replaced() {
+    for damaged in ["", "{", "[]", r#"{"updates": 77, "learner_epoch": 3, "version": 7, "normalised_reward": 9.0}"#] {
+        let (run, store) = evaluated_run(&[10, 20]);
+        std::fs::write(run.path().join("checkpoints/best.json"), damaged).unwrap();
+        store.begin_life().unwrap();
+        write_evaluated(&store, 30);
+        assert!(!store.has(Name::Updates(10)), "{damaged}");
+        assert_eq!(judge(&store, 3, 0.1), Judgement::Best(Name::Updates(30)), "{damaged}");
+    }
 }

@@ -6,11 +6,13 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
+use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec, resolve};
-use comic_learner::checkpoint::{Snapshot, Store};
-use comic_learner::publish::Publisher;
+use comic_learner::checkpoint::{Snapshot, Store, find, read};
+use comic_learner::publish::{Published, Publisher};
+use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
-use comic_learner::service::{self, Shared};
+use comic_learner::service::{self, Evaluation, Shared};
 use comic_learner::trainer::{Ending, Setup, Trainer};
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
@@ -20,6 +22,10 @@ use rand_pcg::Pcg64;
 
 const INCARNATION: u64 = 7;
 const UPDATES: u64 = 6;
+/// Steps an unroll.
+const LENGTH: usize = 5;
+/// Unrolls a batch.
+const BATCH: u64 = 8;
 
 /// What each preset adds to be small.
 const PRESETS: [(&str, &[&str]); 5] = [
@@ -38,12 +44,12 @@ fn experiment(preset: &str, updates: u64) -> Experiment {
         "vmpo.target_period=2",
         "vmpo.gradient_steps=3",
         "vmpo.minibatch_unrolls=4",
-        "unroll.length=5",
-        "unroll.batch=8",
         "optimiser.learning_rate=1e-2",
     ]
     .map(String::from)
     .to_vec();
+    overrides.push(format!("unroll.length={LENGTH}"));
+    overrides.push(format!("unroll.batch={BATCH}"));
     overrides.push(format!("budget.updates={updates}"));
     let own = PRESETS.iter().find(|(name, _)| *name == preset).map_or(&[][..], |(_, own)| own);
     overrides.extend(own.iter().map(ToString::to_string));
@@ -85,9 +91,28 @@ fn recorded(layout: &UnrollLayout, spec: &TaskSpec, sequence: u64) -> UnrollBuff
 /// libtorch's generator, which the networks' first values come from, is the process's.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
-/// One life of the learner, fed with the recording from where its books say; its last checkpoint.
-fn live(preset: &str, run: &Path, updates: u64) -> Snapshot {
-    let experiment = experiment(preset, updates);
+/// A life of the learner that is over.
+struct Life {
+    ended: anyhow::Result<Ending>,
+    /// What actors would act with.
+    published: Arc<Published>,
+    telemetry: String,
+}
+
+/// One life of the learner, fed with the recording from where its books say up to `unrolls`, altered.
+fn live(experiment: &Experiment, run: &Path, unrolls: u64, alter: fn(u64, &mut UnrollBuffer)) -> Life {
+    live_evaluated(experiment, run, unrolls, alter, &[])
+}
+
+/// The same, and these evaluations are reported at its beginning.
+fn live_evaluated(
+    experiment: &Experiment,
+    run: &Path,
+    unrolls: u64,
+    alter: fn(u64, &mut UnrollBuffer),
+    evaluations: &[Evaluation],
+) -> Life {
+    let experiment = experiment.clone();
     let spec = spec(&experiment);
     let store = Store::open(run, 3).unwrap();
     let resume = store.newest().unwrap().map(|(_, snapshot)| snapshot);
@@ -108,34 +133,63 @@ fn live(preset: &str, run: &Path, updates: u64) -> Snapshot {
         assets: Vec::new(),
         batcher: batcher.clone(),
         publisher: publisher.clone(),
+        quarantine: QuarantineOptions::default(),
     })
     .unwrap();
+    assert!(evaluations.iter().all(|evaluation| shared.keep_evaluation(evaluation.clone())));
     let pose = vec![0.1; spec.action];
     let run = run.to_path_buf();
     let joined = batcher.join(INCARNATION, None).unwrap();
     let feeder = std::thread::spawn({
         let (batcher, layout, spec) = (batcher.clone(), layout.clone(), spec.clone());
-        // Exactly what the rest of the run needs, so that the books are the same whoever feeds.
         let batch = experiment.unroll.batch as u64;
-        let unrolls = (updates + 1) * batch;
         move || {
             for sequence in joined.next_sequence..unrolls {
                 let (actor, incarnation) = (joined.actor, INCARNATION);
                 let header = UnrollHeader { actor, incarnation, sequence, learner_epoch: epoch, ..Default::default() };
                 let header = UnrollHeader { version: batcher.phase().version, ..header };
-                let inserted = batcher.insert(&header, recorded(&layout, &spec, sequence).into_bytes());
-                assert_eq!(futures::executor::block_on(inserted), Outcome::Taken);
+                let mut unroll = recorded(&layout, &spec, sequence);
+                alter(sequence, &mut unroll);
+                match futures::executor::block_on(batcher.insert(&header, unroll.into_bytes())) {
+                    Outcome::Taken => {}
+                    Outcome::Closed => break,
+                    other => panic!("{other:?}"),
+                }
                 // Batch by batch, so that none waits while the trainer changes the terms.
-                while (sequence + 1) % batch == 0 && batcher.books().in_flight > 0 {
+                while (sequence + 1) % batch == 0 && batcher.books().in_flight > 0 && !batcher.is_closed() {
                     std::thread::yield_now();
                 }
             }
         }
     });
-    let trainer = Trainer::new(Setup { experiment, spec, pose, run, epoch, resume, batcher, publisher, shared });
-    assert_eq!(trainer.unwrap().run().unwrap(), Ending::Budget);
+    let setup = Setup {
+        experiment,
+        spec,
+        pose,
+        run,
+        epoch,
+        resume,
+        batcher: batcher.clone(),
+        publisher: publisher.clone(),
+        shared: shared.clone(),
+    };
+    let ended = Trainer::new(setup).unwrap().run();
+    batcher.close();
     feeder.join().unwrap();
-    store.newest().unwrap().unwrap().1
+    Life { ended, published: publisher.newest().unwrap(), telemetry: shared.metrics_page() }
+}
+
+/// So many updates of a preset, with exactly the unrolls they need, so that the books are the same whoever feeds; the
+/// last checkpoint.
+fn trained(preset: &str, run: &Path, updates: u64) -> Snapshot {
+    let experiment = experiment(preset, updates);
+    let unrolls = (updates + 1) * experiment.unroll.batch as u64;
+    assert_eq!(live(&experiment, run, unrolls, |_, _| {}).ended.unwrap(), Ending::Budget);
+    last_checkpoint(run)
+}
+
+fn last_checkpoint(run: &Path) -> Snapshot {
+    Store::open(run, 3).unwrap().newest().unwrap().unwrap().1
 }
 
 /// Everything but the clock, the count of lives and the budget.
@@ -160,9 +214,9 @@ fn a_resumed_run_ends_bit_for_bit_where_an_unbroken_one_ends() {
     tch::set_num_threads(1);
     for (preset, _) in PRESETS {
         let (unbroken, broken) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-        let expected = live(preset, unbroken.path(), UPDATES);
-        live(preset, broken.path(), UPDATES / 2);
-        let resumed = live(preset, broken.path(), UPDATES);
+        let expected = trained(preset, unbroken.path(), UPDATES);
+        trained(preset, broken.path(), UPDATES / 2);
+        let resumed = trained(preset, broken.path(), UPDATES);
         let (expected, resumed) = (comparable(&expected), comparable(&resumed));
         for ((name, expected), (_, resumed)) in expected.iter().zip(&resumed) {
             assert!(expected == resumed, "{preset}: {name} differs after a resume");
@@ -175,7 +229,102 @@ fn a_resumed_run_ends_bit_for_bit_where_an_unbroken_one_ends() {
 fn training_changes_the_parameters() {
     let _alone = ONE_AT_A_TIME.lock();
     let run = tempfile::tempdir().unwrap();
-    let trained = live("tracking-mlp", run.path(), 1);
-    let initial = comic_learner::checkpoint::read(&run.path().join("checkpoints/initial")).unwrap();
+    let trained = trained("tracking-mlp", run.path(), 1);
+    let initial = read(&run.path().join("checkpoints/initial")).unwrap();
     assert_ne!(trained.part("policy.safetensors").unwrap(), initial.part("policy.safetensors").unwrap());
+}
+
+#[test]
+fn the_checkpoint_of_the_best_evaluation_outlives_the_newest_few() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let run = tempfile::tempdir().unwrap();
+    let checkpoints = run.path().join("checkpoints");
+    let life = |updates: u64, report: &str| {
+        let experiment = experiment("tracking-mlp", updates);
+        // One version in the first life, which begins with epoch 1.
+        let evaluation = Evaluation { epoch: 1, version: 2, json: report.into() };
+        let unrolls = (updates + 1) * BATCH;
+        live_evaluated(&experiment, run.path(), unrolls, |_, _| {}, &[evaluation]).ended.unwrap();
+    };
+    life(1, "[]");
+    assert!(!checkpoints.join("best.json").exists(), "that report says nothing");
+    for updates in 2..6 {
+        life(updates, r#"{"overall": {"normalised_reward": 0.25}}"#);
+    }
+    let best = find(&checkpoints.join("best")).unwrap().1;
+    assert_eq!(best, read(&checkpoints.join("checkpoint-0000000001")).unwrap());
+    assert!(!checkpoints.join("checkpoint-0000000002").exists());
+    assert_eq!(std::fs::read_to_string(run.path().join("evaluations.jsonl")).unwrap().lines().count(), 5);
+}
+
+/// Rewards whose squares overflow; the wire would not let them through.
+fn poison(_: u64, unroll: &mut UnrollBuffer) {
+    for t in 0..LENGTH {
+        unroll.row_mut(Field::Reward, t).fill(1e30);
+    }
+}
+
+/// Without a normaliser, whose first batch is not learnt from: a step and a version each update, and four skipped steps
+/// lead back.
+fn delicate(updates: u64) -> Experiment {
+    let mut experiment = experiment("tracking-mlp", updates);
+    experiment.network.normaliser_steps = 0;
+    experiment.vmpo.gradient_steps = 1;
+    experiment.vmpo.target_period = 1;
+    experiment.learner.restore_after = 4;
+    experiment
+}
+
+#[test]
+fn after_too_many_skipped_steps_a_learner_is_back_where_it_was_last_good() {
+    let _alone = ONE_AT_A_TIME.lock();
+    tch::set_num_threads(1);
+    let run = tempfile::tempdir().unwrap();
+    // Three batches as they were recorded, then nothing but poison.
+    let Life { ended, published, telemetry } = live(&delicate(3 + 4), run.path(), u64::MAX, |sequence, unroll| {
+        if sequence >= 3 * BATCH {
+            poison(sequence, unroll);
+        }
+    });
+    assert_eq!(ended.unwrap(), Ending::Budget);
+    let initial = read(&run.path().join("checkpoints/initial")).unwrap();
+    let last = last_checkpoint(run.path());
+    for part in ["learner.safetensors", "policy.safetensors"] {
+        assert!(last.part(part).unwrap() == initial.part(part).unwrap(), "{part} is not the last good one");
+    }
+    // Three updates, the return, and the update in which it came: none of the skipped ones published anything.
+    assert_eq!(published.version, 1 + 3 + 2);
+    assert!(published.frames() == frames_of(&published, &initial));
+    assert!(telemetry.contains("comic_updates_skipped_total 4\n") && telemetry.contains("comic_restores_total 1\n"));
+}
+
+#[test]
+fn a_learner_that_the_last_good_state_does_not_help_ends_and_names_the_remedies() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let run = tempfile::tempdir().unwrap();
+    let Life { ended, telemetry, .. } = live(&delicate(100), run.path(), u64::MAX, poison);
+    let said = format!("{:#}", ended.unwrap_err());
+    assert!(said.contains("optimiser.learning_rate") && said.contains("update 7"), "{said}");
+    assert!(telemetry.contains("comic_restores_total 1\n"), "{telemetry}");
+}
+
+#[test]
+fn a_learning_rate_that_ruins_the_parameters_is_not_tried_for_ever() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let run = tempfile::tempdir().unwrap();
+    let mut experiment = delicate(1000);
+    experiment.optimiser.learning_rate = 1e38;
+    let Life { ended, published, .. } = live(&experiment, run.path(), u64::MAX, |_, _| {});
+    assert!(ended.is_err());
+    let initial = read(&run.path().join("checkpoints/initial")).unwrap();
+    assert!(published.frames() == frames_of(&published, &initial), "ruins were published");
+}
+
+/// The pieces that this version would have with a checkpoint's parameters.
+fn frames_of(version: &Published, checkpoint: &Snapshot) -> Vec<Bytes> {
+    // The first life of a run.
+    let publisher = Publisher::new(1);
+    let parameters = Bytes::copy_from_slice(checkpoint.part("policy.safetensors").unwrap());
+    publisher.publish(version.version, version.behaviour, &parameters);
+    publisher.newest().unwrap().frames().to_vec()
 }

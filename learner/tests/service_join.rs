@@ -6,6 +6,7 @@ mod service_support;
 
 use comic_experiment::{Experiment, TaskSpec};
 use comic_learner::publish::Publisher;
+use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
 use comic_proto::v1::JoinRequest;
@@ -63,6 +64,7 @@ async fn a_service_whose_parts_disagree_does_not_start() {
         assets: Vec::new(),
         batcher: world.batcher.clone(),
         publisher: world.publisher.clone(),
+        quarantine: QuarantineOptions::default(),
     };
     let (mut longer, mut later) = (setup(), setup());
     longer.experiment.unroll.length += 1;

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use comic_learner::options::Misuse;
 use comic_learner::publish::Publisher;
+use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
 use comic_proto::PROTOCOL_VERSION;
@@ -94,6 +95,7 @@ async fn a_limit_through_which_no_unroll_fits_is_a_wrong_configuration() {
         assets: Vec::new(),
         batcher: world.batcher.clone(),
         publisher: Publisher::new(EPOCH),
+        quarantine: QuarantineOptions::default(),
     };
     let refused = Shared::new(setup).unwrap_err();
     assert!(refused.is::<Misuse>() && refused.to_string().contains("--max-message-bytes"), "{refused}");

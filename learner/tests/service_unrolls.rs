@@ -4,11 +4,14 @@
 
 mod service_support;
 
+use std::time::Duration;
+
 use bytes::Bytes;
+use comic_learner::quarantine::QuarantineOptions;
 use comic_proto::v1::{UnrollMessage, Verdict};
 use comic_proto::{Field, UnrollBuffer};
 use comic_replay::{Next, Phase};
-use service_support::{BATCH, EPOCH, World};
+use service_support::{BATCH, EPOCH, World, within};
 use tonic::Code;
 
 #[tokio::test]
@@ -20,7 +23,7 @@ async fn an_unroll_is_taken_acknowledged_and_handed_to_the_trainer() {
         let ack = unrolls.send(actor.unroll(sequence)).await.unwrap();
         assert_eq!((ack.sequence, ack.verdict(), ack.detail.as_str()), (sequence, Verdict::Taken, ""));
     }
-    let Next::Batch(batch) = world.batcher.next_batch_within(std::time::Duration::ZERO) else { panic!("no batch") };
+    let Next::Batch(batch) = world.batcher.next_batch_within(Duration::ZERO) else { panic!("no batch") };
     let rewards = batch.f32(Field::Reward);
     assert_eq!(rewards, [[0.0; 8], [1.0; 8]].concat());
     assert_eq!(actor.books().await.in_flight, 2);
@@ -50,6 +53,28 @@ async fn an_invalid_unroll_is_refused_by_name_and_the_next_one_is_welcome() {
     assert_eq!(unrolls.verdict(actor.unroll(4)).await, Verdict::Taken);
     let books = actor.books().await;
     assert_eq!((books.produced, books.dropped_invalid, books.in_flight), (5, 4, 1));
+}
+
+#[tokio::test]
+async fn an_invalid_unroll_goes_to_the_quarantine_and_no_other_one_does() {
+    let directory = tempfile::tempdir().unwrap();
+    let quarantine = QuarantineOptions { quarantine: Some(directory.path().to_path_buf()), quarantine_bytes: 1 << 20 };
+    let world = World::quarantining(quarantine).await;
+    let mut actor = world.actor(70).await;
+    let mut unrolls = actor.stream().await;
+    assert_eq!(unrolls.verdict(actor.unroll(0)).await, Verdict::Taken);
+    let short = UnrollMessage { payload: Bytes::from_static(b"short"), ..actor.unroll(1) };
+    assert_eq!(unrolls.verdict(short.clone()).await, Verdict::Invalid);
+    assert_eq!(unrolls.verdict(short).await, Verdict::Duplicate);
+    let kept = "comic_quarantined_total{result=\"kept\"} 1\n";
+    within(Duration::from_secs(10), async {
+        while !world.shared.metrics_page().contains(kept) {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+    let files: Vec<_> = std::fs::read_dir(directory.path()).unwrap().map(|file| file.unwrap().file_name()).collect();
+    assert_eq!(files, [format!("{EPOCH}-{}-1.unroll", actor.reply.actor).as_str()]);
 }
 
 #[tokio::test]

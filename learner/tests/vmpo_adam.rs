@@ -15,6 +15,15 @@ fn values(tensor: &Tensor) -> Vec<f32> {
     Vec::try_from(tensor.detach().view(-1)).unwrap()
 }
 
+/// Whether a step counts.
+fn counts(yes: bool) -> Tensor {
+    Tensor::from(yes)
+}
+
+fn bits(tensor: &Tensor) -> Vec<u32> {
+    values(tensor).into_iter().map(f32::to_bits).collect()
+}
+
 proptest! {
     #[test]
     fn every_step_is_the_textbooks(
@@ -28,7 +37,7 @@ proptest! {
         let group = adam.add_group("all", vec![("x".into(), learnt.shallow_clone())], learning_rate);
         let (mut x, mut m, mut v) = (f64::from(start), 0.0, 0.0);
         for (index, gradient) in gradients.iter().enumerate() {
-            adam.step(group, &[Tensor::from_slice(&[*gradient])]);
+            adam.step(group, &[Tensor::from_slice(&[*gradient])], &counts(true));
             let gradient = f64::from(*gradient);
             m = config.beta1 * m + (1.0 - config.beta1) * gradient;
             v = config.beta2 * v + (1.0 - config.beta2) * gradient * gradient;
@@ -60,7 +69,7 @@ fn groups_have_learning_rates_of_their_own() {
     let slow_group = adam.add_group("slow", vec![("a".into(), slow.shallow_clone())], 1e-3);
     let fast_group = adam.add_group("fast", vec![("b".into(), fast.shallow_clone())], 1e-1);
     for group in [slow_group, fast_group] {
-        adam.step(group, &[Tensor::from_slice(&[1f32])]);
+        adam.step(group, &[Tensor::from_slice(&[1f32])], &counts(true));
     }
     assert!((values(&slow)[0] + 1e-3).abs() < 1e-6 && (values(&fast)[0] + 1e-1).abs() < 1e-5);
     adam.set_learning_rate(slow_group, 0.5);
@@ -78,17 +87,71 @@ fn a_restored_adam_goes_on_bit_for_bit_and_a_reset_one_starts_anew() {
     let gradient = |step: i64| Tensor::arange(5, (Kind::Float, Device::Cpu)) * 0.3 - step as f64 * 0.2;
     let start = Tensor::zeros([5], (Kind::Float, Device::Cpu));
     let (mut adam, learnt) = make(&start);
-    (0..4).for_each(|step| adam.step(0, &[gradient(step)]));
+    (0..4).for_each(|step| adam.step(0, &[gradient(step)], &counts(true)));
     let (mut restored, restored_parameter) = make(&learnt);
     restored.load_state(&adam.state()).unwrap();
     (4..8).for_each(|step| {
-        adam.step(0, &[gradient(step)]);
-        restored.step(0, &[gradient(step)]);
+        adam.step(0, &[gradient(step)], &counts(true));
+        restored.step(0, &[gradient(step)], &counts(true));
     });
     assert_eq!(values(&learnt), values(&restored_parameter));
     let (mut fresh, fresh_parameter) = make(&learnt);
     adam.reset();
-    adam.step(0, &[gradient(9)]);
-    fresh.step(0, &[gradient(9)]);
+    adam.step(0, &[gradient(9)], &counts(true));
+    fresh.step(0, &[gradient(9)], &counts(true));
     assert_eq!(values(&learnt), values(&fresh_parameter));
+}
+
+/// The same update with its corrections computed on the host, in double precision.
+struct OnTheHost {
+    parameter: Tensor,
+    first: Tensor,
+    second: Tensor,
+    steps: i32,
+}
+
+impl OnTheHost {
+    fn step(&mut self, gradient: &Tensor, learning_rate: f64) {
+        let Optimiser { beta1, beta2, epsilon, .. } = Optimiser::default();
+        self.steps += 1;
+        let (bias1, bias2) = (1.0 - beta1.powf(self.steps.into()), 1.0 - beta2.powf(self.steps.into()));
+        let step_size = learning_rate * bias2.sqrt() / bias1;
+        let _ = self.first.lerp_(gradient, 1.0 - beta1);
+        let _ = self.second.lerp_(&gradient.square(), 1.0 - beta2);
+        let divisor = (self.second.sqrt() + epsilon * bias2.sqrt()) * (-1.0 / step_size);
+        let _ = self.parameter.addcdiv_(&self.first, &divisor);
+    }
+}
+
+#[test]
+fn a_step_that_counts_is_bit_for_bit_one_that_asks_nobody() {
+    let start = Tensor::linspace(-1.0, 1.0, 37, (Kind::Float, Device::Cpu));
+    let mut adam = Adam::new(&Optimiser::default());
+    let learnt = start.copy().set_requires_grad(true);
+    let group = adam.add_group("all", vec![("x".into(), learnt.shallow_clone())], 3e-3);
+    let zeros = || start.zeros_like();
+    let mut expected = OnTheHost { parameter: start.copy(), first: zeros(), second: zeros(), steps: 0 };
+    for step in 0..500 {
+        let gradient = (&start * f64::from(step)).sin() * f64::from(10f32.powi(step % 9 - 6));
+        adam.step(group, &[gradient.copy()], &counts(true));
+        expected.step(&gradient, 3e-3);
+        assert_eq!(bits(&learnt), bits(&expected.parameter), "step {step}");
+    }
+}
+
+#[test]
+fn a_step_that_does_not_count_changes_not_one_bit() {
+    let mut adam = Adam::new(&Optimiser::default());
+    let learnt = parameter(&[0.5, -1e-30, 0.0, 7.0]);
+    let group = adam.add_group("all", vec![("x".into(), learnt.shallow_clone())], 0.1);
+    let poison = Tensor::from_slice(&[f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e38]);
+    for step in 0..5 {
+        let state =
+            |adam: &Adam| adam.state().iter().map(|(_, tensor)| bits(&tensor.to_kind(Kind::Float))).collect::<Vec<_>>();
+        let (parameter_before, state_before) = (bits(&learnt), state(&adam));
+        adam.step(group, &[poison.copy()], &counts(false));
+        assert_eq!((bits(&learnt), state(&adam)), (parameter_before, state_before), "before step {step}");
+        // A moment that is −0 by the end.
+        adam.step(group, &[Tensor::from_slice(&[1.0, -1e-30, -1e-45, step as f32])], &counts(true));
+    }
 }

@@ -5,7 +5,7 @@
 mod vmpo_support;
 
 use comic_experiment::{Experiment, Prior};
-use comic_learner::vmpo::{Error, VmpoLearner};
+use comic_learner::vmpo::{Error, Losses, MinibatchTensors, VmpoLearner};
 use tch::{Kind, Tensor};
 use vmpo_support::{LENGTH, Numbers, UNROLLS, Unrolls, experiment, learner, state, values};
 
@@ -88,6 +88,74 @@ fn a_state_holds_everything_that_is_trained() {
         assert_eq!(names.contains(&format!("adam.first.policy.{name}")), tensor.requires_grad(), "{name}");
     }
     assert!(names.iter().any(|name| name == "value.tracking.clip_embedding"));
+}
+
+/// Rewards whose squares overflow, and an observation that is no number; the wire would let neither through.
+fn poisoned(seed: u64) -> Unrolls {
+    let mut unrolls = unrolls(seed);
+    unrolls.reward.fill(1e30);
+    unrolls.proprioception[0] = f32::NAN;
+    unrolls
+}
+
+fn bits(learner: &VmpoLearner) -> Vec<(String, Vec<u64>)> {
+    state(learner).into_iter().map(|(name, values)| (name, values.into_iter().map(f64::to_bits).collect())).collect()
+}
+
+#[test]
+fn a_step_that_is_not_finite_changes_not_one_bit_and_is_reported() {
+    for taken_before in 0..3 {
+        let mut learner = learner(&training(), 1);
+        (0..taken_before).for_each(|seed| drop(learner.step(&unrolls(seed).minibatch()).unwrap()));
+        let before = bits(&learner);
+        let report = learner.step(&poisoned(9).minibatch()).unwrap().to_metrics();
+        assert_eq!((report.steps, report.skipped, report.skipped_last), (1, 1, 1), "{report:?}");
+        let (report, latents) = learner.regress(&poisoned(9).minibatch()).unwrap();
+        assert_eq!(report.to_metrics().skipped, 1);
+        assert!(values(&latents).iter().all(|value| value.is_finite()));
+        assert_eq!(bits(&learner), before);
+        assert!(learner.is_finite());
+    }
+}
+
+#[test]
+fn what_was_skipped_leaves_no_trace_in_the_steps_after_it() {
+    let (mut spared, mut struck) = (learner(&training(), 1), learner(&training(), 1));
+    for seed in 0..4 {
+        let _ = struck.step(&poisoned(seed).minibatch()).unwrap();
+        let (left, right) = (spared.step(&unrolls(seed).minibatch()), struck.step(&unrolls(seed).minibatch()));
+        assert_eq!(left.unwrap().to_metrics(), right.unwrap().to_metrics());
+    }
+    assert_eq!(bits(&spared), bits(&struck));
+}
+
+#[test]
+fn a_mean_is_over_the_steps_that_were_taken_and_counts_the_others() {
+    let mut learner = learner(&training(), 1);
+    let (good, bad) = (unrolls(1).minibatch(), poisoned(1).minibatch());
+    let mut steps = |of: &[&MinibatchTensors]| -> Vec<Losses> {
+        of.iter().map(|minibatch| learner.step(minibatch).unwrap()).collect()
+    };
+    let mixed = steps(&[&bad, &good, &bad, &good, &bad, &bad]);
+    let mean = Losses::mean(&mixed).unwrap().to_metrics();
+    assert_eq!((mean.steps, mean.skipped, mean.skipped_last), (6, 4, 2));
+    let taken = [1, 3].map(|step| mixed[step].to_metrics().total_loss);
+    assert_eq!(mean.total_loss, f32::midpoint(taken[0], taken[1]));
+    assert!(mean.is_finite());
+    let none = Losses::mean(&steps(&[&bad, &bad])).unwrap().to_metrics();
+    assert_eq!((none.steps, none.skipped, none.skipped_last), (2, 2, 2));
+    assert!(!none.is_finite());
+}
+
+#[test]
+fn parameters_that_are_lost_are_noticed() {
+    let mut experiment = training();
+    experiment.optimiser.learning_rate = 1e38;
+    let mut learner = learner(&experiment, 1);
+    assert!(learner.is_finite());
+    let report = learner.step(&unrolls(1).minibatch()).unwrap().to_metrics();
+    assert_eq!(report.skipped, 0, "the step itself is one of finite numbers");
+    assert!(!learner.is_finite());
 }
 
 /// A task of one step: the nearer the action to a target, the higher the reward.

@@ -1,6 +1,7 @@
 //! A batch of unrolls, one contiguous array per field.
 
 use std::fmt;
+use std::ops::Range;
 use std::sync::Arc;
 
 use comic_proto::v1::UnrollHeader;
@@ -43,8 +44,7 @@ impl Buffer {
     pub(crate) fn push(&mut self, layout: &UnrollLayout, header: UnrollHeader, payload: &[u8]) {
         let slot = self.headers.len();
         for field in Field::ALL {
-            let elements = layout.elements(field);
-            let place = slot * elements..(slot + 1) * elements;
+            let place = place(layout, field, slot);
             let bytes: &mut [u8] = match field {
                 Field::Clip => bytemuck::cast_slice_mut(&mut self.clips[place]),
                 Field::Image => &mut self.images[place],
@@ -54,6 +54,51 @@ impl Buffer {
         }
         self.headers.push(header);
     }
+
+    /// Lets go of the unrolls that are not `kept`; the last ones take their slots. Gives how many went.
+    pub(crate) fn retain(&mut self, layout: &UnrollLayout, kept: impl Fn(&UnrollHeader) -> bool) -> usize {
+        let before = self.len();
+        // From the last one on, so that none is moved that goes itself.
+        for slot in (0..before).rev().filter(|slot| !kept(&self.headers[*slot])).collect::<Vec<_>>() {
+            self.headers.swap_remove(slot);
+            let last = self.headers.len();
+            if slot == last {
+                continue;
+            }
+            for field in Field::ALL {
+                let (from, to) = (place(layout, field, last), place(layout, field, slot).start);
+                match field {
+                    Field::Clip => self.clips.copy_within(from, to),
+                    Field::Image => self.images.copy_within(from, to),
+                    _ => self.floats[field as usize].copy_within(from, to),
+                }
+            }
+        }
+        before - self.len()
+    }
+
+    /// Moves the last unrolls of `other` here, until there are so many.
+    pub(crate) fn fill_from(&mut self, layout: &UnrollLayout, other: &mut Buffer, unrolls: usize) {
+        while self.len() < unrolls
+            && let Some(header) = other.headers.pop()
+        {
+            for field in Field::ALL {
+                let (from, to) = (place(layout, field, other.len()), place(layout, field, self.len()));
+                match field {
+                    Field::Clip => self.clips[to].copy_from_slice(&other.clips[from]),
+                    Field::Image => self.images[to].copy_from_slice(&other.images[from]),
+                    _ => self.floats[field as usize][to].copy_from_slice(&other.floats[field as usize][from]),
+                }
+            }
+            self.headers.push(header);
+        }
+    }
+}
+
+/// The elements of a slot in a field's array.
+fn place(layout: &UnrollLayout, field: Field, slot: usize) -> Range<usize> {
+    let elements = layout.elements(field);
+    slot * elements..(slot + 1) * elements
 }
 
 /// A full batch in the hands of the trainer.

@@ -18,7 +18,7 @@ use crate::snapshot::Snapshot;
 pub struct Config {
     /// B: unrolls a batch, at least 1.
     pub unrolls: usize,
-    /// An unroll may be so many published versions old.
+    /// An unroll may be so many published versions old, when it comes and when its batch is handed out.
     pub max_staleness: u64,
     /// Batches that may be assembled while one is trained on. With 0 nothing is taken meanwhile, and what waits is as
     /// fresh as can be; with 1 the next batch is ready when the trainer is.
@@ -71,8 +71,10 @@ pub enum Next {
 struct State {
     ledger: Ledger,
     phase: Phase,
+    /// The batch that is handed out next: it was full once, and unrolls that grew too old in it leave slots.
+    next: Option<Buffer>,
+    /// What is filled when the next one is full.
     open: Option<Buffer>,
-    full: Option<Buffer>,
     free: Vec<Buffer>,
     /// Unrolls in batches the trainer holds.
     taken: usize,
@@ -84,8 +86,8 @@ struct Inner {
     config: Config,
     /// Everything that must agree with everything else stands behind this one lock.
     state: Mutex<State>,
-    /// A permit for each slot of the open batch that is neither filled nor promised to somebody: first come, first
-    /// served, and a waiting insert costs no memory but its own.
+    /// A permit for each slot of the next and the open batch that is neither filled nor promised to somebody: first
+    /// come, first served, and a waiting insert costs no memory but its own.
     slots: Semaphore,
     filled: Condvar,
 }
@@ -102,7 +104,7 @@ impl Batcher {
         let config = Config { unrolls: config.unrolls.max(1), ..config };
         let mut free: Vec<_> = (0..=config.ahead).map(|_| Buffer::new(&layout, config.unrolls)).collect();
         let open = free.pop();
-        let state = Mutex::new(State { ledger, phase, open, full: None, free, taken: 0, closed: false });
+        let state = Mutex::new(State { ledger, phase, next: None, open, free, taken: 0, closed: false });
         let slots = Semaphore::new(config.unrolls);
         Self { inner: Arc::new(Inner { layout, config, state, slots, filled: Condvar::new() }) }
     }
@@ -128,12 +130,14 @@ impl Batcher {
         if let Some(outcome) = self.refuse(&mut state, header, &payload) {
             return outcome;
         }
-        let State { ledger, open: Some(open), .. } = &mut *state else { return Outcome::Closed };
+        let State { ledger, next, open, .. } = &mut *state;
+        let unfilled = |batch: &&mut Buffer| batch.len() < self.inner.config.unrolls;
+        let Some(batch) = [next, open].into_iter().flatten().find(unfilled) else { return Outcome::Closed };
         if !ledger.record(header.actor, header.sequence) {
             ledger.sums.unattributed += 1;
             return Outcome::Invalid;
         }
-        open.push(&self.inner.layout, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
+        batch.push(&self.inner.layout, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
         slot.forget();
         self.settle(&mut state);
         Outcome::Taken
@@ -166,20 +170,7 @@ impl Batcher {
         if !over {
             return;
         }
-        let mut dropped = 0;
-        if let Some(mut full) = state.full.take() {
-            dropped += full.len();
-            full.headers.clear();
-            state.free.push(full);
-        }
-        // The slots of a full open batch come back too; those promised to waiting inserts stay promised.
-        if let Some(open) = state.open.as_mut() {
-            dropped += open.len();
-            self.inner.slots.add_permits(open.len());
-            open.headers.clear();
-        }
-        state.ledger.sums.dropped.count(Reason::Superseded, dropped as u64);
-        self.settle(&mut state);
+        self.drop_waiting(&mut state, Reason::Superseded, |_| true);
     }
 
     /// What is wanted at this moment.
@@ -207,7 +198,7 @@ impl Batcher {
             if state.closed {
                 return Next::Closed;
             }
-            if let Some(buffer) = state.full.take() {
+            if let Some(buffer) = self.take_next(&mut state) {
                 state.taken += buffer.len();
                 self.settle(&mut state);
                 drop(state);
@@ -293,7 +284,7 @@ impl Batcher {
             Reason::Superseded
         } else if payload.len() != self.inner.layout.size() {
             Reason::Invalid
-        } else if version.saturating_sub(header.version) > self.inner.config.max_staleness {
+        } else if self.is_stale(header, version) {
             Reason::Stale
         } else {
             return None;
@@ -301,11 +292,44 @@ impl Batcher {
         Some(drop_unroll(&mut state.ledger, header, reason))
     }
 
-    /// Moves buffers on: a filled open batch becomes the full one when there is none, and a free buffer the open one.
+    /// Drops unrolls that wait in the batcher. Their slots are free again; those promised to waiting inserts stay
+    /// promised. What is left of the open batch makes the next one full.
+    fn drop_waiting(&self, state: &mut State, reason: Reason, dropped: impl Fn(&UnrollHeader) -> bool) {
+        let (layout, State { ledger, next, open, .. }) = (&self.inner.layout, state);
+        let went: usize = [&mut *next, &mut *open]
+            .into_iter()
+            .flatten()
+            .map(|batch| batch.retain(layout, |header| !dropped(header)))
+            .sum();
+        if let (Some(next), Some(open)) = (next, open) {
+            next.fill_from(layout, open, self.inner.config.unrolls);
+        }
+        ledger.sums.dropped.count(reason, went as u64);
+        self.inner.slots.add_permits(went);
+    }
+
+    /// The next batch, if it is full without what grew too old while it waited.
+    fn take_next(&self, state: &mut State) -> Option<Buffer> {
+        self.is_full(state.next.as_ref()).then_some(())?;
+        let version = state.phase.version;
+        self.drop_waiting(state, Reason::Stale, |header| self.is_stale(header, version));
+        self.is_full(state.next.as_ref()).then(|| state.next.take())?
+    }
+
+    fn is_full(&self, batch: Option<&Buffer>) -> bool {
+        batch.is_some_and(|batch| batch.len() == self.inner.config.unrolls)
+    }
+
+    fn is_stale(&self, header: &UnrollHeader, version: u64) -> bool {
+        version.saturating_sub(header.version) > self.inner.config.max_staleness
+    }
+
+    /// Moves buffers on: a filled open batch becomes the next one when there is none, and a free buffer the open one.
     fn settle(&self, state: &mut State) {
-        let filled = state.open.as_ref().is_some_and(|open| open.len() == self.inner.config.unrolls);
-        if filled && state.full.is_none() {
-            state.full = state.open.take();
+        if state.next.is_none() && self.is_full(state.open.as_ref()) {
+            state.next = state.open.take();
+        }
+        if self.is_full(state.next.as_ref()) {
             self.inner.filled.notify_one();
         }
         if state.open.is_none()
@@ -319,7 +343,7 @@ impl Batcher {
 
 impl State {
     fn in_flight(&self) -> u64 {
-        let waiting: usize = [&self.open, &self.full].into_iter().flatten().map(Buffer::len).sum();
+        let waiting: usize = [&self.next, &self.open].into_iter().flatten().map(Buffer::len).sum();
         (waiting + self.taken) as u64
     }
 }

@@ -17,8 +17,10 @@
 //! 3. The unroll itself is either dropped for a reason — **invalid**; **superseded**, made in another epoch or in
 //!    another phase (demonstrations and policy are phases); **stale**, made with parameters more than `max_staleness`
 //!    published versions old — or it is copied into a slot of the open batch and is then *in flight*.
-//! 4. An unroll in flight ends in one way: its batch is trained on, or dropped. A change of phase drops what waits in
-//!    the batcher as superseded. A batch that its taker lets go of without training is lost at restart.
+//! 4. An unroll in flight ends in one way: its batch is trained on, or it is dropped. A change of phase drops what waits
+//!    in the batcher as superseded. What grew too old while it waited is dropped as stale when its batch is due, and the
+//!    batch is handed out when its slots are filled again. A batch that its taker lets go of without training is lost
+//!    at restart.
 //! 5. While an unroll waits for a slot nothing is recorded. Dropping the waiting future leaves no trace, and the
 //!    rules are applied at the moment the slot is there: another copy may have been faster.
 //! 6. Restoring a [`Snapshot`] counts what was in flight in it as lost at restart, and leaves the accounts as they

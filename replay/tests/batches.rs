@@ -4,11 +4,12 @@
 
 mod common;
 
+use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, Invalid};
-use comic_replay::{Batch, Outcome};
-use common::{Actor, CONFIG, SLOTS, batch_now, batcher, layout, mark, payload};
+use comic_replay::{Batch, Outcome, Phase};
+use common::{Actor, CONFIG, PHASE, SLOTS, batch_now, batcher, insert_now, layout, mark, payload};
 
-fn assert_holds(batch: &Batch, expected: &[comic_proto::v1::UnrollHeader]) {
+fn assert_holds(batch: &Batch, expected: &[UnrollHeader]) {
     assert_eq!(batch.unrolls, expected.len());
     for (slot, header) in expected.iter().enumerate() {
         assert_eq!(batch.headers()[slot].sequence, header.sequence);
@@ -64,6 +65,31 @@ fn while_one_batch_is_trained_on_the_next_two_are_assembled() {
     assert_eq!(actor.send(&batcher, 9), Some(Outcome::Taken));
     assert_holds(&second, &[3, 4, 5].map(|sequence| actor.header(sequence)));
     assert!(batcher.books().balance());
+}
+
+#[test]
+fn what_grew_too_old_while_it_waited_is_dropped_and_its_slots_are_filled_again() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    let newest = |late: u64| PHASE.version + late;
+    let mut sent = Vec::new();
+    // A full batch of which two are at the limit, and one more unroll behind it that is, too, and one that is not.
+    for (sequence, version) in (0..).zip([newest(0) - 4, newest(0), newest(0) - 4, newest(0) - 4, newest(0)]) {
+        let header = UnrollHeader { version, ..actor.header(sequence) };
+        assert_eq!(insert_now(&batcher, &header), Some(Outcome::Taken));
+        sent.push(header);
+    }
+    batcher.set_phase(Phase { version: newest(1), ..PHASE });
+    assert!(batch_now(&batcher).is_none(), "one slot is free");
+    assert_eq!((batcher.books().dropped.stale, batcher.books().in_flight), (3, 2));
+    let late = UnrollHeader { version: newest(1), ..actor.header(5) };
+    assert_eq!(insert_now(&batcher, &late), Some(Outcome::Taken));
+    assert_holds(&batch_now(&batcher).unwrap(), &[sent[1].clone(), sent[4].clone(), late]);
+    // Every slot is there again.
+    for sequence in 6..6 + SLOTS as u64 {
+        assert_eq!(insert_now(&batcher, &actor.header(sequence)), Some(Outcome::Taken));
+    }
+    assert_eq!(insert_now(&batcher, &actor.header(99)), None);
 }
 
 #[test]

@@ -43,7 +43,7 @@ fn event() -> impl Strategy<Value = Event> {
         4 => Just(Event::Train),
         1 => reason.prop_map(|reason| Event::Discard { reason }),
         1 => Just(Event::LetGo),
-        2 => Just(Event::NewVersion),
+        4 => Just(Event::NewVersion),
         1 => Just(Event::SwitchPhase),
         1 => (0..ACTORS).prop_map(|actor| Event::Reconnect { actor }),
         1 => (0..ACTORS).prop_map(|actor| Event::Replace { actor }),
@@ -157,7 +157,13 @@ impl World {
                 assert_eq!(stranger.send(&self.batcher, 0), Some(Outcome::NotJoined));
                 self.known.refused += 1;
             }
-            Event::Take => self.taken.extend(batch_now(&self.batcher)),
+            Event::Take => {
+                let batch = batch_now(&self.batcher);
+                let headers = batch.iter().flat_map(Batch::headers);
+                let mut ages = headers.map(|header| self.phase.version - header.version);
+                assert!(ages.all(|age| age <= CONFIG.max_staleness), "too old when it is handed out");
+                self.taken.extend(batch);
+            }
             Event::Train => self.train(),
             Event::Discard { reason } => {
                 if let Some(batch) = self.taken.pop() {

@@ -75,7 +75,8 @@ pub struct Evaluate {
     /// Write the reward of every step there too, one JSON object an episode: clip, start (its frame), rewards.
     #[arg(long, value_name = "FILE")]
     rewards: Option<PathBuf>,
-    /// Report the evaluation of a checkpoint to this learner too, which keeps it in `evaluations.jsonl`.
+    /// Report the evaluation of a checkpoint to this learner too, which keeps it in `evaluations.jsonl`, and the checkpoint
+    /// as `checkpoints/best` if none was better.
     #[arg(long, value_name = "URL", requires = "checkpoint")]
     learner: Option<String>,
     #[command(flatten)]

@@ -22,6 +22,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::process::obey;
 use crate::publish::Publisher;
+use crate::quarantine::QuarantineOptions;
 use crate::run::service_runtime;
 use crate::security::{Limits, Security};
 use crate::service::{Setup, Shared, serve, server};
@@ -127,6 +128,7 @@ impl Stand {
             assets: Vec::new(),
             batcher: batcher.clone(),
             publisher: publisher.clone(),
+            quarantine: QuarantineOptions::default(),
         })?;
         Ok(Self { shared, batcher, publisher, payload: Bytes::from(vec![1; options.parameters]) })
     }

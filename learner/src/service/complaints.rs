@@ -14,7 +14,7 @@ const REMEMBERED: usize = 1024;
 
 /// When each peer was last complained about, and how often it deserved it since.
 #[derive(Debug)]
-pub(super) struct Complaints<K> {
+pub(crate) struct Complaints<K> {
     peers: Mutex<HashMap<K, (Instant, u64)>>,
 }
 
@@ -26,7 +26,7 @@ impl<K> Default for Complaints<K> {
 
 impl<K: Eq + Hash> Complaints<K> {
     /// How many complaints about this peer went unreported before this one, if it is to be reported: once a minute.
-    pub(super) fn due(&self, peer: K) -> Option<u64> {
+    pub(crate) fn due(&self, peer: K) -> Option<u64> {
         self.due_at(peer, Instant::now())
     }
 

@@ -38,7 +38,7 @@ pub(super) fn of(shared: &Shared) -> v1::Status {
 
 impl Shared {
     /// What `/metrics` answers.
-    pub(crate) fn metrics_page(&self) -> String {
+    pub fn metrics_page(&self) -> String {
         let Census { alive, slow, lost, waiting } = self.roster.census(Instant::now());
         self.telemetry.page(&Sample {
             books: self.batcher.books(),

@@ -79,7 +79,13 @@ async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAc
             let _waiting = shared.roster.wait(header.incarnation);
             (shared.batcher.insert(&header, payload).await, None)
         }
-        Err(invalid) => (shared.batcher.refuse_invalid(&header), Some(invalid)),
+        Err(invalid) => {
+            let outcome = shared.batcher.refuse_invalid(&header);
+            if let (Outcome::Invalid, Some(quarantine)) = (outcome, &shared.quarantine) {
+                quarantine.offer(&header, &payload, &invalid);
+            }
+            (outcome, Some(invalid))
+        }
     };
     let sequence = header.sequence;
     Ok(Some(match outcome {

@@ -98,6 +98,14 @@ struct Pass {
     latent_kl: Tensor,
 }
 
+/// What became of gradients.
+struct Descent {
+    /// Global norm of the networks' gradients before clipping.
+    norm: Tensor,
+    /// Whether the step was taken, a boolean scalar.
+    finite: Tensor,
+}
+
 impl VmpoLearner {
     /// New networks on `device`, from libtorch's generator: call `tch::manual_seed` first. `pose` is the action at which
     /// the policy's mean starts, A entries.
@@ -174,7 +182,8 @@ impl VmpoLearner {
         self.adam.reset();
     }
 
-    /// One gradient step of V-MPO.
+    /// One gradient step of V-MPO. It is skipped when the loss or a gradient is not finite: the report says so, and
+    /// nothing is changed.
     ///
     /// # Errors
     /// [`Error::Shape`] when the minibatch is another task's; nothing is changed then.
@@ -206,17 +215,15 @@ impl VmpoLearner {
         let inputs: Vec<&Tensor> = networks.iter().chain([self.multipliers.parameter()]).collect();
         let mut gradients = Tensor::f_run_backward(&[&total], &inputs, false, false)?;
         let multipliers = gradients.split_off(networks.len());
-        let norm = self.descend(gradients);
-        self.adam.step(self.multipliers_group, &multipliers);
-        self.multipliers.project();
-        Ok(self.report(&total, &pass, Some(&improvement), None, &norm))
+        let descent = self.descend(&total, gradients, Some(&multipliers));
+        Ok(self.report(&total, &pass, Some(&improvement), None, &descent))
     }
 
     /// One gradient step of the warm start: the policy's mean towards the stored mean,
     /// mean over valid steps of Σ ½ ((μ_θ − μ_stored) / initial_std)², with β times the latent's KL; the value function
     /// as in [`VmpoLearner::step`]. The policy's standard deviation gets no gradient. Returns the report and the latents
     /// z_t, `[B, T, Z]`, with which [`MinibatchTensors::refresh_previous_latent`] keeps the demonstrations' z_{t−1}
-    /// those of this encoder.
+    /// those of this encoder. It is skipped where [`VmpoLearner::step`] would be.
     ///
     /// # Errors
     /// [`Error::Shape`] when the minibatch is another task's; nothing is changed then.
@@ -228,12 +235,20 @@ impl VmpoLearner {
         let total =
             &regression + &pass.value_loss * self.vmpo.value_weight + &pass.latent_kl * self.network.latent.beta;
         let gradients = Tensor::f_run_backward(&[&total], self.adam.parameters(self.networks_group), false, false)?;
-        let norm = self.descend(gradients);
+        let descent = self.descend(&total, gradients, None);
         let shape = minibatch.shape();
         let sizes = [shape.unrolls, shape.unroll.length, shape.unroll.latent].map(|size| size as i64);
-        let latents = pass.acting.latent.detach().reshape(sizes);
-        let losses = self.report(&total, &pass, None, Some(&regression), &norm);
+        // What is no number must not stay behind in the demonstrations.
+        let latents = pass.acting.latent.detach().reshape(sizes).nan_to_num(0.0, 0.0, 0.0);
+        let losses = self.report(&total, &pass, None, Some(&regression), &descent);
         Ok((losses, latents))
+    }
+
+    /// Whether every parameter and multiplier is a number; waits for the device.
+    pub fn is_finite(&self) -> bool {
+        let networks = self.adam.parameters(self.networks_group).iter().map(Tensor::detach);
+        let parameters: Vec<Tensor> = networks.chain([self.multipliers.parameter().detach()]).collect();
+        adam::global_norm(&parameters).double_value(&[]).is_finite()
     }
 
     /// Every trained parameter's name and number of elements.
@@ -348,8 +363,8 @@ impl VmpoLearner {
         valid
     }
 
-    /// Clips where asked to, steps the networks and returns the gradient's norm before clipping.
-    fn descend(&mut self, mut gradients: Vec<Tensor>) -> Tensor {
+    /// Clips where asked to, and steps networks and multipliers if every number is finite.
+    fn descend(&mut self, total: &Tensor, mut gradients: Vec<Tensor>, multipliers: Option<&[Tensor]>) -> Descent {
         // A parameter that a loss does not reach has no gradient at all.
         for (gradient, parameter) in gradients.iter_mut().zip(self.adam.parameters(self.networks_group)) {
             if !gradient.defined() {
@@ -357,11 +372,21 @@ impl VmpoLearner {
             }
         }
         let norm = adam::global_norm(&gradients);
+        // Of the squares, since Adam keeps squares: where their sum is finite, each of them is.
+        let mut sum = total.detach() + norm.square();
+        if let Some(multipliers) = multipliers {
+            sum = &sum + adam::global_norm(multipliers).square();
+        }
+        let finite = sum.isfinite().all();
         if self.optimiser.max_gradient_norm > 0.0 {
             adam::clip_by_global_norm(&mut gradients, &norm, self.optimiser.max_gradient_norm);
         }
-        self.adam.step(self.networks_group, &gradients);
-        norm
+        self.adam.step(self.networks_group, &gradients, &finite);
+        if let Some(multipliers) = multipliers {
+            self.adam.step(self.multipliers_group, multipliers, &finite);
+            self.multipliers.project();
+        }
+        Descent { norm, finite }
     }
 
     /// Packs the report of a V-MPO step (`improvement`) or of a regression step (`regression`).
@@ -371,7 +396,7 @@ impl VmpoLearner {
         pass: &Pass,
         improvement: Option<&Improvement>,
         regression: Option<&Tensor>,
-        norm: &Tensor,
+        descent: &Descent,
     ) -> Losses {
         tch::no_grad(|| {
             let zero = Tensor::zeros([1], (Kind::Float, self.device()));
@@ -397,11 +422,11 @@ impl VmpoLearner {
                 &alpha_std,
                 alpha_discrete.as_ref().unwrap_or(&zero),
                 &masked_mean(&std, &pass.valid),
-                norm,
+                &descent.norm,
                 &variance_explained(pass),
                 &pass.share,
             ];
-            Losses::pack(scalars, &temperatures)
+            Losses::pack(scalars, &temperatures, &descent.finite)
         })
     }
 }

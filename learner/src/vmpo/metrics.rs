@@ -5,27 +5,38 @@ use tch::{Device, Kind, Tensor};
 /// Entries of the packed tensor.
 const COUNT: usize = 18;
 
-/// One gradient step's report, still on the device: nothing waits for it until [`Losses::to_metrics`].
+/// The report of gradient steps, still on the device: nothing waits for it until [`Losses::to_metrics`].
 #[derive(Debug)]
 pub struct Losses {
+    /// The scalars and the ηs, then how many steps were taken, and how many were skipped after the last of them.
     packed: Tensor,
+    /// Steps taken or skipped.
+    steps: u64,
 }
 
 impl Losses {
-    /// Packs scalars in the order of [`Metrics`]' fields, and the ηs.
-    pub(crate) fn pack(entries: [&Tensor; COUNT], temperatures: &Tensor) -> Self {
+    /// Packs scalars in the order of [`Metrics`]' fields, the ηs, and whether the step was taken.
+    pub(crate) fn pack(entries: [&Tensor; COUNT], temperatures: &Tensor, taken: &Tensor) -> Self {
         let scalars = entries.map(|entry| entry.detach().reshape([1]).to_kind(Kind::Float));
-        let entries: Vec<&Tensor> = scalars.iter().chain([temperatures]).collect();
-        Self { packed: Tensor::cat(&entries, 0) }
+        let taken = taken.reshape([1]).to_kind(Kind::Float);
+        let skipped = 1.0 - &taken;
+        let entries: Vec<&Tensor> = scalars.iter().chain([temperatures, &taken, &skipped]).collect();
+        Self { packed: Tensor::cat(&entries, 0), steps: 1 }
     }
 
-    /// The mean over several gradient steps, such as those on one batch; `None` of nothing.
+    /// The mean over those of several single gradient steps that were taken, such as those on one batch; `None` of
+    /// nothing.
     pub fn mean(steps: &[Losses]) -> Option<Losses> {
-        if steps.is_empty() {
-            return None;
-        }
+        let numbers = steps.first()?.packed.size()[0] - 2;
         let packed: Vec<&Tensor> = steps.iter().map(|losses| &losses.packed).collect();
-        Some(Self { packed: Tensor::stack(&packed, 0).mean_dim(0i64, false, Kind::Float) })
+        let packed = Tensor::stack(&packed, 0);
+        let [taken, skipped] = [numbers, numbers + 1].map(|column| packed.narrow(1, column, 1));
+        let sums = packed.where_scalarother(&taken.gt(0.5), 0.0).sum_dim_intlist(0i64, false, Kind::Float);
+        let count = taken.sum(Kind::Float).reshape([1]);
+        // From the last step backwards, 1 until the first one that was taken.
+        let at_the_end = skipped.flip([0]).cumprod(0, Kind::Float).sum(Kind::Float).reshape([1]);
+        let means = sums.narrow(0, 0, numbers) / &count;
+        Some(Self { packed: Tensor::cat(&[means, count, at_the_end], 0), steps: steps.len() as u64 })
     }
 
     /// Reads the report from the device, in one transfer.
@@ -34,7 +45,9 @@ impl Losses {
         let count = all.len();
         // A failed transfer leaves NaN, which `Metrics::is_finite` reports.
         let _ = self.packed.to_device(Device::Cpu).f_copy_data(&mut all, count);
-        let temperatures = all.split_off(COUNT.min(count));
+        let counts = all.split_off(count.saturating_sub(2));
+        let temperatures = all.split_off(COUNT.min(all.len()));
+        let [taken, skipped_last] = counts.try_into().unwrap_or([f32::NAN; 2]);
         let [
             total_loss,
             policy_loss,
@@ -75,11 +88,16 @@ impl Losses {
             variance_explained,
             valid_share,
             temperatures,
+            steps: self.steps,
+            // NaN counts none as taken.
+            skipped: self.steps.saturating_sub(taken as u64),
+            skipped_last: if taken >= 1.0 { skipped_last as u64 } else { self.steps },
         }
     }
 }
 
-/// A gradient step in numbers.
+/// Gradient steps in numbers. Those of steps that were skipped are left out; where none was taken they are NaN, or what
+/// the one step made of its losses.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Metrics {
     /// The loss that was differentiated.
@@ -120,6 +138,12 @@ pub struct Metrics {
     pub valid_share: f32,
     /// Every η after the step: one, or one for each task.
     pub temperatures: Vec<f32>,
+    /// Gradient steps taken or skipped.
+    pub steps: u64,
+    /// How many of them were skipped, since the loss or a gradient was not finite.
+    pub skipped: u64,
+    /// How many of them were skipped after the last one that was taken.
+    pub skipped_last: u64,
 }
 
 impl Metrics {
@@ -147,7 +171,7 @@ impl Metrics {
         ]
     }
 
-    /// Whether every number is finite; where not, the parameters are lost and training must stop.
+    /// Whether every number is finite.
     pub fn is_finite(&self) -> bool {
         self.entries().iter().all(|(_, value)| value.is_finite())
     }

@@ -9,6 +9,7 @@ use bytes::Bytes;
 use comic_clips::Asset;
 use comic_experiment::{Experiment, TaskPart, TaskSpec};
 use comic_learner::publish::Publisher;
+use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared, serve};
 use comic_proto::v1::learner_client::LearnerClient;
@@ -44,20 +45,32 @@ impl World {
 
     /// With so many numbers of proprioception, and these assets.
     pub(crate) async fn start_with(proprioception: usize, assets: Vec<Asset>) -> Self {
-        Self::guarded(proprioception, assets, Security::default(), Limits::default()).await
+        Self::guarded(proprioception, assets, Security::default(), Limits::default(), QuarantineOptions::default())
+            .await
     }
 
     /// Behind these limits.
     pub(crate) async fn limited(limits: Limits) -> Self {
-        Self::guarded(8, Vec::new(), Security::default(), limits).await
+        Self::guarded(8, Vec::new(), Security::default(), limits, QuarantineOptions::default()).await
     }
 
     /// Behind certificates and tokens.
     pub(crate) async fn secured(security: Security) -> Self {
-        Self::guarded(8, Vec::new(), security, Limits::default()).await
+        Self::guarded(8, Vec::new(), security, Limits::default(), QuarantineOptions::default()).await
     }
 
-    async fn guarded(proprioception: usize, assets: Vec<Asset>, security: Security, limits: Limits) -> Self {
+    /// With a quarantine.
+    pub(crate) async fn quarantining(quarantine: QuarantineOptions) -> Self {
+        Self::guarded(8, Vec::new(), Security::default(), Limits::default(), quarantine).await
+    }
+
+    async fn guarded(
+        proprioception: usize,
+        assets: Vec<Asset>,
+        security: Security,
+        limits: Limits,
+        quarantine: QuarantineOptions,
+    ) -> Self {
         let mut experiment = Experiment::default();
         experiment.unroll.length = 4;
         experiment.unroll.batch = BATCH;
@@ -92,6 +105,7 @@ impl World {
             assets,
             batcher: batcher.clone(),
             publisher: publisher.clone(),
+            quarantine,
         };
         let shared = Shared::new(setup).unwrap();
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();

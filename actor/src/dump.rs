@@ -1,0 +1,448 @@
+//! Episodes whose simulation diverged, on disk: what is needed to look at them, and to play them again.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::fs::OpenOptions;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use comic_clips::Catalogue;
+use comic_experiment::Experiment;
+use comic_tasks::{Environment, Episode, Outcome, Simulated, Simulation, Step};
+use serde::{Deserialize, Serialize};
+
+use crate::Error;
+
+/// Dumps a process writes at most: one cause makes many alike.
+const MOST: usize = 16;
+/// Moments before the end that a dump holds.
+const LAST: usize = 8;
+
+/// Numbers as text that brings every bit of them back, infinities and NaN too, which JSON's own numbers would not.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(try_from = "Vec<String>", into = "Vec<String>")]
+pub struct Numbers(pub Vec<f64>);
+
+impl From<Numbers> for Vec<String> {
+    fn from(Numbers(numbers): Numbers) -> Self {
+        numbers.iter().map(f64::to_string).collect()
+    }
+}
+
+impl TryFrom<Vec<String>> for Numbers {
+    type Error = std::num::ParseFloatError;
+
+    fn try_from(text: Vec<String>) -> Result<Self, Self::Error> {
+        text.iter().map(|number| number.parse()).collect::<Result<_, _>>().map(Self)
+    }
+}
+
+/// Bit for bit, except that one NaN is as good as another.
+impl PartialEq for Numbers {
+    fn eq(&self, other: &Self) -> bool {
+        let same = |(one, other): (&f64, &f64)| one.to_bits() == other.to_bits() || (one.is_nan() && other.is_nan());
+        self.0.len() == other.0.len() && self.0.iter().zip(&other.0).all(same)
+    }
+}
+
+/// The state of a simulation.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Moment {
+    /// Generalised positions.
+    pub qpos: Numbers,
+    /// Generalised velocities.
+    pub qvel: Numbers,
+    /// The servos' filter states.
+    pub act: Numbers,
+}
+
+impl Moment {
+    fn of(simulation: &Simulation) -> Self {
+        let numbers = |values: &[f64]| Numbers(values.to_vec());
+        Self { qpos: numbers(simulation.qpos()), qvel: numbers(simulation.qvel()), act: numbers(simulation.act()) }
+    }
+}
+
+/// An episode that diverged.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Dump {
+    /// The experiment's document, TOML.
+    pub experiment: String,
+    /// The task.
+    pub task: String,
+    /// The clip's index.
+    pub clip: usize,
+    /// The clip's name.
+    pub clip_name: String,
+    /// Where the episode began; see [`Episode::start`].
+    pub start: usize,
+    /// Decided the environment's draws.
+    pub seed: u64,
+    /// Where the simulation was when it began.
+    pub first: Moment,
+    /// What every step was given, `[steps][56]`; the last one diverged.
+    pub actions: Vec<Numbers>,
+    /// Where the simulation was before each of the last steps.
+    pub last: Vec<Moment>,
+    /// Where it was after the last one.
+    pub end: Moment,
+}
+
+/// What playing a dump again gave.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Replay {
+    /// Steps of the dump.
+    pub steps: usize,
+    /// The step that diverged, counted from 1.
+    pub diverged: Option<usize>,
+    /// Every moment that the dump holds came again, bit for bit.
+    pub exact: bool,
+}
+
+impl fmt::Display for Replay {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.diverged {
+            Some(step) => write!(f, "diverged in step {step} of {}", self.steps)?,
+            None => write!(f, "did not diverge in {} steps", self.steps)?,
+        }
+        f.write_str(if self.exact {
+            ", in the dump's own states bit for bit"
+        } else {
+            ", in other states than the dump's"
+        })
+    }
+}
+
+impl Dump {
+    /// Reads one.
+    ///
+    /// # Errors
+    /// [`Error::File`], and [`Error::Usage`] for what is no dump.
+    pub fn read(path: &Path) -> Result<Self, Error> {
+        let text = std::fs::read(path).map_err(Error::file(path))?;
+        serde_json::from_slice(&text)
+            .map_err(|error| Error::Usage(format!("{} is no dump of a diverged episode: {error}", path.display())))
+    }
+
+    /// Plays it again, on these clips if the experiment's own are not here.
+    ///
+    /// Tracking begins where its clip does, so the states come again bit for bit. Another task's draws are not known:
+    /// its episode is put into the dump's first state, in an arena of its own.
+    ///
+    /// # Errors
+    /// An experiment, clip or state that this release does not have.
+    pub fn replay(&self, clips: &[String]) -> Result<Replay, Error> {
+        let experiment = Experiment::from_toml("the dump's experiment", &self.experiment)?.with_clips(clips);
+        let task = comic_tasks::build(&experiment, &Catalogue::open(&experiment.clips)?)?;
+        let mut environment = task.environment(self.seed)?;
+        environment.reset_to(self.clip, self.start)?;
+        if Moment::of(environment.simulation()) != self.first {
+            self.place(environment.simulation_mut())?;
+        }
+        let mut replay = Replay { steps: self.actions.len(), diverged: None, exact: true };
+        let unseen = self.actions.len().saturating_sub(self.last.len());
+        for (step, Numbers(action)) in self.actions.iter().enumerate() {
+            let recorded = step.checked_sub(unseen).and_then(|place| self.last.get(place));
+            replay.exact &= recorded.is_none_or(|moment| Moment::of(environment.simulation()) == *moment);
+            let action: Vec<f32> = action.iter().map(|value| *value as f32).collect();
+            if environment.step(&action).outcome == Outcome::Diverged {
+                replay.diverged = Some(step + 1);
+                break;
+            }
+        }
+        Ok(replay)
+    }
+
+    fn place(&self, simulation: &mut Simulation) -> Result<(), Error> {
+        let Moment { qpos: Numbers(qpos), qvel: Numbers(qvel), act: Numbers(act) } = &self.first;
+        let sizes = [simulation.qpos().len(), simulation.qvel().len(), simulation.act().len()];
+        let found = [qpos.len(), qvel.len(), act.len()];
+        if sizes != found {
+            return Err(Error::Usage(format!("the dump's states have {found:?} numbers, the task's {sizes:?}")));
+        }
+        simulation.qpos_mut().copy_from_slice(qpos);
+        simulation.qvel_mut().copy_from_slice(qvel);
+        simulation.act_mut().copy_from_slice(act);
+        simulation.forward();
+        Ok(())
+    }
+}
+
+/// `comic-actor replay`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Command {
+    /// What `--dump-diverged` wrote.
+    #[arg(value_name = "FILE")]
+    dump: PathBuf,
+    /// Clips in place of the experiment's own: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP.
+    #[arg(long, value_name = "SOURCE", num_args = 1..)]
+    clips: Vec<String>,
+}
+
+impl Command {
+    /// Plays the dump and prints what came of it.
+    ///
+    /// # Errors
+    /// As [`Dump::read`] and [`Dump::replay`].
+    pub fn run(&self) -> Result<(), Error> {
+        let replay = Dump::read(&self.dump)?.replay(&self.clips)?;
+        let line = format!("{replay}\n");
+        std::io::stdout().write_all(line.as_bytes()).map_err(Error::file("standard output"))
+    }
+}
+
+/// Where a process's dumps go.
+#[derive(Debug)]
+pub struct Dumps {
+    directory: PathBuf,
+    experiment: String,
+    /// The tasks' and the clips' names.
+    names: (Vec<String>, Vec<String>),
+    written: AtomicUsize,
+}
+
+impl Dumps {
+    /// Makes the directory.
+    ///
+    /// # Errors
+    /// [`Error::File`] when it cannot be made.
+    pub fn new(
+        directory: &Path,
+        experiment: &Experiment,
+        spec: &comic_experiment::TaskSpec,
+    ) -> Result<Arc<Self>, Error> {
+        std::fs::create_dir_all(directory).map_err(Error::file(directory))?;
+        let tasks = spec.tasks.iter().map(|task| task.name.clone()).collect();
+        Ok(Arc::new(Self {
+            directory: directory.to_path_buf(),
+            experiment: experiment.to_toml()?,
+            names: (tasks, spec.clips.clone()),
+            written: AtomicUsize::new(0),
+        }))
+    }
+
+    /// Writes one if there were not too many; a disk that refuses costs the dump and no more.
+    fn write(&self, dump: &Dump) {
+        let number = self.written.fetch_add(1, Ordering::Relaxed);
+        if number >= MOST {
+            return;
+        }
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis();
+        let path = self.directory.join(format!("diverged-{now}-{number}.json"));
+        let written = serde_json::to_vec(dump).map_err(std::io::Error::from).and_then(|text| {
+            let mut file = OpenOptions::new().write(true).create_new(true).open(&path)?;
+            file.write_all(&text)
+        });
+        let (clip, start, steps) = (&dump.clip_name, dump.start, dump.actions.len());
+        match written {
+            Ok(()) => tracing::warn!(dump = %path.display(), clip, start, steps, "a simulation diverged"),
+            Err(error) => tracing::error!(dump = %path.display(), "a diverged episode is not dumped: {error}"),
+        }
+    }
+
+    fn has_room(&self) -> bool {
+        self.written.load(Ordering::Relaxed) < MOST
+    }
+}
+
+/// An environment that writes down its episode, if anybody wants to know how one diverged.
+#[derive(Debug)]
+pub struct Watched {
+    environment: Box<dyn Simulated>,
+    tape: Option<Tape>,
+}
+
+/// The episode so far.
+#[derive(Debug)]
+struct Tape {
+    dumps: Arc<Dumps>,
+    seed: u64,
+    first: Moment,
+    actions: Vec<Numbers>,
+    last: VecDeque<Moment>,
+}
+
+impl Watched {
+    /// Watches an environment that was made of `seed`; only passes everything on without `dumps`.
+    pub fn new(environment: Box<dyn Simulated>, dumps: Option<Arc<Dumps>>, seed: u64) -> Self {
+        let first = Moment::of(environment.simulation());
+        let tape = |dumps| Tape { dumps, seed, first, actions: Vec::new(), last: VecDeque::new() };
+        Self { tape: dumps.map(tape), environment }
+    }
+
+    fn begin(&mut self) {
+        let Self { environment, tape } = self;
+        if let Some(tape) = tape {
+            tape.first = Moment::of(environment.simulation());
+            tape.actions.clear();
+            tape.last.clear();
+        }
+    }
+}
+
+impl Tape {
+    fn note(&mut self, before: &Simulation, action: &[f32]) {
+        if self.last.len() == LAST {
+            self.last.pop_front();
+        }
+        self.last.push_back(Moment::of(before));
+        self.actions.push(Numbers(action.iter().map(|value| f64::from(*value)).collect()));
+    }
+
+    fn dump(&mut self, episode: Episode, end: &Simulation) {
+        let name = |names: &[String], index: usize| names.get(index).cloned().unwrap_or_default();
+        let dump = Dump {
+            experiment: self.dumps.experiment.clone(),
+            task: name(&self.dumps.names.0, episode.task),
+            clip: episode.clip,
+            clip_name: name(&self.dumps.names.1, episode.clip),
+            start: episode.start,
+            seed: self.seed,
+            first: self.first.clone(),
+            actions: std::mem::take(&mut self.actions),
+            last: std::mem::take(&mut self.last).into(),
+            end: Moment::of(end),
+        };
+        self.dumps.write(&dump);
+    }
+}
+
+impl Environment for Watched {
+    fn reset(&mut self) {
+        self.environment.reset();
+        self.begin();
+    }
+
+    fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), comic_tasks::Error> {
+        self.environment.reset_to(clip, start)?;
+        self.begin();
+        Ok(())
+    }
+
+    fn step(&mut self, action: &[f32]) -> Step {
+        let Self { environment, tape } = self;
+        // A diverged episode is dumped once, and none when there are enough.
+        let mut tape = tape.as_mut().filter(|tape| tape.dumps.has_room());
+        if let Some(tape) = &mut tape {
+            tape.note(environment.simulation(), action);
+        }
+        let step = environment.step(action);
+        if let (Some(tape), Outcome::Diverged) = (tape, step.outcome) {
+            tape.dump(environment.episode(), environment.simulation());
+        }
+        step
+    }
+
+    fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
+        self.environment.observe(proprioception, task);
+    }
+
+    fn draw(&mut self, image: &mut [u8]) -> Result<(), comic_tasks::Error> {
+        self.environment.draw(image)
+    }
+
+    fn episode(&self) -> Episode {
+        self.environment.episode()
+    }
+
+    fn servo_action(&self, action: &mut [f32]) {
+        self.environment.servo_action(action);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An environment of a preset that dumps into a directory.
+    fn watched(directory: &Path, preset: &str) -> Watched {
+        let experiment = comic_experiment::resolve(preset, &[]).unwrap();
+        let catalogue = Catalogue::open(&experiment.clips).unwrap();
+        let task = comic_tasks::build(&experiment, &catalogue).unwrap();
+        let dumps = Dumps::new(directory, &experiment, task.spec()).unwrap();
+        Watched::new(task.environment(3).unwrap(), Some(dumps), 3)
+    }
+
+    fn dumped(directory: &Path) -> Vec<PathBuf> {
+        std::fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path()).collect()
+    }
+
+    /// A wild action, the same for the same step.
+    fn wild(step: usize) -> [f32; 56] {
+        std::array::from_fn(|joint| ((step * 56 + joint) as f32).sin())
+    }
+
+    #[test]
+    fn a_dump_of_tracking_is_played_again_bit_for_bit() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut environment = watched(directory.path(), "quickstart");
+        environment.reset();
+        for step in 0..4 {
+            environment.step(&wild(step));
+        }
+        environment.reset();
+        for step in 0..12 {
+            environment.step(&wild(step));
+        }
+        assert!(dumped(directory.path()).is_empty());
+        assert_eq!(environment.step(&[f32::NAN; 56]).outcome, Outcome::Diverged);
+        let [path] = dumped(directory.path()).try_into().unwrap();
+        let dump = Dump::read(&path).unwrap();
+        assert_eq!((dump.actions.len(), dump.last.len(), dump.clip_name.as_str()), (13, LAST, "CMU_007_01"));
+        assert_eq!(dump.replay(&[]).unwrap(), Replay { steps: 13, diverged: Some(13), exact: true });
+    }
+
+    #[test]
+    fn a_dump_of_another_task_begins_in_its_first_state() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut environment = watched(directory.path(), "get-up");
+        environment.reset();
+        environment.step(&[f32::INFINITY; 56]);
+        let [path] = dumped(directory.path()).try_into().unwrap();
+        assert_eq!(
+            Dump::read(&path).unwrap().replay(&[]).unwrap(),
+            Replay { steps: 1, diverged: Some(1), exact: true }
+        );
+    }
+
+    #[test]
+    fn states_that_are_no_numbers_come_back_from_the_disk() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut environment = watched(directory.path(), "quickstart");
+        environment.reset();
+        environment.environment.simulation_mut().qvel_mut().fill(1e11);
+        assert_eq!(environment.step(&[0.0; 56]).outcome, Outcome::Diverged);
+        let [path] = dumped(directory.path()).try_into().unwrap();
+        let dump = Dump::read(&path).unwrap();
+        assert!(dump.last[0].qvel.0.iter().all(|value| *value == 1e11));
+        assert_eq!(dump.end, Moment::of(environment.environment.simulation()));
+        assert!(!dump.replay(&[]).unwrap().exact, "the velocity came from nowhere");
+    }
+
+    #[test]
+    fn one_process_writes_no_more_than_a_few() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut environment = watched(directory.path(), "quickstart");
+        for _ in 0..MOST + 3 {
+            environment.reset();
+            environment.step(&[f32::NAN; 56]);
+        }
+        assert_eq!(dumped(directory.path()).len(), MOST);
+    }
+
+    #[test]
+    fn what_is_no_dump_is_refused_by_name() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("notes.json");
+        for text in ["", "{}", "[1, 2]", r#"{"experiment": 3}"#] {
+            std::fs::write(&path, text).unwrap();
+            let error = Dump::read(&path).unwrap_err();
+            assert!(error.is_configuration() && error.to_string().contains("notes.json"), "{error}");
+        }
+    }
+}

@@ -1,0 +1,133 @@
+//! How much memory the learner's buffers can take at most. Each is bounded by configuration, whatever peers do.
+
+use std::fmt;
+
+use crate::publish::{PIECE, VERSIONS};
+use crate::service::CONNECTION_WINDOW;
+
+/// What decides how large the buffers get.
+#[derive(Clone, Copy, Debug)]
+pub struct Sizes {
+    /// Batches that are assembled while one is trained on.
+    pub ahead: usize,
+    /// Unrolls a batch.
+    pub batch: usize,
+    /// Bytes of an unroll.
+    pub unroll: usize,
+    /// Connections at once.
+    pub connections: usize,
+    /// Calls in flight at once.
+    pub requests: usize,
+    /// Bytes of the largest message that is taken.
+    pub message: usize,
+    /// Refused messages that may wait for the disk.
+    pub quarantined: usize,
+    /// Bytes of the parameters that actors get.
+    pub parameters: usize,
+    /// Bytes of a checkpoint.
+    pub snapshot: usize,
+}
+
+/// The most that each buffer holds, in bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Bounds {
+    /// Unrolls in batches: those ahead, and the one at the trainer.
+    pub batches: u64,
+    /// Bytes on their way in that nobody read yet: a window for each connection.
+    pub windows: u64,
+    /// Messages that are read and wait for a place in a batch: one for each call.
+    pub messages: u64,
+    /// Versions of the parameters that are held for readers, and two pieces of them for each call.
+    pub parameters: u64,
+    /// Refused messages on their way to the disk.
+    pub quarantine: u64,
+    /// Checkpoints: one being written, one that waits, and the newest, to turn back to.
+    pub snapshots: u64,
+}
+
+impl Bounds {
+    /// The bounds of these sizes.
+    pub fn new(sizes: &Sizes) -> Self {
+        let product = |factors: &[usize]| factors.iter().fold(1u64, |all, factor| all.saturating_mul(*factor as u64));
+        let Sizes { ahead, batch, unroll, connections, requests, message, quarantined, parameters, snapshot } = *sizes;
+        Self {
+            batches: product(&[ahead + 1, batch, unroll]),
+            windows: product(&[connections, CONNECTION_WINDOW as usize]),
+            messages: product(&[requests, message]),
+            parameters: product(&[VERSIONS, parameters]).saturating_add(product(&[requests, 2, PIECE])),
+            quarantine: product(&[quarantined, message]),
+            snapshots: product(&[3, snapshot]),
+        }
+    }
+
+    fn parts(&self) -> [(&'static str, u64); 6] {
+        let Self { batches, windows, messages, parameters, quarantine, snapshots } = *self;
+        [
+            ("batches", batches),
+            ("connection windows", windows),
+            ("messages", messages),
+            ("parameters", parameters),
+            ("quarantine", quarantine),
+            ("checkpoints", snapshots),
+        ]
+    }
+
+    /// All of them together.
+    pub fn sum(&self) -> u64 {
+        self.parts().iter().fold(0, |sum, (_, bytes)| sum.saturating_add(*bytes))
+    }
+}
+
+/// In MiB, rounded up.
+impl fmt::Display for Bounds {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mebibytes = |bytes: u64| bytes.div_ceil(1 << 20);
+        write!(f, "at most {} MiB", mebibytes(self.sum()))?;
+        for (place, (name, bytes)) in self.parts().into_iter().enumerate() {
+            write!(f, "{} {name} {}", if place == 0 { ":" } else { "," }, mebibytes(bytes))?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZES: Sizes = Sizes {
+        ahead: 1,
+        batch: 128,
+        unroll: 200_000,
+        connections: 100,
+        requests: 300,
+        message: 1 << 20,
+        quarantined: 9,
+        parameters: 5_000_000,
+        snapshot: 40_000_000,
+    };
+
+    #[test]
+    fn each_part_is_what_its_buffers_hold_and_the_sum_is_theirs() {
+        let bounds = Bounds::new(&SIZES);
+        let expected = Bounds {
+            batches: 2 * 128 * 200_000,
+            windows: 100 * 1024 * 1024,
+            messages: 300 * 1024 * 1024,
+            parameters: 9 * 5_000_000 + 300 * 65_536,
+            quarantine: 9 * 1024 * 1024,
+            snapshots: 3 * 40_000_000,
+        };
+        assert_eq!(bounds, expected);
+        assert_eq!(bounds.sum(), 51_200_000 + 409 * 1_048_576 + 64_660_800 + 120_000_000);
+        assert_eq!(
+            bounds.to_string(),
+            "at most 634 MiB: batches 49, connection windows 100, messages 300, parameters 62, quarantine 9, checkpoints 115"
+        );
+    }
+
+    #[test]
+    fn limits_that_limit_nothing_give_a_bound_that_is_none() {
+        let bounds = Bounds::new(&Sizes { requests: usize::MAX, ..SIZES });
+        assert_eq!((bounds.messages, bounds.sum()), (u64::MAX, u64::MAX));
+    }
+}
