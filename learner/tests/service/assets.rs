@@ -2,13 +2,11 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-mod service_support;
-
 use std::path::Path;
 
+use crate::support::World;
 use comic_clips::Asset;
 use comic_proto::v1::AssetRequest;
-use service_support::World;
 use sha2::{Digest as _, Sha256};
 use tonic::{Code, Status};
 

@@ -2,12 +2,10 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-mod service_support;
-
 use std::time::{Duration, Instant};
 
+use crate::support::{BATCH, World, parameters, within};
 use comic_proto::v1::{Behaviour, StatusRequest, Verdict, WatchRequest};
-use service_support::{BATCH, World, parameters, within};
 
 const SECOND: Duration = Duration::from_secs(1);
 

@@ -2,14 +2,12 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-mod service_support;
-
 use std::path::Path;
 
+use crate::support::World;
 use comic_learner::security::{Security, Tokens};
 use comic_proto::Access;
 use comic_proto::v1::{JoinRequest, StatusRequest, WatchRequest};
-use service_support::World;
 use tonic::Code;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;

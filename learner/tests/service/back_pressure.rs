@@ -2,16 +2,14 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-mod service_support;
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
+use crate::support::{BATCH, World, within};
 use comic_proto::v1::Verdict;
 use comic_replay::Next;
 use futures::{StreamExt as _, stream};
-use service_support::{BATCH, World, within};
 
 /// Slots without a trainer: the open batch and the full one.
 const SLOTS: usize = 2 * BATCH;

@@ -2,15 +2,13 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-mod service_support;
-
 use std::path::Path;
 
+use crate::support::World;
 use comic_learner::certs::Certs;
 use comic_learner::security::{Security, Tls};
 use comic_proto::v1::StatusRequest;
 use comic_proto::{Access, distrusted};
-use service_support::World;
 
 fn certificates(directory: &Path) {
     Certs { out: directory.into(), names: vec!["localhost".into()], days: 1 }.run().unwrap();

@@ -2,15 +2,13 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-mod service_support;
-
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
+use crate::support::World;
 use comic_learner::probes;
 use comic_learner::telemetry::Telemetry;
 use comic_proto::v1::{Verdict, WatchRequest};
-use service_support::World;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 

@@ -2,14 +2,12 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-mod service_support;
-
 use std::pin::pin;
 use std::time::Duration;
 
+use crate::support::{EPOCH, World, parameters, within};
 use comic_learner::publish::{Holding, Publisher};
 use comic_proto::v1::{Behaviour, ParametersChunk, WatchRequest};
-use service_support::{EPOCH, World, parameters, within};
 use tonic::Streaming;
 
 const MEGABYTE: usize = 1024 * 1024;

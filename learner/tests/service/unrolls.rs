@@ -2,16 +2,14 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-mod service_support;
-
 use std::time::Duration;
 
+use crate::support::{BATCH, EPOCH, World, within};
 use bytes::Bytes;
 use comic_learner::quarantine::QuarantineOptions;
 use comic_proto::v1::{UnrollMessage, Verdict};
 use comic_proto::{Field, UnrollBuffer};
 use comic_replay::{Next, Phase};
-use service_support::{BATCH, EPOCH, World, within};
 use tonic::Code;
 
 #[tokio::test]

@@ -2,11 +2,9 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-mod service_support;
-
+use crate::support::{EPOCH, World};
 use comic_learner::service::Evaluation;
 use comic_proto::v1::{EvaluationReport, StatusRequest};
-use service_support::{EPOCH, World};
 use tonic::Code;
 
 #[tokio::test]

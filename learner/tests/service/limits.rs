@@ -2,10 +2,9 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-mod service_support;
-
 use std::time::Duration;
 
+use crate::support::{EPOCH, World, within};
 use comic_learner::options::Misuse;
 use comic_learner::publish::Publisher;
 use comic_learner::quarantine::QuarantineOptions;
@@ -14,7 +13,6 @@ use comic_learner::service::{Setup, Shared};
 use comic_proto::PROTOCOL_VERSION;
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{EvaluationReport, JoinRequest, StatusRequest, WatchRequest};
-use service_support::{EPOCH, World, within};
 use tonic::Code;
 
 const LIMIT: Duration = Duration::from_secs(10);

@@ -2,8 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-mod service_support;
-
+use crate::support::{EPOCH, World};
 use comic_experiment::{Experiment, TaskSpec};
 use comic_learner::publish::Publisher;
 use comic_learner::quarantine::QuarantineOptions;
@@ -11,7 +10,6 @@ use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
 use comic_proto::v1::JoinRequest;
 use comic_proto::{PROTOCOL_VERSION, UnrollLayout, UnrollShape};
-use service_support::{EPOCH, World};
 use tonic::Code;
 
 #[tokio::test]
