@@ -16,7 +16,11 @@ pub(crate) struct Buffer {
     floats: [Vec<f32>; Field::ALL.len()],
     clips: Vec<u32>,
     images: Vec<u8>,
-    pub(crate) headers: Vec<UnrollHeader>,
+    /// By slot; in a free one stands what was there before.
+    headers: Vec<UnrollHeader>,
+    filled: Vec<bool>,
+    /// Slots in use.
+    unrolls: usize,
 }
 
 impl Buffer {
@@ -29,19 +33,31 @@ impl Buffer {
             }),
             clips: vec![0; elements(Field::Clip)],
             images: vec![0; elements(Field::Image)],
-            headers: Vec::with_capacity(unrolls),
+            headers: vec![UnrollHeader::default(); unrolls],
+            filled: vec![false; unrolls],
+            unrolls: 0,
         }
     }
 
     /// Slots in use.
     pub(crate) fn len(&self) -> usize {
-        self.headers.len()
+        self.unrolls
     }
 
-    /// Copies an unroll into the next slot: each field once, from where the network put it to where it is trained on.
-    /// The payload's size is the layout's, and a slot is free.
-    pub(crate) fn push(&mut self, layout: &UnrollLayout, header: UnrollHeader, payload: &[u8]) {
-        let slot = self.headers.len();
+    /// Whether there is such a slot, and nothing in it.
+    pub(crate) fn is_free(&self, slot: usize) -> bool {
+        self.filled.get(slot) == Some(&false)
+    }
+
+    /// Frees every slot.
+    pub(crate) fn clear(&mut self) {
+        self.filled.fill(false);
+        self.unrolls = 0;
+    }
+
+    /// Copies an unroll into a free slot: each field once, from where the network put it to where it is trained on.
+    /// The payload's size is the layout's.
+    pub(crate) fn put(&mut self, layout: &UnrollLayout, slot: usize, header: UnrollHeader, payload: &[u8]) {
         for field in Field::ALL {
             let elements = layout.elements(field);
             let place = slot * elements..(slot + 1) * elements;
@@ -52,7 +68,9 @@ impl Buffer {
             };
             bytes.copy_from_slice(&payload[layout.range(field)]);
         }
-        self.headers.push(header);
+        self.headers[slot] = header;
+        self.filled[slot] = true;
+        self.unrolls += 1;
     }
 }
 
@@ -84,12 +102,12 @@ impl Batch {
     ) -> Result<Self, Invalid> {
         let unrolls = unrolls.into_iter();
         let mut buffer = Buffer::new(&layout, unrolls.len());
-        for (header, payload) in unrolls {
+        for (slot, (header, payload)) in unrolls.enumerate() {
             let payload = payload.as_ref();
             if payload.len() != layout.size() {
                 return Err(Invalid::Length { found: payload.len(), expected: layout.size() });
             }
-            buffer.push(&layout, header, payload);
+            buffer.put(&layout, slot, header, payload);
         }
         Ok(Self { layout, unrolls: buffer.len(), buffer: Some(Box::new(buffer)), owner: None })
     }

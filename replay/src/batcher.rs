@@ -23,6 +23,18 @@ pub struct Config {
     /// Batches that may be assembled while one is trained on. With 0 nothing is taken meanwhile, and what waits is as
     /// fresh as can be; with 1 the next batch is ready when the trainer is.
     pub ahead: usize,
+    /// In which order unrolls stand in a batch.
+    pub order: Order,
+}
+
+/// Which slot of a batch an unroll takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Order {
+    /// The next one: first come, first served.
+    Arrival,
+    /// That of its environment's number. A batch has one unroll of each of B environments, and no order of arrival can
+    /// be told from it.
+    Environment,
 }
 
 /// What the trainer wants at this moment.
@@ -133,7 +145,11 @@ impl Batcher {
             ledger.sums.unattributed += 1;
             return Outcome::Invalid;
         }
-        open.push(&self.inner.layout, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
+        let place = match self.inner.config.order {
+            Order::Arrival => open.len(),
+            Order::Environment => header.environment as usize,
+        };
+        open.put(&self.inner.layout, place, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
         slot.forget();
         self.settle(&mut state);
         Outcome::Taken
@@ -169,14 +185,14 @@ impl Batcher {
         let mut dropped = 0;
         if let Some(mut full) = state.full.take() {
             dropped += full.len();
-            full.headers.clear();
+            full.clear();
             state.free.push(full);
         }
         // The slots of a full open batch come back too; those promised to waiting inserts stay promised.
         if let Some(open) = state.open.as_mut() {
             dropped += open.len();
             self.inner.slots.add_permits(open.len());
-            open.headers.clear();
+            open.clear();
         }
         state.ledger.sums.dropped.count(Reason::Superseded, dropped as u64);
         self.settle(&mut state);
@@ -269,7 +285,7 @@ impl Batcher {
             None => state.ledger.sums.trained += unrolls as u64,
             Some(reason) => state.ledger.sums.dropped.count(reason, unrolls as u64),
         }
-        buffer.headers.clear();
+        buffer.clear();
         state.free.push(buffer);
         self.settle(&mut state);
     }
@@ -295,10 +311,24 @@ impl Batcher {
             Reason::Invalid
         } else if version.saturating_sub(header.version) > self.inner.config.max_staleness {
             Reason::Stale
+        } else if !self.has_room_for(state, header) {
+            Reason::Invalid
         } else {
             return None;
         };
         Some(drop_unroll(&mut state.ledger, header, reason))
+    }
+
+    /// Whether the open batch may get an unroll of this environment, once it has a slot.
+    fn has_room_for(&self, state: &State, header: &UnrollHeader) -> bool {
+        let environment = header.environment as usize;
+        match self.inner.config.order {
+            Order::Arrival => true,
+            Order::Environment => {
+                environment < self.inner.config.unrolls
+                    && state.open.as_ref().is_none_or(|open| open.is_free(environment))
+            }
+        }
     }
 
     /// Moves buffers on: a filled open batch becomes the full one when there is none, and a free buffer the open one.

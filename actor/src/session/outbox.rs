@@ -94,6 +94,7 @@ impl Outbox {
             layout_hash: self.layout_hash.clone(),
             demonstration: unroll.demonstration,
             episodes: unroll.episodes.clone(),
+            environment: 0,
         };
         Some(UnrollMessage { header: Some(header), payload: unroll.payload.clone() })
     }

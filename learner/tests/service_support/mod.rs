@@ -14,7 +14,7 @@ use comic_learner::service::{Setup, Shared, serve};
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{JoinReply, JoinRequest, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict};
 use comic_proto::{Access, Client, Field, PROTOCOL_VERSION, UnrollBuffer, UnrollLayout, UnrollShape};
-use comic_replay::{Batcher, Config, Ledger, Phase};
+use comic_replay::{Batcher, Config, Ledger, Order, Phase};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
@@ -79,7 +79,7 @@ impl World {
             }],
         };
         let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
-        let config = Config { unrolls: BATCH, max_staleness: 5, ahead: 2 };
+        let config = Config { unrolls: BATCH, max_staleness: 5, ahead: 2, order: Order::Arrival };
         let phase = Phase { epoch: EPOCH, version: 0, oldest: 0, demonstration: false };
         let batcher = Batcher::new(layout, config, phase, Ledger::new());
         let publisher = Publisher::new(EPOCH);
@@ -159,6 +159,7 @@ impl Actor {
             layout_hash: self.layout.hash().to_vec(),
             demonstration: false,
             episodes: Vec::new(),
+            environment: 0,
         };
         let mut unroll = UnrollBuffer::new(&self.layout);
         for t in 0..self.layout.shape().length {
