@@ -16,9 +16,9 @@ use tokio::sync::{mpsc, watch};
 use crate::Error;
 use crate::mailbox::Mailbox;
 use crate::policy::TorchPolicy;
-use crate::seeds::derive;
+use crate::seeds::EnvironmentSeeds;
 use crate::session::{self, Joined, Limits};
-use crate::worker::{FinishedUnroll, Progress, Worker};
+use crate::worker::{FinishedUnroll, Pace, Progress, Worker};
 
 /// A stopped actor delivers finished unrolls for so long: a second less than the five in which it promises to leave.
 const FLUSH: Duration = Duration::from_secs(4);
@@ -130,16 +130,17 @@ fn build(joined: &Joined, threads: usize, environments: usize) -> Result<(Vec<Ta
     }
     let mut parameters = 0;
     let mut workers = Vec::with_capacity(threads);
-    for thread in 0..threads as u64 {
-        let seed = derive(joined.seed, thread);
-        let environments = (1..=environments as u64)
-            .map(|environment| Arc::clone(&task).environment(derive(seed, environment)))
+    for thread in 0..threads {
+        let first = (thread * environments) as u32;
+        let environments = (first..)
+            .take(environments)
+            .map(|number| Arc::clone(&task).environment(EnvironmentSeeds::new(joined.seed, number).simulation))
             .collect::<Result<_, _>>()?;
         // The first parameters off the wire replace what it starts with.
-        let policy = TorchPolicy::untrained(spec, experiment, seed, || Ok([0.0; 56]))?;
+        let policy = TorchPolicy::untrained(spec, experiment, 0, || Ok([0.0; 56]))?;
         parameters = policy.to_parameters()?.len() as u64;
         let noise = experiment.warm_start.noise as f32;
-        workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), noise, derive(seed, 0)));
+        workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), noise, first, joined.seed));
     }
     Ok((workers, parameters))
 }
@@ -161,7 +162,7 @@ fn start(
                 .name(format!("worker-{index}"))
                 .spawn(move || {
                     let closing = closing;
-                    worker.run(&closing.mailbox, &unrolls, &progress)
+                    worker.run(Pace::Free, &closing.mailbox, &unrolls, &progress)
                 })
                 .map_err(Error::Thread)
         })

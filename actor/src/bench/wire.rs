@@ -102,7 +102,15 @@ fn still_unroll(layout: &UnrollLayout) -> FinishedUnroll {
         buffer.row_mut(Field::Valid, t)[0] = 1.0;
     }
     let payload = buffer.into_bytes();
-    FinishedUnroll { payload, learner_epoch: 1, version: 1, demonstration: false, episodes: Vec::new(), ticket: None }
+    FinishedUnroll {
+        payload,
+        learner_epoch: 1,
+        version: 1,
+        demonstration: false,
+        episodes: Vec::new(),
+        environment: 0,
+        ticket: None,
+    }
 }
 
 /// Processor time of this thread from the first unroll handed over to the last acknowledgement.

@@ -94,7 +94,7 @@ impl Outbox {
             layout_hash: self.layout_hash.clone(),
             demonstration: unroll.demonstration,
             episodes: unroll.episodes.clone(),
-            environment: 0,
+            environment: unroll.environment,
         };
         Some(UnrollMessage { header: Some(header), payload: unroll.payload.clone() })
     }
@@ -144,6 +144,7 @@ mod tests {
             version: 1,
             demonstration: false,
             episodes: Vec::new(),
+            environment: 0,
             ticket: None,
         }
     }

@@ -23,6 +23,7 @@ fn unroll(number: u64) -> FinishedUnroll {
         version: number,
         demonstration: false,
         episodes: Vec::new(),
+        environment: 0,
         ticket: None,
     }
 }
