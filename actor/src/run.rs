@@ -1,5 +1,6 @@
 //! An actor process: join, build the environments, act until told to stop.
 
+use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -14,6 +15,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{mpsc, watch};
 
 use crate::Error;
+use crate::acting::{ActingSizes, ForwardPass, OneByOne};
 use crate::mailbox::Mailbox;
 use crate::policy::TorchPolicy;
 use crate::seeds::EnvironmentSeeds;
@@ -45,7 +47,7 @@ pub struct Options {
     pub cache: Option<PathBuf>,
 }
 
-type TaskWorker = Worker<Box<dyn Simulated>, TorchPolicy>;
+type TaskWorker = Worker<Box<dyn Simulated>, Box<dyn ForwardPass + Send>>;
 
 /// Acts for a learner until the run is over.
 ///
@@ -74,14 +76,21 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
         learner: options.learner.clone(),
         access: options.access.clone(),
         cache: options.cache.clone(),
+        threads: options.threads,
+        environments: options.environments,
     };
     let joined = runtime.block_on(session::join(&session, stop.clone()))?;
     let threads = options.threads.unwrap_or(joined.experiment.actor.threads).max(1);
     let environments = options.environments.unwrap_or(joined.experiment.actor.environments).max(1);
-    let (workers, parameters) = build(&joined, threads, environments)?;
-    tracing::info!(experiment = joined.experiment.name, threads, environments, "acting");
+    let (pace, numbers) = match &joined.environments {
+        Some(share) => (Pace::Lockstep, share.clone()),
+        None => (Pace::Free, 0..u32::try_from(threads.saturating_mul(environments)).unwrap_or(u32::MAX)),
+    };
+    let environments = numbers.len();
+    let (workers, parameters) = build(&joined, threads, pace, numbers)?;
+    tracing::info!(experiment = joined.experiment.name, threads = workers.len(), environments, ?pace, "acting");
 
-    let unacknowledged = (2 * threads).saturating_mul(environments).clamp(FEWEST_UNACKNOWLEDGED, MOST_UNACKNOWLEDGED);
+    let unacknowledged = environments.saturating_mul(2).clamp(FEWEST_UNACKNOWLEDGED, MOST_UNACKNOWLEDGED);
     let limits = Limits { window: unacknowledged, parameters: parameters + PARAMETERS_SLACK, flush: FLUSH };
     // One round of unrolls fits: then a worker goes on stepping while the connection takes what it made.
     let (sender, unrolls) = mpsc::channel(unacknowledged / 2);
@@ -89,7 +98,7 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
     let session = runtime.spawn(joined.run(limits, unrolls, Arc::clone(&mailbox), stop));
     let reporter = runtime.spawn(report(Arc::clone(&progress)));
 
-    let handles = start(workers, &closing, sender, &progress)?;
+    let handles = start(workers, pace, &closing, sender, &progress)?;
     let settled = runtime.block_on(session);
     mailbox.close();
     reporter.abort();
@@ -120,8 +129,8 @@ fn stop_on_signal(runtime: &Runtime, closing: Closing) -> Result<(), Error> {
     Ok(())
 }
 
-/// The workers, and the bytes that the acting parameters take.
-fn build(joined: &Joined, threads: usize, environments: usize) -> Result<(Vec<TaskWorker>, u64), Error> {
+/// The workers, at most one a thread, and the bytes that the acting parameters take.
+fn build(joined: &Joined, threads: usize, pace: Pace, numbers: Range<u32>) -> Result<(Vec<TaskWorker>, u64), Error> {
     let (experiment, spec) = (&joined.experiment, &joined.spec);
     let catalogue = Catalogue::open_with(&experiment.clips, |source| joined.assets.get(source).cloned())?;
     let task = comic_tasks::build(experiment, &catalogue)?;
@@ -130,15 +139,19 @@ fn build(joined: &Joined, threads: usize, environments: usize) -> Result<(Vec<Ta
     }
     let mut parameters = 0;
     let mut workers = Vec::with_capacity(threads);
-    for thread in 0..threads {
-        let first = (thread * environments) as u32;
-        let environments = (first..)
-            .take(environments)
+    let each = numbers.len().div_ceil(threads);
+    for first in numbers.clone().step_by(each) {
+        let environments = (first..numbers.end)
+            .take(each)
             .map(|number| Arc::clone(&task).environment(EnvironmentSeeds::new(joined.seed, number).simulation))
             .collect::<Result<_, _>>()?;
         // The first parameters off the wire replace what it starts with.
         let policy = TorchPolicy::untrained(spec, experiment, 0, || Ok([0.0; 56]))?;
         parameters = policy.to_parameters()?.len() as u64;
+        let policy: Box<dyn ForwardPass + Send> = match pace {
+            Pace::Free => Box::new(policy),
+            Pace::Lockstep => Box::new(OneByOne::new(policy, ActingSizes::from(joined.layout.shape()))),
+        };
         let noise = experiment.warm_start.noise as f32;
         workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), noise, first, joined.seed));
     }
@@ -149,6 +162,7 @@ type WorkerThread = thread::JoinHandle<Result<(), Error>>;
 
 fn start(
     workers: Vec<TaskWorker>,
+    pace: Pace,
     closing: &Closing,
     unrolls: mpsc::Sender<FinishedUnroll>,
     progress: &Arc<Progress>,
@@ -162,7 +176,7 @@ fn start(
                 .name(format!("worker-{index}"))
                 .spawn(move || {
                     let closing = closing;
-                    worker.run(Pace::Free, &closing.mailbox, &unrolls, &progress)
+                    worker.run(pace, &closing.mailbox, &unrolls, &progress)
                 })
                 .map_err(Error::Thread)
         })

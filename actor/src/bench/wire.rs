@@ -116,7 +116,13 @@ fn still_unroll(layout: &UnrollLayout) -> FinishedUnroll {
 /// Processor time of this thread from the first unroll handed over to the last acknowledgement.
 async fn send(address: &str, unroll: &FinishedUnroll, unrolls: usize) -> Result<Duration, Error> {
     let (_stop, stopped) = watch::channel(false);
-    let options = session::Options { learner: address.to_string(), access: Access::default(), cache: None };
+    let options = session::Options {
+        learner: address.to_string(),
+        access: Access::default(),
+        cache: None,
+        threads: None,
+        environments: None,
+    };
     let joined = session::join(&options, stopped.clone()).await?;
     let (sender, receiver) = mpsc::channel(super::ENVIRONMENTS);
     let limits = Limits { window: 2 * super::ENVIRONMENTS, parameters: 0, flush: Duration::ZERO };

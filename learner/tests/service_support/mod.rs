@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Result;
 use bytes::Bytes;
 use comic_clips::Asset;
-use comic_experiment::{Experiment, TaskPart, TaskSpec};
+use comic_experiment::{Experiment, TaskPart, TaskSpec, Unroll};
 use comic_learner::publish::Publisher;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared, serve};
@@ -57,12 +57,24 @@ impl World {
         Self::guarded(8, Vec::new(), security, Limits::default()).await
     }
 
+    /// In lockstep, over so many environments.
+    pub(crate) async fn in_lockstep(environments: usize) -> Self {
+        let mut experiment = experiment();
+        experiment.unroll = Unroll { lockstep: true, ahead: 0, batch: environments, ..experiment.unroll };
+        Self::of(experiment, 8, Vec::new(), Security::default(), Limits::default()).await
+    }
+
     async fn guarded(proprioception: usize, assets: Vec<Asset>, security: Security, limits: Limits) -> Self {
-        let mut experiment = Experiment::default();
-        experiment.unroll.length = 4;
-        experiment.unroll.batch = BATCH;
-        experiment.vmpo.minibatch_unrolls = BATCH;
-        experiment.network.latent.size = 2;
+        Self::of(experiment(), proprioception, assets, security, limits).await
+    }
+
+    async fn of(
+        experiment: Experiment,
+        proprioception: usize,
+        assets: Vec<Asset>,
+        security: Security,
+        limits: Limits,
+    ) -> Self {
         let spec = TaskSpec {
             proprioception,
             task: 3,
@@ -124,7 +136,7 @@ impl World {
     /// An actor that has joined.
     pub(crate) async fn actor(&self, incarnation: u64) -> Actor {
         let mut client = self.client().await;
-        let request = JoinRequest { incarnation, actor: None, protocol: PROTOCOL_VERSION };
+        let request = joining(incarnation);
         let reply = client.join(request).await.unwrap().into_inner();
         Actor { client, reply, incarnation, layout: self.batcher.layout().clone() }
     }
@@ -138,6 +150,20 @@ impl World {
     pub(crate) async fn ended(self) -> Result<()> {
         within(Duration::from_secs(5), self.server).await.unwrap()
     }
+}
+
+fn experiment() -> Experiment {
+    let mut experiment = Experiment::default();
+    experiment.unroll.length = 4;
+    experiment.unroll.batch = BATCH;
+    experiment.vmpo.minibatch_unrolls = BATCH;
+    experiment.network.latent.size = 2;
+    experiment
+}
+
+/// What a new process asks for.
+pub(crate) fn joining(incarnation: u64) -> JoinRequest {
+    JoinRequest { incarnation, protocol: PROTOCOL_VERSION, ..JoinRequest::default() }
 }
 
 pub(crate) struct Actor {
