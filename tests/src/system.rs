@@ -119,6 +119,11 @@ impl System {
         })
     }
 
+    /// Overrides a field of the experiment when the learner starts the next time.
+    pub fn set(&mut self, field: &str) {
+        self.arguments.extend(["--set".to_owned(), field.to_owned()]);
+    }
+
     /// The learner's address.
     pub fn url(&self) -> String {
         let scheme = if self.access.ca.is_some() { "https" } else { "http" };
@@ -162,6 +167,16 @@ impl System {
         let mut command = Command::new(program("comic-actor")?);
         command.args(["--learner", &self.url()]).args(flags(access));
         change(&mut command);
+        self.spawn("actor", command)
+    }
+
+    /// Starts an actor that simulates so many environments and reaches the learner at `url`.
+    ///
+    /// # Errors
+    /// When it cannot be started.
+    pub fn start_actor_of(&mut self, environments: u32, url: &str) -> Result<Process> {
+        let mut command = Command::new(program("comic-actor")?);
+        command.args(["--learner", url, "--environments", &environments.to_string()]);
         self.spawn("actor", command)
     }
 
@@ -299,8 +314,7 @@ impl Process {
     /// # Errors
     /// When it is still there after `limit`.
     pub async fn terminate(mut self, limit: Duration) -> Result<ExitStatus> {
-        let pid = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw).context("no process id")?;
-        kill_process(pid, Signal::TERM).context("cannot signal")?;
+        self.signal(Signal::TERM)?;
         let deadline = Instant::now() + limit;
         while Instant::now() < deadline {
             if let Some(status) = self.ended()? {
@@ -309,6 +323,27 @@ impl Process {
             tokio::time::sleep(POLL).await;
         }
         bail!("still there {limit:?} after SIGTERM: {}", self.log())
+    }
+
+    /// Stops it where it is (SIGSTOP), until it [`resumes`](Self::resume).
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn pause(&self) -> Result<()> {
+        self.signal(Signal::STOP)
+    }
+
+    /// Lets it go on (SIGCONT).
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn resume(&self) -> Result<()> {
+        self.signal(Signal::CONT)
+    }
+
+    fn signal(&self, signal: Signal) -> Result<()> {
+        let pid = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw).context("no process id")?;
+        kill_process(pid, signal).context("cannot signal")
     }
 
     /// How it ended, if it has.
