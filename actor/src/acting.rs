@@ -103,6 +103,26 @@ pub struct ActingRow<'a> {
 }
 
 impl ActingRow<'_> {
+    /// Takes everything from another row of the same sizes.
+    pub fn copy_from(&mut self, other: &ActingRow<'_>) {
+        self.proprioception.copy_from_slice(other.proprioception);
+        self.task.copy_from_slice(other.task);
+        self.image.copy_from_slice(other.image);
+        self.previous_latent.copy_from_slice(other.previous_latent);
+        self.latent_noise.copy_from_slice(other.latent_noise);
+        self.latent.copy_from_slice(other.latent);
+        self.mean.copy_from_slice(other.mean);
+        self.std.copy_from_slice(other.std);
+        self.log_weights.copy_from_slice(other.log_weights);
+        self.state.copy_from_slice(other.state);
+        *self.of_task = *other.of_task;
+    }
+
+    /// Draws the latent's noise of the coming step.
+    pub fn draw_latent_noise(&mut self, rng: &mut impl Rng) {
+        fill_normal(self.latent_noise, rng);
+    }
+
     /// A mind without memory: an episode's beginning.
     pub fn forget(&mut self) {
         self.previous_latent.fill(0.0);
@@ -211,7 +231,7 @@ impl ActingBatch {
         }
     }
 
-    /// Draws the latents' noise of the coming step.
+    /// Draws the latents' noise of the coming step, all from one source.
     pub fn draw_latent_noise(&mut self, rng: &mut impl Rng) {
         fill_normal(&mut self.latent_noise, rng);
     }
@@ -249,12 +269,75 @@ pub trait ForwardPass {
     fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error>;
 }
 
+impl<F: ForwardPass + ?Sized> ForwardPass for Box<F> {
+    fn load(&mut self, parameters: &[u8]) -> Result<(), Error> {
+        (**self).load(parameters)
+    }
+
+    fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+        (**self).forward(batch)
+    }
+}
+
+/// A forward pass for each environment alone. The order in which a library adds up depends on the size of the batch, so
+/// this is how an environment's numbers do not depend on how many others there are.
+#[derive(Debug)]
+pub struct OneByOne<F> {
+    forward: F,
+    alone: ActingBatch,
+}
+
+impl<F: ForwardPass> OneByOne<F> {
+    /// By this forward pass, over arrays of these widths.
+    pub fn new(forward: F, sizes: ActingSizes) -> Self {
+        Self { forward, alone: ActingBatch::new(1, sizes) }
+    }
+}
+
+impl<F: ForwardPass> ForwardPass for OneByOne<F> {
+    fn load(&mut self, parameters: &[u8]) -> Result<(), Error> {
+        self.forward.load(parameters)
+    }
+
+    fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+        for environment in 0..batch.environments() {
+            self.alone.row(0).copy_from(&batch.row(environment));
+            self.forward.forward(&mut self.alone)?;
+            batch.row(environment).copy_from(&self.alone.row(0));
+        }
+        Ok(())
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use rand::SeedableRng as _;
     use rand_pcg::Pcg64;
 
     use super::*;
+
+    /// Adds the batch's size to what it reads, so that whoever depends on it shows.
+    struct Sizes;
+
+    impl ForwardPass for Sizes {
+        fn load(&mut self, _: &[u8]) -> Result<(), Error> {
+            Ok(())
+        }
+
+        fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+            let environments = batch.environments() as f32;
+            batch.state.iter_mut().for_each(|value| *value += environments);
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn one_by_one_every_environment_is_a_batch_of_its_own() {
+        let mut batch = ActingBatch::new(3, SIZES);
+        batch.state = (0..12).map(|value| value as f32).collect();
+        OneByOne::new(Sizes, SIZES).forward(&mut batch).unwrap();
+        assert_eq!(batch.state, (1..13).map(|value| value as f32).collect::<Vec<_>>());
+    }
 
     const SIZES: ActingSizes =
         ActingSizes { proprioception: 0, task: 0, latent: 0, action: 2, image: 0, components: 3, state: 4 };

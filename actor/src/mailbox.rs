@@ -63,13 +63,18 @@ impl Mailbox {
 
     /// The newest directive, waiting for the one that was announced; `None` once the mailbox is closed.
     pub fn wait(&self) -> Option<Arc<Directive>> {
+        self.wait_from((0, 0))
+    }
+
+    /// The same, waiting for one that is at least of this learner epoch and version too.
+    pub fn wait_from(&self, oldest: (u64, u64)) -> Option<Arc<Directive>> {
         let mut state = self.lock();
         loop {
             if self.is_closed() {
                 return None;
             }
             match &state.newest {
-                Some(directive) if (directive.learner_epoch, directive.version) >= state.announced => {
+                Some(directive) if (directive.learner_epoch, directive.version) >= state.announced.max(oldest) => {
                     return Some(Arc::clone(directive));
                 }
                 _ => state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
@@ -120,6 +125,18 @@ mod tests {
         let waiter = std::thread::spawn({
             let mailbox = Arc::clone(&mailbox);
             move || mailbox.wait().unwrap().version
+        });
+        mailbox.publish(directive(2));
+        assert_eq!(waiter.join().unwrap(), 2);
+    }
+
+    #[test]
+    fn who_wants_a_newer_directive_waits_for_it() {
+        let mailbox = Arc::new(Mailbox::default());
+        mailbox.publish(directive(1));
+        let waiter = std::thread::spawn({
+            let mailbox = Arc::clone(&mailbox);
+            move || mailbox.wait_from((1, 2)).unwrap().version
         });
         mailbox.publish(directive(2));
         assert_eq!(waiter.join().unwrap(), 2);

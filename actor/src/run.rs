@@ -1,5 +1,6 @@
 //! An actor process: join, build the environments, act until told to stop.
 
+use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -13,12 +14,13 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{mpsc, watch};
 
 use crate::Error;
+use crate::acting::{ActingSizes, ForwardPass, OneByOne};
 use crate::dump::{Dumps, Watched};
 use crate::mailbox::Mailbox;
 use crate::policy::TorchPolicy;
-use crate::seeds::derive;
+use crate::seeds::EnvironmentSeeds;
 use crate::session::{self, Joined, Limits};
-use crate::worker::{FinishedUnroll, Progress, Worker};
+use crate::worker::{FinishedUnroll, Pace, Progress, Worker};
 
 /// A stopped actor delivers finished unrolls for so long: a second less than the five in which it promises to leave.
 const FLUSH: Duration = Duration::from_secs(4);
@@ -47,7 +49,7 @@ pub struct Options {
     pub dump_diverged: Option<PathBuf>,
 }
 
-type TaskWorker = Worker<Watched, TorchPolicy>;
+type TaskWorker = Worker<Watched, Box<dyn ForwardPass + Send>>;
 
 /// Acts for a learner until the run is over.
 ///
@@ -76,16 +78,23 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
         learner: options.learner.clone(),
         access: options.access.clone(),
         cache: options.cache.clone(),
+        threads: options.threads,
+        environments: options.environments,
     };
     let joined = runtime.block_on(session::join(&session, stop.clone()))?;
     let threads = options.threads.unwrap_or(joined.experiment.actor.threads).max(1);
     let environments = options.environments.unwrap_or(joined.experiment.actor.environments).max(1);
+    let (pace, numbers) = match &joined.environments {
+        Some(share) => (Pace::Lockstep, share.clone()),
+        None => (Pace::Free, 0..u32::try_from(threads.saturating_mul(environments)).unwrap_or(u32::MAX)),
+    };
+    let environments = numbers.len();
     let dumps = options.dump_diverged.as_deref();
     let dumps = dumps.map(|directory| Dumps::new(directory, &joined.experiment, &joined.spec)).transpose()?;
-    let (workers, parameters) = build(&joined, threads, environments, dumps.as_ref())?;
-    tracing::info!(experiment = joined.experiment.name, threads, environments, "acting");
+    let (workers, parameters) = build(&joined, threads, pace, numbers, dumps.as_ref())?;
+    tracing::info!(experiment = joined.experiment.name, threads = workers.len(), environments, ?pace, "acting");
 
-    let unacknowledged = (2 * threads).saturating_mul(environments).clamp(FEWEST_UNACKNOWLEDGED, MOST_UNACKNOWLEDGED);
+    let unacknowledged = environments.saturating_mul(2).clamp(FEWEST_UNACKNOWLEDGED, MOST_UNACKNOWLEDGED);
     let limits = Limits { window: unacknowledged, parameters: parameters + PARAMETERS_SLACK, flush: FLUSH };
     // One round of unrolls fits: then a worker goes on stepping while the connection takes what it made.
     let (sender, unrolls) = mpsc::channel(unacknowledged / 2);
@@ -93,7 +102,7 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
     let session = runtime.spawn(joined.run(limits, unrolls, Arc::clone(&mailbox), stop));
     let reporter = runtime.spawn(report(Arc::clone(&progress)));
 
-    let handles = start(workers, &closing, sender, &progress)?;
+    let handles = start(workers, pace, &closing, sender, &progress)?;
     let settled = runtime.block_on(session);
     mailbox.close();
     reporter.abort();
@@ -124,11 +133,12 @@ fn stop_on_signal(runtime: &Runtime, closing: Closing) -> Result<(), Error> {
     Ok(())
 }
 
-/// The workers, and the bytes that the acting parameters take.
+/// The workers, at most one a thread, and the bytes that the acting parameters take.
 fn build(
     joined: &Joined,
     threads: usize,
-    environments: usize,
+    pace: Pace,
+    numbers: Range<u32>,
     dumps: Option<&Arc<Dumps>>,
 ) -> Result<(Vec<TaskWorker>, u64), Error> {
     let (experiment, spec) = (&joined.experiment, &joined.spec);
@@ -139,19 +149,24 @@ fn build(
     }
     let mut parameters = 0;
     let mut workers = Vec::with_capacity(threads);
-    for thread in 0..threads as u64 {
-        let seed = derive(joined.seed, thread);
-        let environments = (1..=environments as u64)
-            .map(|environment| {
-                let seed = derive(seed, environment);
+    let each = numbers.len().div_ceil(threads);
+    for first in numbers.clone().step_by(each) {
+        let environments = (first..numbers.end)
+            .take(each)
+            .map(|number| {
+                let seed = EnvironmentSeeds::new(joined.seed, number).simulation;
                 Ok(Watched::new(Arc::clone(&task).environment(seed)?, dumps.cloned(), seed))
             })
             .collect::<Result<_, comic_tasks::Error>>()?;
         // The first parameters off the wire replace what it starts with.
-        let policy = TorchPolicy::untrained(spec, experiment, seed, || Ok([0.0; 56]))?;
+        let policy = TorchPolicy::untrained(spec, experiment, 0, || Ok([0.0; 56]))?;
         parameters = policy.to_parameters()?.len() as u64;
+        let policy: Box<dyn ForwardPass + Send> = match pace {
+            Pace::Free => Box::new(policy),
+            Pace::Lockstep => Box::new(OneByOne::new(policy, ActingSizes::from(joined.layout.shape()))),
+        };
         let noise = experiment.warm_start.noise as f32;
-        workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), noise, derive(seed, 0)));
+        workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), noise, first, joined.seed));
     }
     Ok((workers, parameters))
 }
@@ -160,6 +175,7 @@ type WorkerThread = thread::JoinHandle<Result<(), Error>>;
 
 fn start(
     workers: Vec<TaskWorker>,
+    pace: Pace,
     closing: &Closing,
     unrolls: mpsc::Sender<FinishedUnroll>,
     progress: &Arc<Progress>,
@@ -173,7 +189,7 @@ fn start(
                 .name(format!("worker-{index}"))
                 .spawn(move || {
                     let closing = closing;
-                    worker.run(&closing.mailbox, &unrolls, &progress)
+                    worker.run(pace, &closing.mailbox, &unrolls, &progress)
                 })
                 .map_err(Error::Thread)
         })

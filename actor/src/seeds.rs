@@ -9,6 +9,23 @@ pub(crate) fn derive(seed: u64, index: u64) -> u64 {
     z ^ (z >> 31)
 }
 
+/// What is random about one environment, whoever simulates it and beside which others.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct EnvironmentSeeds {
+    /// Of its episodes.
+    pub(crate) simulation: u64,
+    /// Of its latents' and its actions' noise.
+    pub(crate) noise: u64,
+}
+
+impl EnvironmentSeeds {
+    /// Of environment `number` of the family `seed`.
+    pub(crate) fn new(seed: u64, number: u32) -> Self {
+        let own = derive(seed, u64::from(number));
+        Self { simulation: derive(own, 0), noise: derive(own, 1) }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::collections::HashSet;

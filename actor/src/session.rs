@@ -13,12 +13,13 @@ mod outbox;
 mod parameters;
 
 use std::collections::HashMap;
+use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
 use comic_experiment::{Experiment, TaskSpec};
-use comic_proto::v1::JoinReply;
+use comic_proto::v1::{Environments, JoinReply};
 use comic_proto::{Access, UnrollLayout, UnrollShape};
 use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
@@ -38,7 +39,7 @@ pub use parameters::{Assembled, Assembler};
 /// Shorter connections are failures too: the back-off goes on growing.
 const STABLE: Duration = Duration::from_secs(5);
 
-/// Where the learner is and where assets are kept.
+/// Where the learner is, where assets are kept, and how much this actor does.
 #[derive(Clone, Debug)]
 pub struct Options {
     /// For instance `http://host:7070`.
@@ -47,6 +48,10 @@ pub struct Options {
     pub access: Access,
     /// Directory of the asset cache; [`default_cache`] when absent.
     pub cache: Option<PathBuf>,
+    /// Threads; the experiment's number when absent.
+    pub threads: Option<usize>,
+    /// Environments a thread; the experiment's number when absent.
+    pub environments: Option<usize>,
 }
 
 /// Limits of an exchange.
@@ -73,6 +78,8 @@ pub struct Joined {
     pub actor: u64,
     /// Seed of this actor's random numbers.
     pub seed: u64,
+    /// What of a run in lockstep this actor simulates, never empty; none when the run is in no lockstep.
+    pub environments: Option<Range<u32>>,
     /// Where the experiment's clip sources lie on this machine.
     pub assets: HashMap<String, PathBuf>,
     terms: Terms,
@@ -86,6 +93,7 @@ struct Terms {
     experiment: String,
     task_spec: String,
     layout_hash: Vec<u8>,
+    environments: Option<Environments>,
 }
 
 impl Terms {
@@ -94,6 +102,7 @@ impl Terms {
             experiment: lasting(&reply.experiment),
             task_spec: reply.task_spec.clone(),
             layout_hash: reply.layout_hash.clone(),
+            environments: reply.environments,
         }
     }
 }
@@ -123,11 +132,11 @@ pub async fn join(options: &Options, mut stop: watch::Receiver<bool>) -> Result<
 }
 
 async fn join_for_ever(options: &Options) -> Result<Joined, Error> {
-    let mut connector = Connector::new(&options.learner, &options.access)?;
+    let mut connector = Connector::new(options)?;
     let mut backoff = Backoff::default();
     loop {
         match attempt(options, &mut connector).await {
-            Ok((link, experiment, spec, layout, assets)) => {
+            Ok((link, Told { experiment, spec, layout, environments }, assets)) => {
                 let reply = &link.reply;
                 return Ok(Joined {
                     experiment,
@@ -135,6 +144,7 @@ async fn join_for_ever(options: &Options) -> Result<Joined, Error> {
                     layout,
                     actor: reply.actor,
                     seed: reply.seed,
+                    environments,
                     assets,
                     terms: Terms::of(reply),
                     connector,
@@ -147,23 +157,45 @@ async fn join_for_ever(options: &Options) -> Result<Joined, Error> {
     }
 }
 
-type Answer = (Link, Experiment, TaskSpec, Arc<UnrollLayout>, HashMap<String, PathBuf>);
+type Answer = (Link, Told, HashMap<String, PathBuf>);
 
 async fn attempt(options: &Options, connector: &mut Connector) -> Result<Answer, Failure> {
     let mut link = connector.connect().await?;
-    let (experiment, spec, layout) = read_reply(&link.reply).map_err(Failure::Fatal)?;
+    let told = read_reply(&link.reply).map_err(Failure::Fatal)?;
     let assets = assets::fetch(&mut link, options.cache.as_deref()).await?;
-    Ok((link, experiment, spec, layout, assets))
+    Ok((link, told, assets))
 }
 
-fn read_reply(reply: &JoinReply) -> Result<(Experiment, TaskSpec, Arc<UnrollLayout>), Error> {
+/// What a reply says, checked.
+struct Told {
+    experiment: Experiment,
+    spec: TaskSpec,
+    layout: Arc<UnrollLayout>,
+    environments: Option<Range<u32>>,
+}
+
+fn read_reply(reply: &JoinReply) -> Result<Told, Error> {
     let experiment = Experiment::from_toml("the learner's experiment", &reply.experiment)?;
     let spec: TaskSpec = toml::from_str(&reply.task_spec)?;
     let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
     if reply.layout_hash != layout.hash()[..] {
         return Err(Error::Disagreement { what: "the layout of an unroll" });
     }
-    Ok((experiment, spec, Arc::new(layout)))
+    let environments = read_environments(reply, &experiment)?;
+    Ok(Told { experiment, spec, layout: Arc::new(layout), environments })
+}
+
+fn read_environments(reply: &JoinReply, experiment: &Experiment) -> Result<Option<Range<u32>>, Error> {
+    let (lockstep, batch) = (experiment.unroll.lockstep, experiment.unroll.batch);
+    let disagreement = Error::Disagreement { what: "the environments of a run in lockstep" };
+    match reply.environments {
+        None if !lockstep => Ok(None),
+        Some(Environments { first, count }) if lockstep => {
+            let end = first.checked_add(count).filter(|end| count > 0 && *end as usize <= batch);
+            Ok(Some(first..end.ok_or(disagreement)?))
+        }
+        _ => Err(disagreement),
+    }
 }
 
 impl Joined {

@@ -24,8 +24,6 @@ use bytes::Bytes;
 use comic_proto::UnrollLayout;
 use comic_proto::v1::EpisodeStatistics;
 use comic_tasks::Environment;
-use rand::SeedableRng as _;
-use rand_pcg::Pcg64;
 use tokio::sync::mpsc;
 
 use crate::Error;
@@ -47,8 +45,20 @@ pub struct FinishedUnroll {
     pub demonstration: bool,
     /// Episodes that ended in this unroll.
     pub episodes: Vec<EpisodeStatistics>,
+    /// The environment's number.
+    pub environment: u32,
     /// Held until the learner has answered for it, if somebody waits for that.
     pub ticket: Option<Arc<Ticket>>,
+}
+
+/// How often a worker acts with the same parameters.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pace {
+    /// For as many unrolls as the learner takes.
+    Free,
+    /// For one unroll of every environment: the next one waits for the next version, which the learner publishes when it
+    /// has learnt from all of them.
+    Lockstep,
 }
 
 /// What a process has done so far, for its log.
@@ -70,42 +80,46 @@ pub struct Worker<E, F> {
     demonstration_noise: f32,
     /// What the current unroll is made with; none before the first directive.
     directive: Option<Arc<Directive>>,
-    rng: Pcg64,
 }
 
 impl<E: Environment, F: ForwardPass> Worker<E, F> {
     /// Resets every environment.
     ///
     /// `demonstration_noise` is the standard deviation around the servo action when the learner asks for
-    /// demonstrations; `seed` is the source of the latents' and the actions' noise.
+    /// demonstrations. The environments are numbered from `first` on; `seed` and its number are the source of the noise
+    /// of an environment's latents and actions.
     pub fn new(
         environments: Vec<E>,
         forward: F,
         layout: Arc<UnrollLayout>,
         demonstration_noise: f32,
+        first: u32,
         seed: u64,
     ) -> Self {
         let mut batch = ActingBatch::new(environments.len(), ActingSizes::from(layout.shape()));
         let lanes = environments
             .into_iter()
+            .zip(first..)
             .enumerate()
-            .map(|(index, environment)| Lane::new(environment, &layout, &mut batch.row(index)))
+            .map(|(index, (environment, number))| Lane::new(environment, number, seed, &layout, &mut batch.row(index)))
             .collect();
-        Self { lanes, batch, forward, layout, demonstration_noise, directive: None, rng: Pcg64::seed_from_u64(seed) }
+        Self { lanes, batch, forward, layout, demonstration_noise, directive: None }
     }
 
     /// Acts by the newest directive and hands every full unroll to `unrolls`, until the mailbox is closed or nobody
-    /// takes unrolls any more. The environments stand still until every unroll of the last round is answered for.
+    /// takes unrolls any more. The environments stand still until every unroll of the last round is answered for, and
+    /// then as `pace` says.
     ///
     /// # Errors
     /// Parameters that do not fit, or a failing forward pass.
     pub fn run(
         mut self,
+        pace: Pace,
         mailbox: &Mailbox,
         unrolls: &mpsc::Sender<FinishedUnroll>,
         progress: &Progress,
     ) -> Result<(), Error> {
-        while let Some(directive) = mailbox.wait() {
+        while let Some(directive) = mailbox.wait_from(self.oldest_wanted(pace)) {
             self.adopt(&directive)?;
             let Some(finished) = self.unroll(&|| mailbox.is_closed(), progress)? else { return Ok(()) };
             let round = Round::default();
@@ -118,6 +132,14 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
             round.wait();
         }
         Ok(())
+    }
+
+    /// Learner epoch and version of the oldest parameters for the next unroll.
+    fn oldest_wanted(&self, pace: Pace) -> (u64, u64) {
+        match (pace, &self.directive) {
+            (Pace::Lockstep, Some(last)) => (last.learner_epoch, last.version.saturating_add(1)),
+            (Pace::Lockstep, None) | (Pace::Free, _) => (0, 0),
+        }
     }
 
     /// Takes a directive for the next unroll.
@@ -165,7 +187,9 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     }
 
     fn act(&mut self) -> Result<(), Error> {
-        self.batch.draw_latent_noise(&mut self.rng);
+        for (index, lane) in self.lanes.iter_mut().enumerate() {
+            lane.draw_latent_noise(&mut self.batch.row(index));
+        }
         if self.demonstrates() {
             self.demonstrate();
             return Ok(());
@@ -184,7 +208,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
                 lane.pass(t, &row);
                 lane.begin_episode(&mut row);
             } else {
-                lane.step(t, &mut row, &mut self.rng);
+                lane.step(t, &mut row);
                 steps += 1;
                 episodes += u64::from(lane.at_episode_end());
             }
@@ -206,7 +230,8 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
                 if lane.at_episode_end() {
                     lane.begin_episode(&mut batch.row(index));
                 }
-                FinishedUnroll { payload, learner_epoch, version, demonstration, episodes, ticket: None }
+                let environment = lane.number();
+                FinishedUnroll { payload, learner_epoch, version, demonstration, episodes, environment, ticket: None }
             })
             .collect()
     }

@@ -332,7 +332,7 @@ fn warm_start(warm_start: &WarmStart) -> Result<(), Fault> {
 
 /// Fields that make no sense beside one another.
 fn together(experiment: &Experiment) -> Result<(), Fault> {
-    let Experiment { network, vmpo, warm_start, .. } = experiment;
+    let Experiment { network, vmpo, warm_start, unroll, budget, .. } = experiment;
     let holds = vmpo.value_burn_in == 0 || !network.value_lstm.is_empty();
     let remedy = "wakes a recurrent value function, and network.value_lstm names none: set one of the two";
     ensure("vmpo.value_burn_in", vmpo.value_burn_in, holds, remedy)?;
@@ -341,7 +341,13 @@ fn together(experiment: &Experiment) -> Result<(), Fault> {
     ensure("warm_start.steps", warm_start.steps, holds, "must be 0 without tracking, whose reference is demonstrated")?;
     // A product's mean hangs on its primitives' deviations, which a regression on the mean alone would ruin.
     let holds = warm_start.steps == 0 || network.low_level != LowLevelName::Product;
-    ensure("warm_start.steps", warm_start.steps, holds, "must be 0 with network.low_level = \"product\"")
+    ensure("warm_start.steps", warm_start.steps, holds, "must be 0 with network.low_level = \"product\"")?;
+    let holds = !unroll.lockstep || unroll.ahead == 0;
+    ensure("unroll.ahead", unroll.ahead, holds, "must be 0 with unroll.lockstep, in which nothing is made ahead")?;
+    let holds = !unroll.lockstep || budget.minutes == 0.0;
+    let remedy =
+        "must be 0 with unroll.lockstep, which goes by no clock: set budget.updates or budget.environment_steps";
+    ensure("budget.minutes", budget.minutes, holds, remedy)
 }
 
 fn learner(learner: &Learner) -> Result<(), Fault> {

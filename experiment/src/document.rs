@@ -232,11 +232,15 @@ pub struct Unroll {
     pub max_staleness: u64,
     /// Batches assembled while one is trained on: 1 keeps the device busy (D), 0 keeps the experience fresh.
     pub ahead: usize,
+    /// Lockstep, for debugging and tests: a batch is one unroll of each of `batch` environments, made with the newest
+    /// parameters, so that the seed alone decides what is learnt, whatever actors share the environments. Slower; needs
+    /// `ahead` 0 and no budget in minutes.
+    pub lockstep: bool,
 }
 
 impl Default for Unroll {
     fn default() -> Self {
-        Self { length: 32, batch: 128, max_staleness: 1000, ahead: 1 }
+        Self { length: 32, batch: 128, max_staleness: 1000, ahead: 1, lockstep: false }
     }
 }
 

@@ -91,6 +91,11 @@ fn fields_that_make_no_sense_beside_one_another_are_refused() {
     assert!(error.contains("network.value_lstm"), "{error}");
     let error = refused(&["network.latent.size=0"]);
     assert!(error.contains("must be 1 to 4096"), "{error}");
+    let error = refused(&["unroll.lockstep=true"]);
+    assert!(error.contains("budget.minutes = 9.0") && error.contains("budget.updates"), "{error}");
+    let error = refused(&["unroll.lockstep=true", "budget.minutes=0", "unroll.ahead=1"]);
+    assert!(error.contains("unroll.ahead = 1: must be 0"), "{error}");
+    resolve("quickstart", &["unroll.lockstep=true".into(), "budget.minutes=0".into()]).unwrap();
     resolve("quickstart", &["vmpo.value_burn_in=2".into(), "network.value_lstm=[8]".into()]).unwrap();
     resolve("quickstart", &["network.low_level=mixture".into(), "network.latent.size=0".into()]).unwrap();
 }

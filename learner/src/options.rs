@@ -69,7 +69,14 @@ pub struct Document {
     /// Override any field, for instance --set vmpo.epsilon_eta=0.2.
     #[arg(long = "set", value_name = "FIELD=VALUE", global = true)]
     pub overrides: Vec<String>,
+    /// Learn reproducibly, whatever actors there are, for debugging; short for --set unroll.lockstep=true and --set
+    /// unroll.ahead=0.
+    #[arg(long, global = true)]
+    pub lockstep: bool,
 }
+
+/// What `--lockstep` stands for; `--set` has the last word.
+const LOCKSTEP: [&str; 2] = ["unroll.lockstep=true", "unroll.ahead=0"];
 
 impl Document {
     /// The resolved experiment.
@@ -77,7 +84,9 @@ impl Document {
     /// # Errors
     /// Names the file, field and remedy.
     pub fn resolve(&self) -> Result<Experiment> {
-        let experiment = comic_experiment::resolve(&self.preset, &self.overrides)
+        let lockstep = self.lockstep.then_some(LOCKSTEP).into_iter().flatten().map(String::from);
+        let overrides: Vec<String> = lockstep.chain(self.overrides.iter().cloned()).collect();
+        let experiment = comic_experiment::resolve(&self.preset, &overrides)
             .with_context(|| format!("the experiment `{}` is not usable", self.preset))?;
         Ok(experiment.with_clips(&self.clips))
     }

@@ -9,10 +9,10 @@ use std::time::Duration;
 use anyhow::{Context as _, Result, anyhow, bail};
 use bytes::Bytes;
 use comic_clips::Catalogue;
-use comic_experiment::{Difference, Experiment, InitialPose, TaskSpec};
+use comic_experiment::{Difference, Experiment, InitialPose, TaskSpec, Unroll};
 use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
-use comic_replay::{Batcher, Config, Ledger, Phase};
+use comic_replay::{Batcher, Config, Ledger, Order, Phase};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
@@ -180,11 +180,7 @@ fn prepare(options: &Options, experiment: Experiment, security: Security) -> Res
         None => Ledger::new(),
     };
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
-    let config = Config {
-        unrolls: experiment.unroll.batch,
-        max_staleness: experiment.unroll.max_staleness,
-        ahead: experiment.unroll.ahead,
-    };
+    let config = batches(&experiment.unroll);
     let batcher = Batcher::new(layout, config, Phase { epoch, ..Phase::default() }, ledger);
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {
@@ -201,6 +197,13 @@ fn prepare(options: &Options, experiment: Experiment, security: Security) -> Res
     let run = options.run.clone();
     let setup = Setup { experiment, spec, pose, run, epoch, resume, batcher, publisher, shared: shared.clone() };
     Ok((setup, shared))
+}
+
+/// How unrolls become batches.
+fn batches(unroll: &Unroll) -> Config {
+    let Unroll { batch, max_staleness, ahead, lockstep, .. } = *unroll;
+    let (order, max_staleness) = if lockstep { (Order::Environment, 0) } else { (Order::Arrival, max_staleness) };
+    Config { unrolls: batch, max_staleness, ahead, order }
 }
 
 /// A run goes on only as the experiment it was, unless it is allowed to change; how long, how often and with how many

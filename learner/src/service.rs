@@ -6,7 +6,7 @@
 //! - `incoming` lets connections in, `admission` calls: TLS, tokens and limits are theirs, and nobody else's.
 //! - `calls` answers each call; `unrolls` and `assets` are the two streams with a life of their own, and `broadcast` of
 //!   what is [published](crate::publish) the third. `status` tells how things are, `roster` how the actors are.
-//!   `complaints` keeps the log readable when a peer misbehaves.
+//!   `shares` says which actor simulates what of a run in lockstep. `complaints` keeps the log readable when a peer misbehaves.
 //!
 //! Streams are pulled: nothing is read from an actor until the unroll before it has a slot in a batch, so HTTP/2 flow
 //! control carries the batcher's back-pressure to the actor, and no queue lies in between.
@@ -18,6 +18,7 @@ mod calls;
 pub(crate) mod complaints;
 mod incoming;
 mod roster;
+mod shares;
 mod status;
 mod unrolls;
 
@@ -51,6 +52,7 @@ use calls::Calls;
 use complaints::Complaints;
 use incoming::Door;
 use roster::Roster;
+use shares::Shares;
 
 /// A peer that answers no ping for [`KEEPALIVE_TIMEOUT`] is gone; without pings a half-open one is never noticed.
 const KEEPALIVE: Duration = Duration::from_secs(15);
@@ -143,6 +145,10 @@ pub struct Shared {
     message_limit: usize,
     roster: Arc<Roster>,
     quarantine: Option<Quarantine>,
+    /// Of a run in lockstep.
+    shares: Option<Shares>,
+    /// Of an actor whose command line says nothing else: threads, and environments of each.
+    actor: (u64, u64),
     pub(crate) telemetry: Arc<Telemetry>,
     closing: watch::Sender<bool>,
 }
@@ -177,6 +183,8 @@ impl Shared {
             tokens: security.tokens.map(Arc::new),
             message_limit,
             roster: Arc::new(Roster::new(limits.max_actors)),
+            shares: experiment.unroll.lockstep.then(|| Shares::new(experiment.unroll.batch)),
+            actor: (experiment.actor.threads as u64, experiment.actor.environments as u64),
             limits,
             quarantine: Quarantine::start(&quarantine, &telemetry)?,
             telemetry,

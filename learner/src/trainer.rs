@@ -224,6 +224,8 @@ impl Trainer {
         // Published before the batch goes back: whoever waits for its room goes on with these parameters.
         if self.progress.updates.is_multiple_of(self.experiment.vmpo.target_period) {
             self.publish(Behaviour::Policy)?;
+        } else {
+            self.keep_step(Behaviour::Policy);
         }
         self.book(batch);
         self.shared.telemetry.count_update(began.elapsed(), ages);
@@ -325,6 +327,15 @@ impl Trainer {
         self.progress.version += 1;
         self.announce(behaviour);
         Ok(())
+    }
+
+    /// In lockstep actors make one unroll of each environment with each version, so a batch that changes no parameters
+    /// they act with is answered by the same ones as another version.
+    pub(crate) fn keep_step(&mut self, behaviour: Behaviour) {
+        if self.experiment.unroll.lockstep {
+            self.progress.version += 1;
+            self.announce(behaviour);
+        }
     }
 
     /// Tells actors and batcher of the newest version, for instance after a restart.

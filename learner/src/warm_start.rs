@@ -67,6 +67,9 @@ impl Trainer {
                     }
                     self.absorb(&batch);
                     self.metrics.absorb(batch.headers(), 0);
+                    if (demonstrations.len() as u64) < wanted {
+                        self.keep_step(Behaviour::Demonstrate);
+                    }
                     self.book(batch);
                 }
                 Wait::Nothing => {}

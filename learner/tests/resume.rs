@@ -16,7 +16,7 @@ use comic_learner::service::{self, Evaluation, Shared};
 use comic_learner::trainer::{Ending, Setup, Trainer};
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
-use comic_replay::{Batcher, Config, Ledger, Outcome, Phase};
+use comic_replay::{Batcher, Config, Ledger, Order, Outcome, Phase};
 use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 
@@ -121,7 +121,7 @@ fn live_evaluated(
         Ledger::restore(&serde_json::from_slice(snapshot.part("books.json").unwrap()).unwrap()).unwrap()
     });
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
-    let config = Config { unrolls: experiment.unroll.batch, max_staleness: 1000, ahead: 1 };
+    let config = Config { unrolls: experiment.unroll.batch, max_staleness: 1000, ahead: 1, order: Order::Arrival };
     let batcher = Batcher::new(layout.clone(), config, Phase { epoch, ..Phase::default() }, ledger);
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {

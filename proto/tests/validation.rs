@@ -40,6 +40,7 @@ fn header() -> UnrollHeader {
         layout_hash: layout().hash().to_vec(),
         demonstration: false,
         episodes: vec![episode],
+        environment: 0,
     }
 }
 

@@ -17,7 +17,11 @@ pub(crate) struct Buffer {
     floats: [Vec<f32>; Field::ALL.len()],
     clips: Vec<u32>,
     images: Vec<u8>,
-    pub(crate) headers: Vec<UnrollHeader>,
+    /// By slot; in a free one stands what was there before.
+    headers: Vec<UnrollHeader>,
+    filled: Vec<bool>,
+    /// Slots in use.
+    unrolls: usize,
 }
 
 impl Buffer {
@@ -30,19 +34,41 @@ impl Buffer {
             }),
             clips: vec![0; elements(Field::Clip)],
             images: vec![0; elements(Field::Image)],
-            headers: Vec::with_capacity(unrolls),
+            headers: vec![UnrollHeader::default(); unrolls],
+            filled: vec![false; unrolls],
+            unrolls: 0,
         }
     }
 
     /// Slots in use.
     pub(crate) fn len(&self) -> usize {
-        self.headers.len()
+        self.unrolls
     }
 
-    /// Copies an unroll into the next slot: each field once, from where the network put it to where it is trained on.
-    /// The payload's size is the layout's, and a slot is free.
-    pub(crate) fn push(&mut self, layout: &UnrollLayout, header: UnrollHeader, payload: &[u8]) {
-        let slot = self.headers.len();
+    /// Whether every slot is in use.
+    pub(crate) fn is_full(&self) -> bool {
+        self.unrolls == self.filled.len()
+    }
+
+    /// The first free slot; beyond the last one when there is none.
+    pub(crate) fn first_free(&self) -> usize {
+        self.filled.iter().position(|filled| !filled).unwrap_or(self.filled.len())
+    }
+
+    /// Whether there is such a slot, and nothing in it.
+    pub(crate) fn is_free(&self, slot: usize) -> bool {
+        self.filled.get(slot) == Some(&false)
+    }
+
+    /// Frees every slot.
+    pub(crate) fn clear(&mut self) {
+        self.filled.fill(false);
+        self.unrolls = 0;
+    }
+
+    /// Copies an unroll into a free slot: each field once, from where the network put it to where it is trained on.
+    /// The payload's size is the layout's.
+    pub(crate) fn put(&mut self, layout: &UnrollLayout, slot: usize, header: UnrollHeader, payload: &[u8]) {
         for field in Field::ALL {
             let place = place(layout, field, slot);
             let bytes: &mut [u8] = match field {
@@ -52,45 +78,45 @@ impl Buffer {
             };
             bytes.copy_from_slice(&payload[layout.range(field)]);
         }
-        self.headers.push(header);
+        self.headers[slot] = header;
+        self.filled[slot] = true;
+        self.unrolls += 1;
     }
 
-    /// Lets go of the unrolls that are not `kept`; the last ones take their slots. Gives how many went.
-    pub(crate) fn retain(&mut self, layout: &UnrollLayout, kept: impl Fn(&UnrollHeader) -> bool) -> usize {
-        let before = self.len();
-        // From the last one on, so that none is moved that goes itself.
-        for slot in (0..before).rev().filter(|slot| !kept(&self.headers[*slot])).collect::<Vec<_>>() {
-            self.headers.swap_remove(slot);
-            let last = self.headers.len();
-            if slot == last {
-                continue;
-            }
-            for field in Field::ALL {
-                let (from, to) = (place(layout, field, last), place(layout, field, slot).start);
-                match field {
-                    Field::Clip => self.clips.copy_within(from, to),
-                    Field::Image => self.images.copy_within(from, to),
-                    _ => self.floats[field as usize].copy_within(from, to),
-                }
+    /// Lets go of the unrolls that are not `kept`; their slots are free. Gives how many went.
+    pub(crate) fn retain(&mut self, kept: impl Fn(&UnrollHeader) -> bool) -> usize {
+        let before = self.unrolls;
+        for (filled, header) in self.filled.iter_mut().zip(&self.headers) {
+            if *filled && !kept(header) {
+                *filled = false;
+                self.unrolls -= 1;
             }
         }
-        before - self.len()
+        before - self.unrolls
     }
 
-    /// Moves the last unrolls of `other` here, until there are so many.
-    pub(crate) fn fill_from(&mut self, layout: &UnrollLayout, other: &mut Buffer, unrolls: usize) {
-        while self.len() < unrolls
-            && let Some(header) = other.headers.pop()
-        {
+    /// Moves unrolls of `other` here, as far as there are free slots.
+    pub(crate) fn fill_from(&mut self, layout: &UnrollLayout, other: &mut Buffer) {
+        for slot in 0..other.filled.len() {
+            if self.is_full() {
+                return;
+            }
+            if !std::mem::take(&mut other.filled[slot]) {
+                continue;
+            }
+            other.unrolls -= 1;
+            let free = self.first_free();
             for field in Field::ALL {
-                let (from, to) = (place(layout, field, other.len()), place(layout, field, self.len()));
+                let (from, to) = (place(layout, field, slot), place(layout, field, free));
                 match field {
                     Field::Clip => self.clips[to].copy_from_slice(&other.clips[from]),
                     Field::Image => self.images[to].copy_from_slice(&other.images[from]),
                     _ => self.floats[field as usize][to].copy_from_slice(&other.floats[field as usize][from]),
                 }
             }
-            self.headers.push(header);
+            self.headers[free] = std::mem::take(&mut other.headers[slot]);
+            self.filled[free] = true;
+            self.unrolls += 1;
         }
     }
 }
@@ -129,12 +155,12 @@ impl Batch {
     ) -> Result<Self, Invalid> {
         let unrolls = unrolls.into_iter();
         let mut buffer = Buffer::new(&layout, unrolls.len());
-        for (header, payload) in unrolls {
+        for (slot, (header, payload)) in unrolls.enumerate() {
             let payload = payload.as_ref();
             if payload.len() != layout.size() {
                 return Err(Invalid::Length { found: payload.len(), expected: layout.size() });
             }
-            buffer.push(&layout, header, payload);
+            buffer.put(&layout, slot, header, payload);
         }
         Ok(Self { layout, unrolls: buffer.len(), buffer: Some(Box::new(buffer)), owner: None })
     }

@@ -23,6 +23,18 @@ pub struct Config {
     /// Batches that may be assembled while one is trained on. With 0 nothing is taken meanwhile, and what waits is as
     /// fresh as can be; with 1 the next batch is ready when the trainer is.
     pub ahead: usize,
+    /// In which order unrolls stand in a batch.
+    pub order: Order,
+}
+
+/// Which slot of a batch an unroll takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Order {
+    /// The next one: first come, first served.
+    Arrival,
+    /// That of its environment's number. A batch has one unroll of each of B environments, and no order of arrival can
+    /// be told from it.
+    Environment,
 }
 
 /// What the trainer wants at this moment.
@@ -131,13 +143,17 @@ impl Batcher {
             return outcome;
         }
         let State { ledger, next, open, .. } = &mut *state;
-        let unfilled = |batch: &&mut Buffer| batch.len() < self.inner.config.unrolls;
-        let Some(batch) = [next, open].into_iter().flatten().find(unfilled) else { return Outcome::Closed };
+        let unfilled = [next, open].into_iter().flatten().find(|batch| !batch.is_full());
+        let Some(batch) = unfilled else { return Outcome::Closed };
+        let place = match self.inner.config.order {
+            Order::Arrival => batch.first_free(),
+            Order::Environment => header.environment as usize,
+        };
         if !ledger.record(header.actor, header.sequence) {
             ledger.sums.unattributed += 1;
             return Outcome::Invalid;
         }
-        batch.push(&self.inner.layout, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
+        batch.put(&self.inner.layout, place, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
         slot.forget();
         self.settle(&mut state);
         Outcome::Taken
@@ -260,7 +276,7 @@ impl Batcher {
             None => state.ledger.sums.trained += unrolls as u64,
             Some(reason) => state.ledger.sums.dropped.count(reason, unrolls as u64),
         }
-        buffer.headers.clear();
+        buffer.clear();
         state.free.push(buffer);
         self.settle(&mut state);
     }
@@ -286,6 +302,8 @@ impl Batcher {
             Reason::Invalid
         } else if self.is_stale(header, version) {
             Reason::Stale
+        } else if !self.has_room_for(state, header) {
+            Reason::Invalid
         } else {
             return None;
         };
@@ -296,13 +314,10 @@ impl Batcher {
     /// promised. What is left of the open batch makes the next one full.
     fn drop_waiting(&self, state: &mut State, reason: Reason, dropped: impl Fn(&UnrollHeader) -> bool) {
         let (layout, State { ledger, next, open, .. }) = (&self.inner.layout, state);
-        let went: usize = [&mut *next, &mut *open]
-            .into_iter()
-            .flatten()
-            .map(|batch| batch.retain(layout, |header| !dropped(header)))
-            .sum();
+        let went: usize =
+            [&mut *next, &mut *open].into_iter().flatten().map(|batch| batch.retain(|header| !dropped(header))).sum();
         if let (Some(next), Some(open)) = (next, open) {
-            next.fill_from(layout, open, self.inner.config.unrolls);
+            next.fill_from(layout, open);
         }
         ledger.sums.dropped.count(reason, went as u64);
         self.inner.slots.add_permits(went);
@@ -310,26 +325,31 @@ impl Batcher {
 
     /// The next batch, if it is full without what grew too old while it waited.
     fn take_next(&self, state: &mut State) -> Option<Buffer> {
-        self.is_full(state.next.as_ref()).then_some(())?;
+        state.next.as_ref()?.is_full().then_some(())?;
         let version = state.phase.version;
         self.drop_waiting(state, Reason::Stale, |header| self.is_stale(header, version));
-        self.is_full(state.next.as_ref()).then(|| state.next.take())?
-    }
-
-    fn is_full(&self, batch: Option<&Buffer>) -> bool {
-        batch.is_some_and(|batch| batch.len() == self.inner.config.unrolls)
+        state.next.take_if(|next| next.is_full())
     }
 
     fn is_stale(&self, header: &UnrollHeader, version: u64) -> bool {
         version.saturating_sub(header.version) > self.inner.config.max_staleness
     }
 
+    /// Whether there can be a slot for an unroll of this environment.
+    fn has_room_for(&self, state: &State, header: &UnrollHeader) -> bool {
+        let Order::Environment = self.inner.config.order else { return true };
+        let environment = header.environment as usize;
+        let waiting = [&state.next, &state.open].into_iter().flatten();
+        environment < self.inner.config.unrolls
+            && waiting.filter(|batch| !batch.is_full()).all(|batch| batch.is_free(environment))
+    }
+
     /// Moves buffers on: a filled open batch becomes the next one when there is none, and a free buffer the open one.
     fn settle(&self, state: &mut State) {
-        if state.next.is_none() && self.is_full(state.open.as_ref()) {
-            state.next = state.open.take();
+        if state.next.is_none() {
+            state.next = state.open.take_if(|open| open.is_full());
         }
-        if self.is_full(state.next.as_ref()) {
+        if state.next.as_ref().is_some_and(Buffer::is_full) {
             self.inner.filled.notify_one();
         }
         if state.open.is_none()

@@ -16,7 +16,8 @@
 //!    dropped as **lost at restart**.
 //! 3. The unroll itself is either dropped for a reason — **invalid**; **superseded**, made in another epoch or in
 //!    another phase (demonstrations and policy are phases); **stale**, made with parameters more than `max_staleness`
-//!    published versions old — or it is copied into a slot of the open batch and is then *in flight*.
+//!    published versions old — or it is copied into a slot of the open batch and is then *in flight*. Where slots are
+//!    the environments' ([`Order::Environment`]), one whose environment has no slot, or has filled it, is invalid.
 //! 4. An unroll in flight ends in one way: its batch is trained on, or it is dropped. A change of phase drops what waits
 //!    in the batcher as superseded. What grew too old while it waited is dropped as stale when its batch is due, and the
 //!    batch is handed out when its slots are filled again. A batch that its taker lets go of without training is lost
@@ -41,6 +42,6 @@ mod ledger;
 mod snapshot;
 
 pub use batch::Batch;
-pub use batcher::{Batcher, Config, Next, Outcome, Phase};
+pub use batcher::{Batcher, Config, Next, Order, Outcome, Phase};
 pub use ledger::{Books, Dropped, JoinError, Joined, Ledger, Reason};
 pub use snapshot::{Account, Error, Snapshot};

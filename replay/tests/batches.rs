@@ -6,8 +6,9 @@ mod common;
 
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, Invalid};
-use comic_replay::{Batch, Outcome, Phase};
+use comic_replay::{Batch, Batcher, Config, Ledger, Order, Outcome, Phase};
 use common::{Actor, CONFIG, PHASE, SLOTS, batch_now, batcher, insert_now, layout, mark, payload};
+use proptest::prelude::*;
 
 fn assert_holds(batch: &Batch, expected: &[UnrollHeader]) {
     assert_eq!(batch.unrolls, expected.len());
@@ -106,4 +107,47 @@ fn a_batch_can_be_assembled_from_a_recording() {
     let short = unrolls[0].1.slice(1..);
     let refused = Batch::assemble(layout(), [(recorded[0].clone(), short)]).err();
     assert_eq!(refused, Some(Invalid::Length { found: layout().size() - 1, expected: layout().size() }));
+}
+
+/// A batcher whose slots are the environments'.
+fn ordered() -> Batcher {
+    let config = Config { ahead: 0, max_staleness: 0, order: Order::Environment, ..CONFIG };
+    Batcher::new(layout(), config, PHASE, Ledger::new())
+}
+
+proptest! {
+    #[test]
+    fn in_whatever_order_unrolls_come_each_lies_in_its_environments_slot(
+        orders in prop::collection::vec(Just([0_u32, 1, 2]).prop_shuffle(), 1..5),
+    ) {
+        let batcher = ordered();
+        let actor = Actor::join(&batcher, 5);
+        let mut sequence = 0..;
+        for order in orders {
+            let mut sent = order.map(|environment| {
+                let header = UnrollHeader { environment, ..actor.header(sequence.next().unwrap()) };
+                assert_eq!(insert_now(&batcher, &header), Some(Outcome::Taken));
+                header
+            });
+            sent.sort_by_key(|header| header.environment);
+            let batch = batch_now(&batcher).unwrap();
+            assert_holds(&batch, &sent);
+            batcher.trained(batch);
+        }
+        prop_assert!(batcher.books().balance());
+    }
+}
+
+#[test]
+fn an_environment_without_a_slot_or_with_a_full_one_is_invalid() {
+    let batcher = ordered();
+    let actor = Actor::join(&batcher, 5);
+    let send = |sequence, environment| insert_now(&batcher, &UnrollHeader { environment, ..actor.header(sequence) });
+    assert_eq!(send(0, 1), Some(Outcome::Taken));
+    assert_eq!(send(1, 1), Some(Outcome::Invalid));
+    assert_eq!(send(2, 3), Some(Outcome::Invalid));
+    assert_eq!(send(3, u32::MAX), Some(Outcome::Invalid));
+    assert_eq!((send(4, 0), send(5, 2)), (Some(Outcome::Taken), Some(Outcome::Taken)));
+    assert_eq!(batch_now(&batcher).unwrap().unrolls, 3);
+    assert_eq!(batcher.books().dropped.invalid, 3);
 }

@@ -122,6 +122,11 @@ impl System {
         })
     }
 
+    /// Overrides a field of the experiment when the learner starts the next time.
+    pub fn set(&mut self, field: &str) {
+        self.arguments.extend(["--set".to_owned(), field.to_owned()]);
+    }
+
     /// The learner's address.
     pub fn url(&self) -> String {
         let scheme = if self.access.ca.is_some() { "https" } else { "http" };
@@ -195,6 +200,16 @@ impl System {
         ]);
         command.args(["--window", "1", "--watch"]);
         self.spawn("crowd", command)
+    }
+
+    /// Starts an actor that simulates so many environments and reaches the learner at `url`.
+    ///
+    /// # Errors
+    /// When it cannot be started.
+    pub fn start_actor_of(&mut self, environments: u32, url: &str) -> Result<Process> {
+        let mut command = Command::new(program("comic-actor")?);
+        command.args(["--learner", url, "--environments", &environments.to_string()]);
+        self.spawn("actor", command)
     }
 
     /// Runs `comic-learner COMMAND` against the learner and waits for its end.
@@ -327,15 +342,6 @@ impl Process {
         Ok(())
     }
 
-    /// Sends a signal.
-    ///
-    /// # Errors
-    /// When the system refuses.
-    pub fn signal(&self, signal: Signal) -> Result<()> {
-        let pid = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw).context("no process id")?;
-        kill_process(pid, signal).context("cannot signal")
-    }
-
     /// Bytes of memory it has.
     ///
     /// # Errors
@@ -361,6 +367,27 @@ impl Process {
             tokio::time::sleep(POLL).await;
         }
         bail!("still there {limit:?} after SIGTERM: {}", self.log())
+    }
+
+    /// Stops it where it is (SIGSTOP), until it [`resumes`](Self::resume).
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn pause(&self) -> Result<()> {
+        self.signal(Signal::STOP)
+    }
+
+    /// Lets it go on (SIGCONT).
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn resume(&self) -> Result<()> {
+        self.signal(Signal::CONT)
+    }
+
+    fn signal(&self, signal: Signal) -> Result<()> {
+        let pid = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw).context("no process id")?;
+        kill_process(pid, signal).context("cannot signal")
     }
 
     /// How it ended, if it has.

@@ -5,7 +5,6 @@ use std::time::Duration;
 use anyhow::{Context as _, Result};
 use comic_tests::steps::{LIMIT, leaves, the_books_balance_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
-use rustix::process::Signal;
 
 /// Thirty seconds are promised; the rest is for a busy machine.
 const NOTICED: Duration = Duration::from_secs(60);
@@ -20,11 +19,11 @@ async fn a_stopped_actor_is_given_up_and_comes_back() -> Result<()> {
     other.until_log_holds("acting", LIMIT).await?;
     trains_on(&mut system, "two actors' unrolls are trained on").await?;
 
-    stopped.signal(Signal::STOP)?;
+    stopped.pause()?;
     let lost = |status: &comic_proto::v1::Status| status.actors.is_some_and(|actors| actors.lost == 1);
     system.until("the learner gives the stopped actor up", NOTICED, |status| lost(status).then_some(())).await?;
     trains_on(&mut system, "the other's unrolls are trained on meanwhile").await?;
-    stopped.signal(Signal::CONT)?;
+    stopped.resume()?;
 
     stopped.until_log_holds("reconnected to the learner", LIMIT).await?;
     leaves(other).await?;
@@ -42,9 +41,9 @@ async fn a_stopped_learner_is_noticed_and_served_again() -> Result<()> {
     trains_on(&mut system, "the actor's unrolls are trained on").await?;
 
     let learner = system.learner.as_ref().context("no learner")?;
-    learner.signal(Signal::STOP)?;
+    learner.pause()?;
     actor.until_log_holds("no connection to the learner", NOTICED).await?;
-    learner.signal(Signal::CONT)?;
+    learner.resume()?;
 
     actor.until_log_holds("reconnected to the learner", LIMIT).await?;
     trains_on(&mut system, "training goes on").await?;

@@ -62,7 +62,7 @@ fn worker<E: Environment>(subject: &Subject, environments: Vec<E>, seed: u64) ->
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, experiment)));
     let policy = TorchPolicy::untrained(spec, experiment, seed, || Ok([0.0; 56]))?;
     let parameters = Bytes::from(policy.to_parameters()?);
-    let mut worker = Worker::new(environments, policy, layout, 0.0, seed);
+    let mut worker = Worker::new(environments, policy, layout, 0.0, 0, seed);
     worker.adopt(&Arc::new(Directive { learner_epoch: 1, version: 1, conduct: Conduct::Policy, parameters }))?;
     Ok(worker)
 }

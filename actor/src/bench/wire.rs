@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
 use comic_proto::v1::*;
 use comic_proto::{Access, Expected, Field, UnrollBuffer, UnrollLayout, UnrollShape, validate};
-use comic_replay::{Batcher, Config, Ledger, Outcome, Phase};
+use comic_replay::{Batcher, Config, Ledger, Order, Outcome, Phase};
 use futures::{Stream, StreamExt as _};
 use tokio::net::TcpListener;
 use tokio::sync::{mpsc, watch};
@@ -36,6 +36,7 @@ pub(super) fn wire(subject: &Subject) -> Result<Figure, Error> {
         unrolls: experiment.unroll.batch,
         max_staleness: experiment.unroll.max_staleness,
         ahead: experiment.unroll.ahead,
+        order: Order::Arrival,
     };
     let batcher = Batcher::new(Arc::clone(&layout), config, phase, Ledger::new());
     let trainer = thread::spawn({
@@ -101,13 +102,27 @@ fn still_unroll(layout: &UnrollLayout) -> FinishedUnroll {
         buffer.row_mut(Field::Valid, t)[0] = 1.0;
     }
     let payload = buffer.into_bytes();
-    FinishedUnroll { payload, learner_epoch: 1, version: 1, demonstration: false, episodes: Vec::new(), ticket: None }
+    FinishedUnroll {
+        payload,
+        learner_epoch: 1,
+        version: 1,
+        demonstration: false,
+        episodes: Vec::new(),
+        environment: 0,
+        ticket: None,
+    }
 }
 
 /// Processor time of this thread from the first unroll handed over to the last acknowledgement.
 async fn send(address: &str, unroll: &FinishedUnroll, unrolls: usize) -> Result<Duration, Error> {
     let (_stop, stopped) = watch::channel(false);
-    let options = session::Options { learner: address.to_string(), access: Access::default(), cache: None };
+    let options = session::Options {
+        learner: address.to_string(),
+        access: Access::default(),
+        cache: None,
+        threads: None,
+        environments: None,
+    };
     let joined = session::join(&options, stopped.clone()).await?;
     let (sender, receiver) = mpsc::channel(super::ENVIRONMENTS);
     let limits = Limits { window: 2 * super::ENVIRONMENTS, parameters: 0, flush: Duration::ZERO };

@@ -8,7 +8,7 @@ use comic_proto::{Access, AccessError, Client, PROTOCOL_VERSION, chain, distrust
 use tonic::transport::Endpoint;
 use tonic::{Code, Request, Status};
 
-use super::Terms;
+use super::{Options, Terms};
 use crate::Error;
 
 /// Deadline of a unary call.
@@ -48,6 +48,8 @@ pub(super) struct Link {
 pub(super) struct Connector {
     address: String,
     access: Access,
+    threads: Option<u32>,
+    environments: Option<u32>,
     incarnation: u64,
     actor: Option<u64>,
     learner_epoch: Option<u64>,
@@ -55,10 +57,13 @@ pub(super) struct Connector {
 
 impl Connector {
     /// Looks at address, certificates and token, so that what is wrong with them is said at once.
-    pub(super) fn new(address: &str, access: &Access) -> Result<Self, Error> {
+    pub(super) fn new(options: &Options) -> Result<Self, Error> {
+        let number = |given: Option<usize>| given.map(|number| u32::try_from(number).unwrap_or(u32::MAX));
         let connector = Self {
-            address: address.to_string(),
-            access: access.clone(),
+            address: options.learner.clone(),
+            access: options.access.clone(),
+            threads: number(options.threads),
+            environments: number(options.environments),
             incarnation: rand::random(),
             actor: None,
             learner_epoch: None,
@@ -92,8 +97,13 @@ impl Connector {
 
     pub(super) async fn connect(&mut self) -> Result<Link, Failure> {
         let mut client = self.client().await?.max_decoding_message_size(MESSAGE_LIMIT);
-        let mut request =
-            Request::new(JoinRequest { incarnation: self.incarnation, actor: self.actor, protocol: PROTOCOL_VERSION });
+        let mut request = Request::new(JoinRequest {
+            incarnation: self.incarnation,
+            actor: self.actor,
+            protocol: PROTOCOL_VERSION,
+            threads: self.threads,
+            environments: self.environments,
+        });
         request.set_timeout(CALL);
         let reply = match client.join(request).await {
             Ok(reply) => reply.into_inner(),

@@ -94,6 +94,7 @@ impl Outbox {
             layout_hash: self.layout_hash.clone(),
             demonstration: unroll.demonstration,
             episodes: unroll.episodes.clone(),
+            environment: unroll.environment,
         };
         Some(UnrollMessage { header: Some(header), payload: unroll.payload.clone() })
     }
@@ -143,6 +144,7 @@ mod tests {
             version: 1,
             demonstration: false,
             episodes: Vec::new(),
+            environment: 0,
             ticket: None,
         }
     }

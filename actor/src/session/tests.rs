@@ -3,7 +3,7 @@
 mod learner;
 
 use bytes::Bytes;
-use comic_proto::v1::Behaviour;
+use comic_proto::v1::{Behaviour, Environments};
 
 use super::*;
 use crate::mailbox::{Conduct, Directive};
@@ -12,7 +12,7 @@ use learner::{FakeLearner, Script};
 const LIMITS: Limits = Limits { window: 4, parameters: 1000, flush: Duration::from_secs(60) };
 
 fn options_for(learner: impl Into<String>) -> Options {
-    Options { learner: learner.into(), access: Access::default(), cache: None }
+    Options { learner: learner.into(), access: Access::default(), cache: None, threads: None, environments: None }
 }
 
 /// An unroll that names itself by its version.
@@ -23,6 +23,7 @@ fn unroll(number: u64) -> FinishedUnroll {
         version: number,
         demonstration: false,
         episodes: Vec::new(),
+        environment: 0,
         ticket: None,
     }
 }
@@ -183,6 +184,29 @@ async fn a_refusal_is_a_configuration_error_and_stopping_ends_the_wait() {
     // Nobody listens at port 1.
     let options = options_for("http://127.0.0.1:1");
     assert!(matches!(join(&options, stopped).await, Err(Error::Stopped)));
+}
+
+#[tokio::test]
+async fn an_actor_simulates_environments_that_there_are_in_lockstep_and_only_then() {
+    let told = |lockstep, environments: Option<(u32, u32)>| async move {
+        let environments = environments.map(|(first, count)| Environments { first, count });
+        let learner = FakeLearner::start(Script { lockstep, environments, ..Script::default() }).await;
+        let (_stop, stopped) = watch::channel(false);
+        join(&options_for(learner.address()), stopped).await.map(|joined| joined.environments)
+    };
+    let batch = Experiment::default().unroll.batch as u32;
+    assert_eq!(told(false, None).await.unwrap(), None);
+    assert_eq!(told(true, Some((3, batch - 3))).await.unwrap(), Some(3..batch));
+    for (lockstep, environments) in [
+        (false, Some((0, 1))),
+        (true, None),
+        (true, Some((3, 0))),
+        (true, Some((3, batch))),
+        (true, Some((3, u32::MAX))),
+    ] {
+        let error = told(lockstep, environments).await.unwrap_err();
+        assert!(matches!(error, Error::Disagreement { .. }), "{environments:?}: {error}");
+    }
 }
 
 #[tokio::test]

@@ -4,14 +4,19 @@ use bytes::Bytes;
 use comic_proto::v1::{EpisodeEnd, EpisodeStatistics};
 use comic_proto::{Field, UnrollBuffer, UnrollLayout};
 use comic_tasks::{Environment, Episode, MAX_REWARD_TERMS, Outcome};
-use rand::Rng;
+use rand::SeedableRng as _;
+use rand_pcg::Pcg64;
 
 use crate::Error;
 use crate::acting::{ActingRow, clip_action};
+use crate::seeds::EnvironmentSeeds;
 
 #[derive(Debug)]
 pub(super) struct Lane<E> {
     environment: E,
+    number: u32,
+    /// Of its own noise, so that no other environment has a part in it.
+    rng: Pcg64,
     unroll: UnrollBuffer,
     /// The current observation is its episode's first.
     first: bool,
@@ -30,11 +35,20 @@ pub(super) struct Lane<E> {
 }
 
 impl<E: Environment> Lane<E> {
-    pub(super) fn new(mut environment: E, layout: &UnrollLayout, row: &mut ActingRow<'_>) -> Self {
+    /// Resets the environment; its noise comes from `seed` and its number.
+    pub(super) fn new(
+        mut environment: E,
+        number: u32,
+        seed: u64,
+        layout: &UnrollLayout,
+        row: &mut ActingRow<'_>,
+    ) -> Self {
         environment.reset();
         let episode = environment.episode();
         let lane = Self {
             environment,
+            number,
+            rng: Pcg64::seed_from_u64(EnvironmentSeeds::new(seed, number).noise),
             unroll: UnrollBuffer::new(layout),
             first: true,
             ended: false,
@@ -47,6 +61,16 @@ impl<E: Environment> Lane<E> {
         };
         lane.observe(row);
         lane
+    }
+
+    /// The environment's number.
+    pub(super) fn number(&self) -> u32 {
+        self.number
+    }
+
+    /// Draws the latent's noise of the coming step.
+    pub(super) fn draw_latent_noise(&mut self, row: &mut ActingRow<'_>) {
+        row.draw_latent_noise(&mut self.rng);
     }
 
     /// Whether the current observation is an episode's last.
@@ -79,10 +103,10 @@ impl<E: Environment> Lane<E> {
     }
 
     /// A transition: samples the action, writes row `t`, steps, observes.
-    pub(super) fn step(&mut self, t: usize, row: &mut ActingRow<'_>, rng: &mut impl Rng) {
+    pub(super) fn step(&mut self, t: usize, row: &mut ActingRow<'_>) {
         self.write_decision(t, row);
         let action = self.unroll.row_mut(Field::Action, t);
-        row.sample(action, rng);
+        row.sample(action, &mut self.rng);
         clip_action(action, &mut self.clipped);
         let step = self.environment.step(&self.clipped);
         let reward = self.unroll.row_mut(Field::Reward, t);

@@ -144,9 +144,19 @@ use comic_proto::Field;
 
 /// `unrolls` unrolls of environments with these episode lengths; `[environment][unroll]`.
 fn record(length: usize, lanes: &[Vec<usize>], unrolls: usize) -> (Arc<UnrollLayout>, Vec<Vec<FinishedUnroll>>) {
+    record_from(0, length, lanes, unrolls)
+}
+
+/// The same for environments that are numbered from `first` on.
+fn record_from(
+    first: u32,
+    length: usize,
+    lanes: &[Vec<usize>],
+    unrolls: usize,
+) -> (Arc<UnrollLayout>, Vec<Vec<FinishedUnroll>>) {
     let layout = layout(length);
     let environments = lanes.iter().map(|lengths| Counter::new(lengths)).collect();
-    let mut worker = Worker::new(environments, Plain::default(), Arc::clone(&layout), 0.1, 3);
+    let mut worker = Worker::new(environments, Plain::default(), Arc::clone(&layout), 0.1, first, 3);
     worker.adopt(&directive(0, Conduct::Policy)).unwrap();
     let mut recorded = vec![Vec::new(); lanes.len()];
     for _ in 0..unrolls {
@@ -162,7 +172,7 @@ fn record(length: usize, lanes: &[Vec<usize>], unrolls: usize) -> (Arc<UnrollLay
 fn record_tasks(length: usize, lengths: &[usize], tasks: &[usize]) -> (Arc<UnrollLayout>, Vec<FinishedUnroll>) {
     let layout = layout(length);
     let environment = Counter { tasks: tasks.to_vec(), ..Counter::new(lengths) };
-    let mut worker = Worker::new(vec![environment], Plain::default(), Arc::clone(&layout), 0.1, 3);
+    let mut worker = Worker::new(vec![environment], Plain::default(), Arc::clone(&layout), 0.1, 0, 3);
     worker.adopt(&directive(0, Conduct::Policy)).unwrap();
     let unrolls = (0..12).flat_map(|_| worker.unroll(&|| false, &Progress::default()).unwrap().unwrap()).collect();
     (layout, unrolls)
@@ -319,6 +329,23 @@ proptest! {
         }
     }
 
+    /// Which worker an environment belongs to, and beside which others, changes nothing about its unrolls.
+    #[test]
+    fn an_environments_unrolls_are_its_own(
+        length in 1_usize..10,
+        lanes in prop::collection::vec(episode_lengths(), 1..5),
+        cut in any::<prop::sample::Index>(),
+    ) {
+        let cut = cut.index(lanes.len() + 1);
+        let (_, together) = record(length, &lanes, 4);
+        let (_, mut apart) = record(length, &lanes[..cut], 4);
+        apart.extend(record_from(cut as u32, length, &lanes[cut..], 4).1);
+        for (number, (one, other)) in together.iter().flatten().zip(apart.iter().flatten()).enumerate() {
+            prop_assert_eq!(&one.payload, &other.payload);
+            prop_assert_eq!((one.environment, other.environment), ((number / 4) as u32, (number / 4) as u32));
+        }
+    }
+
     /// z_{t−1} is 0 at an episode's first step and the sampled latent afterwards, across unrolls too.
     #[test]
     fn the_previous_latent_follows_the_episode(length in 1_usize..10, lengths in episode_lengths()) {
@@ -335,7 +362,7 @@ proptest! {
 #[test]
 fn the_unroll_records_the_unclipped_action_and_the_simulator_sees_the_clipped_one() {
     let layout = layout(32);
-    let mut worker = Worker::new(vec![Counter::new(&[1000])], Plain::default(), Arc::clone(&layout), 0.1, 3);
+    let mut worker = Worker::new(vec![Counter::new(&[1000])], Plain::default(), Arc::clone(&layout), 0.1, 0, 3);
     worker.adopt(&directive(1, Conduct::Policy)).unwrap();
     let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
     let rows = Rows { layout: &layout, payload: &unroll.payload };
@@ -351,7 +378,7 @@ fn the_unroll_records_the_unclipped_action_and_the_simulator_sees_the_clipped_on
 #[test]
 fn parameters_change_at_unroll_boundaries_only_and_the_header_names_them() {
     let layout = layout(5);
-    let mut worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), Arc::clone(&layout), 0.1, 3);
+    let mut worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), Arc::clone(&layout), 0.1, 0, 3);
     for version in 1..4 {
         worker.adopt(&directive(version, Conduct::Policy)).unwrap();
         let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
@@ -364,7 +391,7 @@ fn parameters_change_at_unroll_boundaries_only_and_the_header_names_them() {
 #[test]
 fn a_demonstration_is_the_servo_action_with_noise_and_no_latent() {
     let layout = layout(8);
-    let mut worker = Worker::new(vec![Counter::new(&[5])], Plain::default(), Arc::clone(&layout), 0.25, 3);
+    let mut worker = Worker::new(vec![Counter::new(&[5])], Plain::default(), Arc::clone(&layout), 0.25, 0, 3);
     worker.adopt(&directive(9, Conduct::Demonstrate)).unwrap();
     let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
     let rows = Rows { layout: &layout, payload: &unroll.payload };
@@ -389,9 +416,45 @@ fn a_seed_fixes_every_byte() {
 }
 
 #[test]
+fn in_lockstep_a_version_makes_one_unroll_of_every_environment() {
+    let environments = vec![Counter::new(&[3]), Counter::new(&[4])];
+    let worker = Worker::new(environments, Plain::default(), layout(4), 0.1, 0, 3);
+    let mailbox = Mailbox::default();
+    let publish = |learner_epoch, version| {
+        mailbox.publish(Directive {
+            learner_epoch,
+            version,
+            conduct: Conduct::Policy,
+            parameters: Bytes::from_static(b"1"),
+        });
+    };
+    // There is room for more, if the worker made more.
+    let (sender, mut receiver) = mpsc::channel(16);
+    std::thread::scope(|scope| {
+        let running = scope.spawn(|| {
+            let sender = sender;
+            worker.run(Pace::Lockstep, &mailbox, &sender, &Progress::default())
+        });
+        // What is published again is no new version, and a restarted learner's first one is.
+        for (learner_epoch, version) in [(1, 1), (1, 2), (2, 1)] {
+            publish(learner_epoch, version);
+            for environment in 0..2 {
+                let unroll = receiver.blocking_recv().unwrap();
+                let made = (unroll.learner_epoch, unroll.version, unroll.environment);
+                assert_eq!(made, (learner_epoch, version, environment));
+            }
+            publish(learner_epoch, version);
+        }
+        mailbox.close();
+        running.join().unwrap().unwrap();
+        assert!(receiver.blocking_recv().is_none(), "nothing was made beyond that");
+    });
+}
+
+#[test]
 fn a_closed_mailbox_ends_the_worker_and_a_full_channel_holds_it() {
     let layout = layout(4);
-    let worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), layout, 0.1, 3);
+    let worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), layout, 0.1, 0, 3);
     let mailbox = Mailbox::default();
     mailbox.publish(Directive {
         learner_epoch: 1,
@@ -404,7 +467,7 @@ fn a_closed_mailbox_ends_the_worker_and_a_full_channel_holds_it() {
     std::thread::scope(|scope| {
         let running = scope.spawn(|| {
             let sender = sender;
-            worker.run(&mailbox, &sender, &progress)
+            worker.run(Pace::Free, &mailbox, &sender, &progress)
         });
         for _ in 0..3 {
             receiver.blocking_recv().unwrap();

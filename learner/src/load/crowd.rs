@@ -278,7 +278,8 @@ impl Crowd {
         let mut client = LearnerClient::new(endpoint.connect().await?);
         let reply = match kind {
             Kind::Grpc => {
-                let request = JoinRequest { incarnation, actor: *number, protocol: PROTOCOL_VERSION };
+                let request =
+                    JoinRequest { incarnation, actor: *number, protocol: PROTOCOL_VERSION, ..JoinRequest::default() };
                 client.join(request).await.context("join")?.into_inner()
             }
             _ => JoinReply::default(),
@@ -404,8 +405,7 @@ impl Unrolls<'_> {
                 learner_epoch: self.reply.learner_epoch,
                 version,
                 layout_hash: layout_hash.clone(),
-                demonstration: false,
-                episodes: Vec::new(),
+                ..UnrollHeader::default()
             };
             self.sequence += 1;
             // As many as are acknowledged: there is room, or the connection is lost.

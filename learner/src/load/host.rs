@@ -11,7 +11,7 @@ use bytes::Bytes;
 use clap::{Args, ValueEnum};
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
 use comic_proto::v1::{self, Behaviour, UnrollAck, UnrollMessage, Verdict};
-use comic_replay::{Batcher, Config, Ledger, Next, Phase};
+use comic_replay::{Batcher, Config, Ledger, Next, Order, Phase};
 use futures::stream::{self, BoxStream, StreamExt as _};
 use serde_json::{Value, json};
 use tokio::io::AsyncWriteExt as _;
@@ -109,6 +109,7 @@ impl Stand {
             unrolls: experiment.unroll.batch,
             max_staleness: experiment.unroll.max_staleness,
             ahead: experiment.unroll.ahead,
+            order: Order::Arrival,
         };
         let batcher = Batcher::new(Arc::new(layout), config, Phase { epoch: EPOCH, ..Phase::default() }, Ledger::new());
         let publisher = Publisher::new(EPOCH);

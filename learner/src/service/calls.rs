@@ -6,13 +6,14 @@ use std::time::Instant;
 use comic_proto::PROTOCOL_VERSION;
 use comic_proto::v1::learner_server::Learner;
 use comic_proto::v1::{
-    self, AssetChunk, AssetRequest, EvaluationAck, EvaluationReport, JoinReply, JoinRequest, ParametersChunk,
-    StatusRequest, UnrollAck, UnrollMessage, WatchRequest,
+    self, AssetChunk, AssetRequest, Environments, EvaluationAck, EvaluationReport, JoinReply, JoinRequest,
+    ParametersChunk, StatusRequest, UnrollAck, UnrollMessage, WatchRequest,
 };
 use futures::stream::{self, BoxStream, StreamExt as _};
 use serde::de::IgnoredAny;
 use tonic::{Request, Response, Status, Streaming};
 
+use super::shares::{Denied, Share};
 use super::unrolls::UnrollStream;
 use super::{Evaluation, Shared, assets, status};
 
@@ -36,7 +37,8 @@ impl Learner for Calls {
 
     async fn join(&self, request: Request<JoinRequest>) -> Result<Response<JoinReply>, Status> {
         let peer = request.remote_addr();
-        let JoinRequest { incarnation, actor, protocol } = request.into_inner();
+        let request = request.into_inner();
+        let JoinRequest { incarnation, actor, protocol, .. } = request;
         let shared = &self.shared;
         let joins = &shared.telemetry.joins;
         if protocol != PROTOCOL_VERSION {
@@ -49,21 +51,26 @@ impl Learner for Calls {
             joins.of("full").inc();
             return Err(Status::resource_exhausted("as many actors as --max-actors allows are here: try again later"));
         }
+        let environments = environments_of(shared, &request)?;
         let joined = shared.batcher.join(incarnation, actor).map_err(|refused| {
             joins.of("refused").inc();
             Status::failed_precondition(refused.to_string())
         })?;
         joins.of("joined").inc();
         tracing::info!(actor = joined.actor, incarnation = format_args!("{incarnation:016x}"), peer = ?peer, "actor joined");
+        let epoch = shared.publisher.epoch();
+        // In lockstep an environment's number makes the difference, not the actor that happens to have it.
+        let index = if environments.is_some() { epoch } else { joined.actor };
         Ok(Response::new(JoinReply {
-            learner_epoch: shared.publisher.epoch(),
+            learner_epoch: epoch,
             actor: joined.actor,
-            seed: actor_seed(shared.seed, joined.actor),
+            seed: derived_seed(shared.seed, index),
             experiment: shared.experiment.clone(),
             task_spec: shared.task_spec.clone(),
             assets: shared.assets.iter().map(assets::described).collect(),
             layout_hash: shared.batcher.layout().hash().to_vec(),
             next_sequence: joined.next_sequence,
+            environments,
         }))
     }
 
@@ -105,9 +112,34 @@ impl Learner for Calls {
     }
 }
 
-/// An actor's seed: the same for the same index of the same experiment, whatever process has it (SplitMix64).
-fn actor_seed(experiment: u64, actor: u64) -> u64 {
-    let mut z = experiment.wrapping_add(actor.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+/// What an actor simulates of a run in lockstep; nothing in particular otherwise.
+fn environments_of(shared: &Shared, request: &JoinRequest) -> Result<Option<Environments>, Status> {
+    let JoinRequest { incarnation, actor, threads, environments, .. } = *request;
+    let Some(shares) = &shared.shares else { return Ok(None) };
+    let wanted = threads.map_or(shared.actor.0, u64::from) * environments.map_or(shared.actor.1, u64::from);
+    let now = Instant::now();
+    let claimed = shares.claim(incarnation, wanted, actor.is_some(), |owner| shared.roster.expects(owner, now));
+    let Share { environments, inherited, left } = claimed.map_err(|denied| match denied {
+        Denied::Taken => {
+            shared.telemetry.joins.of("full").inc();
+            Status::resource_exhausted("other actors simulate every environment of this run in lockstep: standing by")
+        }
+        Denied::Lost => {
+            shared.telemetry.joins.of("refused").inc();
+            Status::failed_precondition("in lockstep the environments it had were begun anew")
+        }
+    })?;
+    tracing::info!(?environments, left, "in lockstep: every batch waits for every environment");
+    if inherited {
+        tracing::warn!(?environments, "begun anew by another actor: from here on this run is not what its seed gives");
+    }
+    Ok(Some(Environments { first: environments.start, count: environments.len() as u32 }))
+}
+
+/// The seed of an actor, or in lockstep of a life of the learner: the same for the same index of the same experiment,
+/// whatever process has it (SplitMix64).
+fn derived_seed(experiment: u64, index: u64) -> u64 {
+    let mut z = experiment.wrapping_add(index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15));
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
     z ^ (z >> 31)

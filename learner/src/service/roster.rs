@@ -6,7 +6,8 @@ use std::time::{Duration, Instant};
 
 use super::lock;
 
-/// An actor that joined has so long to open its streams.
+/// An actor that joined has so long to open its streams, and one whose connection ended to come back before its
+/// environments of a run in lockstep are given away.
 const JOINING: Duration = Duration::from_secs(30);
 /// Silence after which an actor that the learner waits for is slow.
 const SLOW: Duration = Duration::from_secs(60);
@@ -83,6 +84,14 @@ impl Roster {
         let actor = actors.entry(incarnation).or_insert(Actor { streams: 0, waiting: 0, heard: now, gone: None });
         (actor.heard, actor.gone) = (now, None);
         true
+    }
+
+    /// Whether an actor is there, or went so lately that it may be on its way back.
+    pub(super) fn expects(&self, incarnation: u64, now: Instant) -> bool {
+        let lately = |gone: Instant| now.duration_since(gone) < JOINING;
+        lock(&self.actors)
+            .get(&incarnation)
+            .is_some_and(|actor| actor.is_present(now) || actor.gone.is_some_and(lately))
     }
 
     /// Notes that something came from an actor.
@@ -191,6 +200,18 @@ mod tests {
         assert!(!roster.join(3, start));
         assert!(roster.join(1, start), "a reconnection");
         assert!(roster.join(3, start + JOINING), "who joins and opens no stream gives up the place");
+    }
+
+    #[test]
+    fn an_actor_is_expected_while_it_is_there_and_a_little_longer() {
+        let (roster, start) = (Arc::new(Roster::new(10)), Instant::now());
+        assert!(!roster.expects(1, start));
+        assert!(roster.join(1, start) && roster.expects(1, start));
+        let watching = roster.watch(1);
+        assert!(roster.expects(1, start + JOINING * 2));
+        drop(watching);
+        let gone = Instant::now();
+        assert!(roster.expects(1, gone) && !roster.expects(1, gone + JOINING));
     }
 
     #[test]

@@ -102,7 +102,10 @@ async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAc
             )
         }
         Outcome::Invalid => {
-            let reason = invalid.map_or_else(|| "its numbers fit no account".into(), |invalid| invalid.to_string());
+            let reason = invalid.map_or_else(
+                || "its numbers fit no account, or its environment no slot of the batch".into(),
+                |invalid| invalid.to_string(),
+            );
             if let Some(unreported) = shared.complaints.due(header.actor) {
                 tracing::warn!(actor = header.actor, sequence, unreported, "invalid unroll refused: {reason}");
             }

@@ -2,13 +2,13 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use crate::support::{EPOCH, World};
+use crate::support::{EPOCH, World, joining};
 use comic_experiment::{Experiment, TaskSpec};
 use comic_learner::publish::Publisher;
 use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
-use comic_proto::v1::JoinRequest;
+use comic_proto::v1::{Environments, JoinRequest};
 use comic_proto::{PROTOCOL_VERSION, UnrollLayout, UnrollShape};
 use tonic::Code;
 
@@ -30,7 +30,7 @@ async fn a_new_process_gets_a_new_index_and_seed_and_one_that_reconnects_its_own
     let (one, mut other) = (world.actor(70).await, world.actor(71).await);
     assert_ne!(one.reply.actor, other.reply.actor);
     assert_ne!(one.reply.seed, other.reply.seed);
-    let again = JoinRequest { incarnation: 70, actor: Some(one.reply.actor), protocol: PROTOCOL_VERSION };
+    let again = JoinRequest { actor: Some(one.reply.actor), ..joining(70) };
     let again = other.client.join(again).await.unwrap().into_inner();
     assert_eq!((again.actor, again.seed), (one.reply.actor, one.reply.seed));
 }
@@ -44,10 +44,41 @@ async fn the_seed_depends_on_experiment_and_index_and_not_on_the_process() {
 #[tokio::test]
 async fn another_protocol_is_refused_with_the_remedy() {
     let world = World::start().await;
-    let request = JoinRequest { incarnation: 70, actor: None, protocol: PROTOCOL_VERSION + 1 };
+    let request = JoinRequest { protocol: PROTOCOL_VERSION + 1, ..joining(70) };
     let refused = world.client().await.join(request).await.unwrap_err();
     assert_eq!(refused.code(), Code::FailedPrecondition);
     assert!(refused.message().contains("same release"), "{}", refused.message());
+}
+
+#[tokio::test]
+async fn in_lockstep_actors_share_the_environments_and_one_seed_and_one_too_many_stands_by() {
+    let world = World::in_lockstep(8).await;
+    let mut client = world.client().await;
+    let asking = |incarnation, threads, environments| JoinRequest { threads, environments, ..joining(incarnation) };
+    let mut seeds = std::collections::HashSet::new();
+    for (request, share) in [
+        (asking(70, Some(2), Some(2)), (0, 4)),
+        (asking(71, Some(1), Some(3)), (4, 3)),
+        // What the experiment says, 16, and there is one left.
+        (asking(72, None, None), (7, 1)),
+        (asking(71, Some(1), Some(3)), (4, 3)),
+    ] {
+        let reply = client.join(request).await.unwrap().into_inner();
+        assert_eq!(reply.environments, Some(Environments { first: share.0, count: share.1 }));
+        seeds.insert(reply.seed);
+    }
+    assert_eq!(seeds.len(), 1);
+    let refused = client.join(joining(73)).await.unwrap_err();
+    assert_eq!(refused.code(), Code::ResourceExhausted, "an actor tries again: {refused}");
+    assert_eq!(world.batcher.snapshot().accounts.len(), 3, "no account was opened for the one that stands by");
+}
+
+#[tokio::test]
+async fn in_lockstep_an_actor_of_an_earlier_life_has_to_start_again() {
+    let world = World::in_lockstep(8).await;
+    let refused = world.client().await.join(JoinRequest { actor: Some(0), ..joining(70) }).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    assert!(refused.message().contains("begun anew"), "{}", refused.message());
 }
 
 #[tokio::test]

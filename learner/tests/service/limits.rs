@@ -4,15 +4,14 @@
 
 use std::time::Duration;
 
-use crate::support::{EPOCH, World, within};
+use crate::support::{EPOCH, World, joining, within};
 use comic_learner::options::Misuse;
 use comic_learner::publish::Publisher;
 use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
-use comic_proto::PROTOCOL_VERSION;
 use comic_proto::v1::learner_client::LearnerClient;
-use comic_proto::v1::{EvaluationReport, JoinRequest, StatusRequest, WatchRequest};
+use comic_proto::v1::{EvaluationReport, StatusRequest, WatchRequest};
 use tonic::Code;
 
 const LIMIT: Duration = Duration::from_secs(10);
@@ -49,11 +48,10 @@ async fn actors_in_all() {
     let world = World::limited(Limits { max_actors: 1, ..Limits::default() }).await;
     let mut first = world.actor(70).await;
     let mut client = world.client().await;
-    let request = |incarnation| JoinRequest { incarnation, actor: None, protocol: PROTOCOL_VERSION };
-    let refused = client.join(request(71)).await.unwrap_err();
+    let refused = client.join(joining(71)).await.unwrap_err();
     assert_eq!(refused.code(), Code::ResourceExhausted, "an actor tries again");
     assert!(refused.message().contains("--max-actors"), "{refused}");
-    first.client.join(request(70)).await.expect("one that is there comes back");
+    first.client.join(joining(70)).await.expect("one that is there comes back");
     assert_eq!(world.batcher.snapshot().accounts.len(), 1, "no account was opened for the one that was refused");
 }
 

@@ -8,10 +8,10 @@ use std::task::{Context, Poll, Waker};
 use bytes::Bytes;
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
-use comic_replay::{Batch, Batcher, Config, Ledger, Next, Outcome, Phase};
+use comic_replay::{Batch, Batcher, Config, Ledger, Next, Order, Outcome, Phase};
 
 pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, oldest: 0, demonstration: false };
-pub(crate) const CONFIG: Config = Config { unrolls: 3, max_staleness: 4, ahead: 2 };
+pub(crate) const CONFIG: Config = Config { unrolls: 3, max_staleness: 4, ahead: 2, order: Order::Arrival };
 /// Slots that fill up while nobody trains: the open batch and the full one.
 pub(crate) const SLOTS: usize = 2 * CONFIG.unrolls;
 
@@ -56,6 +56,7 @@ impl Actor {
             layout_hash: layout().hash().to_vec(),
             demonstration: PHASE.demonstration,
             episodes: Vec::new(),
+            environment: 0,
         }
     }
 

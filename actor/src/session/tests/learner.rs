@@ -29,6 +29,9 @@ pub(super) struct Script {
     pub(super) silent: bool,
     pub(super) refuse: bool,
     pub(super) wrong_layout: bool,
+    /// What it has the actor simulate in lockstep.
+    pub(super) environments: Option<Environments>,
+    pub(super) lockstep: bool,
     pub(super) asset: Option<Vec<u8>>,
     /// What comes in the asset's place.
     pub(super) asset_sent: Option<Vec<u8>>,
@@ -132,7 +135,10 @@ impl Learner for FakeLearner {
             return Err(Status::failed_precondition("another protocol"));
         }
         self.inner.seen.send_modify(|seen| seen.joins.push(request.into_inner()));
-        let experiment = self.inner.experiment.lock().unwrap().clone();
+        let mut experiment = self.inner.experiment.lock().unwrap().clone();
+        if self.inner.script.lockstep {
+            (experiment.unroll.lockstep, experiment.unroll.ahead) = (true, 0);
+        }
         let spec = TaskSpec::new(&experiment, vec!["walk".into()]).unwrap();
         let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
         let layout_hash = if self.inner.script.wrong_layout { vec![0; 32] } else { layout.hash().to_vec() };
@@ -150,6 +156,7 @@ impl Learner for FakeLearner {
             assets: self.inner.script.asset.iter().map(asset).collect(),
             layout_hash,
             next_sequence: 0,
+            environments: self.inner.script.environments,
         }))
     }
 

@@ -4,6 +4,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail};
+use comic_experiment::Experiment;
 
 use super::Job;
 use super::display::Display;
@@ -64,6 +65,12 @@ impl<'a> Supervisor<'a> {
     fn start_actor(&self, number: usize) -> Result<Process> {
         let mut command = Command::new(workspace::program("comic-actor")?);
         command.args(["--learner", &format!("http://127.0.0.1:{}", self.port)]);
+        let Experiment { unroll, actor, .. } = &self.job.experiment;
+        if unroll.lockstep {
+            // A batch waits for every environment, so the actors have all of them between them.
+            let environments = unroll.batch.div_ceil(usize::from(self.job.actors) * actor.threads);
+            command.args(["--environments", &environments.to_string()]);
+        }
         let name = format!("actor-{number}");
         let log = self.job.directory.log(&name);
         Process::start(name, &mut command, log)

@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Result;
 use bytes::Bytes;
 use comic_clips::Asset;
-use comic_experiment::{Experiment, TaskPart, TaskSpec};
+use comic_experiment::{Experiment, TaskPart, TaskSpec, Unroll};
 use comic_learner::publish::Publisher;
 use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
@@ -15,7 +15,7 @@ use comic_learner::service::{Setup, Shared, serve};
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{JoinReply, JoinRequest, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict};
 use comic_proto::{Access, Client, Field, PROTOCOL_VERSION, UnrollBuffer, UnrollLayout, UnrollShape};
-use comic_replay::{Batcher, Config, Ledger, Phase};
+use comic_replay::{Batcher, Config, Ledger, Order, Phase};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
@@ -45,37 +45,44 @@ impl World {
 
     /// With so many numbers of proprioception, and these assets.
     pub(crate) async fn start_with(proprioception: usize, assets: Vec<Asset>) -> Self {
-        Self::guarded(proprioception, assets, Security::default(), Limits::default(), QuarantineOptions::default())
-            .await
+        Self::guarded(proprioception, assets, Security::default(), Limits::default()).await
     }
 
     /// Behind these limits.
     pub(crate) async fn limited(limits: Limits) -> Self {
-        Self::guarded(8, Vec::new(), Security::default(), limits, QuarantineOptions::default()).await
+        Self::guarded(8, Vec::new(), Security::default(), limits).await
     }
 
     /// Behind certificates and tokens.
     pub(crate) async fn secured(security: Security) -> Self {
-        Self::guarded(8, Vec::new(), security, Limits::default(), QuarantineOptions::default()).await
+        Self::guarded(8, Vec::new(), security, Limits::default()).await
     }
 
     /// With a quarantine.
     pub(crate) async fn quarantining(quarantine: QuarantineOptions) -> Self {
-        Self::guarded(8, Vec::new(), Security::default(), Limits::default(), quarantine).await
+        Self::of(experiment(), 8, Vec::new(), Security::default(), Limits::default(), quarantine).await
     }
 
-    async fn guarded(
+    /// In lockstep, over so many environments.
+    pub(crate) async fn in_lockstep(environments: usize) -> Self {
+        let mut experiment = experiment();
+        experiment.unroll = Unroll { lockstep: true, ahead: 0, batch: environments, ..experiment.unroll };
+        let (security, limits, quarantine) = (Security::default(), Limits::default(), QuarantineOptions::default());
+        Self::of(experiment, 8, Vec::new(), security, limits, quarantine).await
+    }
+
+    async fn guarded(proprioception: usize, assets: Vec<Asset>, security: Security, limits: Limits) -> Self {
+        Self::of(experiment(), proprioception, assets, security, limits, QuarantineOptions::default()).await
+    }
+
+    async fn of(
+        experiment: Experiment,
         proprioception: usize,
         assets: Vec<Asset>,
         security: Security,
         limits: Limits,
         quarantine: QuarantineOptions,
     ) -> Self {
-        let mut experiment = Experiment::default();
-        experiment.unroll.length = 4;
-        experiment.unroll.batch = BATCH;
-        experiment.vmpo.minibatch_unrolls = BATCH;
-        experiment.network.latent.size = 2;
         let spec = TaskSpec {
             proprioception,
             task: 3,
@@ -92,7 +99,7 @@ impl World {
             }],
         };
         let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
-        let config = Config { unrolls: BATCH, max_staleness: 5, ahead: 2 };
+        let config = Config { unrolls: BATCH, max_staleness: 5, ahead: 2, order: Order::Arrival };
         let phase = Phase { epoch: EPOCH, version: 0, oldest: 0, demonstration: false };
         let batcher = Batcher::new(layout, config, phase, Ledger::new());
         let publisher = Publisher::new(EPOCH);
@@ -138,7 +145,7 @@ impl World {
     /// An actor that has joined.
     pub(crate) async fn actor(&self, incarnation: u64) -> Actor {
         let mut client = self.client().await;
-        let request = JoinRequest { incarnation, actor: None, protocol: PROTOCOL_VERSION };
+        let request = joining(incarnation);
         let reply = client.join(request).await.unwrap().into_inner();
         Actor { client, reply, incarnation, layout: self.batcher.layout().clone() }
     }
@@ -152,6 +159,20 @@ impl World {
     pub(crate) async fn ended(self) -> Result<()> {
         within(Duration::from_secs(5), self.server).await.unwrap()
     }
+}
+
+fn experiment() -> Experiment {
+    let mut experiment = Experiment::default();
+    experiment.unroll.length = 4;
+    experiment.unroll.batch = BATCH;
+    experiment.vmpo.minibatch_unrolls = BATCH;
+    experiment.network.latent.size = 2;
+    experiment
+}
+
+/// What a new process asks for.
+pub(crate) fn joining(incarnation: u64) -> JoinRequest {
+    JoinRequest { incarnation, protocol: PROTOCOL_VERSION, ..JoinRequest::default() }
 }
 
 pub(crate) struct Actor {
@@ -173,6 +194,7 @@ impl Actor {
             layout_hash: self.layout.hash().to_vec(),
             demonstration: false,
             episodes: Vec::new(),
+            environment: 0,
         };
         let mut unroll = UnrollBuffer::new(&self.layout);
         for t in 0..self.layout.shape().length {

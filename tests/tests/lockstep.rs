@@ -1,0 +1,159 @@
+//! In lockstep the seed decides every parameter, bit for bit, whatever actors share the environments and whatever happens
+//! to them and to their connections on the way.
+
+use std::fs;
+use std::io::{self, Read as _};
+use std::net::{Shutdown, TcpListener, TcpStream};
+use std::thread;
+
+use anyhow::{Context, Result, ensure};
+use comic_tests::steps::{LIMIT, books, trains_on};
+use comic_tests::system::{Process, SMALL, System};
+
+/// Environments in all: one for each unroll of a batch.
+const ALL: u32 = 8;
+const UPDATES: u64 = 6;
+
+/// A run in lockstep with a warm start, a normaliser that is set twice, and updates that publish nothing new.
+fn lockstep(overrides: &[&str]) -> Result<System> {
+    let updates = format!("budget.updates={UPDATES}");
+    let fields = [
+        "warm_start.steps=10",
+        "warm_start.demonstration_steps=128",
+        "vmpo.target_period=2",
+        "vmpo.gradient_steps=2",
+        "vmpo.minibatch_unrolls=4",
+        updates.as_str(),
+    ];
+    let settings = fields.iter().chain(overrides).flat_map(|field| ["--set", *field]);
+    System::new(&SMALL.into_iter().chain(["--lockstep"]).chain(settings).collect::<Vec<_>>())
+}
+
+/// Trains with an actor for each number of environments, until the budget is used up.
+async fn train(system: &mut System, actors: &[u32]) -> Result<()> {
+    system.start_learner(LIMIT).await?;
+    let url = system.url();
+    let actors = actors.iter().map(|environments| system.start_actor_of(*environments, &url)).collect::<Result<_>>()?;
+    is_over(system, actors).await
+}
+
+async fn is_over(system: &mut System, actors: Vec<Process>) -> Result<()> {
+    for mut actor in actors {
+        let status = actor.until_it_ends(LIMIT).await?;
+        ensure!(status.success(), "an actor ended with {status}: {}", actor.log());
+    }
+    let mut learner = system.learner.take().context("no learner")?;
+    let status = learner.until_it_ends(LIMIT).await?;
+    ensure!(status.success(), "the learner ended with {status}: {}", learner.log());
+    Ok(())
+}
+
+/// What the run's last checkpoint says of networks, optimiser and statistics.
+fn learnt(system: &System) -> Result<[Vec<u8>; 3]> {
+    let checkpoint = system.run().join(format!("checkpoints/checkpoint-{UPDATES:010}"));
+    let part = |name: &str| fs::read(checkpoint.join(name)).with_context(|| format!("no {name}"));
+    Ok([part("policy.safetensors")?, part("target.safetensors")?, part("learner.safetensors")?])
+}
+
+/// What is learnt by an actor for each number of environments.
+async fn learnt_by(actors: &[u32], overrides: &[&str]) -> Result<[Vec<u8>; 3]> {
+    let mut system = lockstep(overrides)?;
+    train(&mut system, actors).await?;
+    learnt(&system)
+}
+
+#[tokio::test]
+async fn one_actor_or_two_learn_the_same_and_another_seed_something_else() -> Result<()> {
+    let one = learnt_by(&[ALL], &[]).await?;
+    ensure!(one == learnt_by(&[3, 5], &[]).await?, "two actors learnt something else than one");
+    ensure!(one != learnt_by(&[ALL], &["seed=2"]).await?, "another seed led to the same");
+    Ok(())
+}
+
+#[tokio::test]
+async fn with_a_memory_and_two_tasks_too() -> Result<()> {
+    let joint = r#"joint=[{task="get-up", probability=0.3}]"#;
+    let overrides = ["network.low_level=lstm", "network.lstm.units=[12, 8]", joint, "get_up.lying_share=0"];
+    let one = learnt_by(&[ALL], &overrides).await?;
+    ensure!(one == learnt_by(&[5, 3], &overrides).await?, "two actors learnt something else than one");
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_paused_actor_and_broken_connections_change_nothing() -> Result<()> {
+    let mut system = lockstep(&[])?;
+    system.start_learner(LIMIT).await?;
+    let mut paused = system.start_actor_of(5, &system.url())?;
+    paused.until_log_holds("joined the learner", LIMIT).await?;
+    paused.pause()?;
+    let mut cut = system.start_actor_of(3, &fragile_way(&system.url())?)?;
+    let what = "the other environments' unrolls wait for the paused actor's";
+    system.until(what, LIMIT, |status| (books(status).in_flight >= 3).then_some(())).await?;
+    paused.resume()?;
+    cut.until_log_holds("reconnected to the learner", LIMIT).await?;
+    is_over(&mut system, vec![paused, cut]).await?;
+    ensure!(learnt(&system)? == learnt_by(&[ALL], &[]).await?, "a pause or a broken connection changed something");
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_resumed_run_hangs_on_where_it_was_interrupted_and_on_nothing_else() -> Result<()> {
+    let interrupted = async |before: &[u32], after: &[u32]| {
+        let mut system = lockstep(&["budget.updates=3"])?;
+        train(&mut system, before).await?;
+        system.set(&format!("budget.updates={UPDATES}"));
+        train(&mut system, after).await?;
+        learnt(&system)
+    };
+    let one = interrupted(&[ALL], &[3, 5]).await?;
+    ensure!(one == interrupted(&[5, 3], &[ALL]).await?, "other actors learnt something else");
+    Ok(())
+}
+
+#[tokio::test]
+async fn actors_of_a_killed_learner_leave_and_new_ones_take_their_place() -> Result<()> {
+    let mut system = lockstep(&["budget.updates=0"])?;
+    system.start_learner(LIMIT).await?;
+    let mut actor = system.start_actor_of(ALL, &system.url())?;
+    trains_on(&mut system, "the first actor's unrolls are trained on").await?;
+    system.learner.take().context("no learner")?.kill()?;
+    system.start_learner(LIMIT).await?;
+    let status = actor.until_it_ends(LIMIT).await?;
+    ensure!(status.code() == Some(1), "an actor that is to start again ends with {status}");
+    ensure!(actor.log().contains("start the actor again"), "{}", actor.log());
+    let _actor = system.start_actor_of(ALL, &system.url())?;
+    trains_on(&mut system, "a new actor's unrolls are trained on").await
+}
+
+/// A way to the learner on which the first connections break in the middle of an unroll.
+fn fragile_way(learner: &str) -> Result<String> {
+    const FRAGILE: usize = 3;
+    const BYTES: u64 = 50_000;
+    let learner = learner.trim_start_matches("http://").to_owned();
+    let listener = TcpListener::bind("127.0.0.1:0").context("no port")?;
+    let url = format!("http://{}", listener.local_addr()?);
+    thread::spawn(move || {
+        for (number, actor) in listener.incoming().enumerate() {
+            let (Ok(actor), Ok(learner)) = (actor, TcpStream::connect(&learner)) else { continue };
+            let bytes = if number < FRAGILE { BYTES } else { u64::MAX };
+            thread::spawn(move || carry(&actor, &learner, bytes));
+        }
+    });
+    Ok(url)
+}
+
+/// Carries everything down and so many bytes up.
+fn carry(actor: &TcpStream, learner: &TcpStream, bytes: u64) {
+    thread::scope(|scope| {
+        scope.spawn(|| pour(learner, actor, u64::MAX));
+        pour(actor, learner, bytes);
+    });
+}
+
+/// So many bytes from one side to the other; then, and when either side ends, the connection breaks.
+fn pour(from: &TcpStream, mut to: &TcpStream, bytes: u64) {
+    let _ = io::copy(&mut from.take(bytes), &mut to);
+    for side in [from, to] {
+        let _ = side.shutdown(Shutdown::Both);
+    }
+}
