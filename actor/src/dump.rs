@@ -233,7 +233,7 @@ impl Dumps {
             return;
         }
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis();
-        let path = self.directory.join(format!("diverged-{now}-{number}.json"));
+        let path = self.directory.join(format!("diverged-{now}-{}-{number}.json", std::process::id()));
         let written = serde_json::to_vec(dump).map_err(std::io::Error::from).and_then(|text| {
             let mut file = OpenOptions::new().write(true).create_new(true).open(&path)?;
             file.write_all(&text)

@@ -51,7 +51,7 @@ enum Figure {
         #[arg(long, value_name = "N", num_args = 1.., default_values_t = [32, 1000])]
         connections: Vec<usize>,
         /// Seconds of a round.
-        #[arg(long, default_value_t = 5.0)]
+        #[arg(long, default_value_t = 5.0, value_parser = positive)]
         seconds: f64,
         /// Rounds.
         #[arg(long, default_value_t = 5)]
@@ -63,8 +63,8 @@ enum Figure {
         #[arg(long, value_name = "N", default_value_t = 1000)]
         connections: usize,
         /// Bytes of a version.
-        #[arg(long, value_name = "BYTES", default_value_t = 5_000_000)]
-        parameters: usize,
+        #[arg(long, value_name = "BYTES", default_value_t = 5_000_000, value_parser = clap::value_parser!(u64).range(1..))]
+        parameters: u64,
         /// Versions a round, and rounds.
         #[arg(long, default_value_t = 3)]
         rounds: usize,
@@ -75,8 +75,8 @@ enum Figure {
         #[arg(long, value_name = "N", default_value_t = 1000)]
         connections: usize,
         /// Bytes of a version.
-        #[arg(long, value_name = "BYTES", default_value_t = 5_000_000)]
-        parameters: usize,
+        #[arg(long, value_name = "BYTES", default_value_t = 5_000_000, value_parser = clap::value_parser!(u64).range(1..))]
+        parameters: u64,
     },
     /// Many actors for long, with joins, leaves and stalls.
     Swarm(swarm::Options),
@@ -184,7 +184,7 @@ fn ingest_round((kind, crowd): (&str, &str), connections: usize, seconds: f64) -
 }
 
 /// The readers of service and floor drop what they read; those of a third round decode it, as actors do.
-fn publish(connections: usize, parameters: usize, rounds: usize) -> Result<()> {
+fn publish(connections: usize, parameters: u64, rounds: usize) -> Result<()> {
     let mut found = [Vec::new(), Vec::new(), Vec::new()];
     for _ in 0..rounds {
         let kinds = [("learner", "readers"), ("sockets", "sockets"), ("learner", "grpc")];
@@ -202,7 +202,7 @@ fn publish(connections: usize, parameters: usize, rounds: usize) -> Result<()> {
 }
 
 /// Three versions, each to everybody before the next.
-fn publish_round((kind, crowd): (&str, &str), connections: usize, parameters: usize) -> Result<Round> {
+fn publish_round((kind, crowd): (&str, &str), connections: usize, parameters: u64) -> Result<Round> {
     const VERSIONS: usize = 3;
     let mut host = Process::host(&["--kind", kind, "--parameters", &parameters.to_string()])?;
     let everybody = connections.to_string();
@@ -218,12 +218,12 @@ fn publish_round((kind, crowd): (&str, &str), connections: usize, parameters: us
         host.ask("publish")?;
         crowd.wait_for("versions", (version * connections) as f64, PATIENCE)?;
     }
-    let bytes = (VERSIONS * connections * parameters) as f64;
+    let bytes = (VERSIONS * connections) as f64 * parameters as f64;
     Ok(Round::new(&before, &host.usage()?, bytes, start.elapsed()))
 }
 
 /// New parameters at this pace, whoever has read the last ones.
-fn lag(connections: usize, parameters: usize, target_period: usize, every: f64) -> Result<()> {
+fn lag(connections: usize, parameters: u64, target_period: usize, every: f64) -> Result<()> {
     const SECONDS: f64 = 40.0;
     let (every, size) = (every.to_string(), parameters.to_string());
     let mut host = Process::host(&["--kind", "learner", "--parameters", &size, "--publish-every", &every])?;
@@ -251,7 +251,7 @@ fn lag(connections: usize, parameters: usize, target_period: usize, every: f64) 
 }
 
 /// Readers that stop, each in another version, and one among them that goes on.
-fn stalled(connections: usize, parameters: usize) -> Result<()> {
+fn stalled(connections: usize, parameters: u64) -> Result<()> {
     const VERSIONS: usize = 8;
     let size = parameters.to_string();
     let mut host = Process::host(&["--kind", "learner", "--parameters", &size])?;
@@ -263,7 +263,7 @@ fn stalled(connections: usize, parameters: usize) -> Result<()> {
     healthy.wait_for("connected", 1.0, PATIENCE)?;
     let before = host.usage()?;
     let mut times = Vec::new();
-    for version in 1..=2 * VERSIONS {
+    for version in 1..=6 * VERSIONS {
         host.ask("publish")?;
         let start = Instant::now();
         healthy.wait_for("versions", version as f64, PATIENCE)?;
@@ -283,6 +283,14 @@ fn stalled(connections: usize, parameters: usize) -> Result<()> {
         })
     );
     Ok(())
+}
+
+/// A number of seconds, or the like, that can be waited for.
+fn positive(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(number) if (1e-3..=1e6).contains(&number) => Ok(number),
+        _ => Err("must be a number from 0.001 to 1000000".into()),
+    }
 }
 
 fn median(mut values: Vec<f64>) -> f64 {

@@ -2,8 +2,11 @@
 
 use std::fmt;
 
-use crate::publish::{PIECE, VERSIONS};
+use crate::publish::VERSIONS;
 use crate::service::CONNECTION_WINDOW;
+
+/// Bytes of a call's answers that its peer does not take: hyper's send buffer, and the largest piece beside it, an asset's.
+const ANSWER: usize = (400 + 256) * 1024;
 
 /// What decides how large the buffers get.
 #[derive(Clone, Copy, Debug)]
@@ -37,8 +40,10 @@ pub struct Bounds {
     pub windows: u64,
     /// Messages that are read and wait for a place in a batch: one for each call.
     pub messages: u64,
-    /// Versions of the parameters that are held for readers, and two pieces of them for each call.
+    /// Versions of the parameters that are held for readers.
     pub parameters: u64,
+    /// Answers on their way out: see [`ANSWER`].
+    pub answers: u64,
     /// Refused messages on their way to the disk.
     pub quarantine: u64,
     /// Checkpoints: one being written, one that waits, and the newest, to turn back to.
@@ -54,19 +59,21 @@ impl Bounds {
             batches: product(&[ahead + 1, batch, unroll]),
             windows: product(&[connections, CONNECTION_WINDOW as usize]),
             messages: product(&[requests, message]),
-            parameters: product(&[VERSIONS, parameters]).saturating_add(product(&[requests, 2, PIECE])),
+            parameters: product(&[VERSIONS, parameters]),
+            answers: product(&[requests, ANSWER]),
             quarantine: product(&[quarantined, message]),
             snapshots: product(&[3, snapshot]),
         }
     }
 
-    fn parts(&self) -> [(&'static str, u64); 6] {
-        let Self { batches, windows, messages, parameters, quarantine, snapshots } = *self;
+    fn parts(&self) -> [(&'static str, u64); 7] {
+        let Self { batches, windows, messages, parameters, answers, quarantine, snapshots } = *self;
         [
             ("batches", batches),
             ("connection windows", windows),
             ("messages", messages),
             ("parameters", parameters),
+            ("answers", answers),
             ("quarantine", quarantine),
             ("checkpoints", snapshots),
         ]
@@ -113,15 +120,16 @@ mod tests {
             batches: 2 * 128 * 200_000,
             windows: 100 * 1024 * 1024,
             messages: 300 * 1024 * 1024,
-            parameters: 9 * 5_000_000 + 300 * 65_536,
+            parameters: 9 * 5_000_000,
+            answers: 300 * 656 * 1024,
             quarantine: 9 * 1024 * 1024,
             snapshots: 3 * 40_000_000,
         };
         assert_eq!(bounds, expected);
-        assert_eq!(bounds.sum(), 51_200_000 + 409 * 1_048_576 + 64_660_800 + 120_000_000);
+        assert_eq!(bounds.sum(), 51_200_000 + 409 * 1_048_576 + 45_000_000 + 201_523_200 + 120_000_000);
         assert_eq!(
             bounds.to_string(),
-            "at most 634 MiB: batches 49, connection windows 100, messages 300, parameters 62, quarantine 9, checkpoints 115"
+            "at most 808 MiB: batches 49, connection windows 100, messages 300, parameters 43, answers 193, quarantine 9, checkpoints 115"
         );
     }
 

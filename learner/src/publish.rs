@@ -2,8 +2,8 @@
 //!
 //! An actor that reads on finishes the version it began, however many come meanwhile: if it started over with each of
 //! them, a slow one would never have any. An actor that stalls must not keep its version alive. So a few versions are
-//! *held* for their readers, readers themselves hold nothing, and the place of a version nobody gets on with is given to
-//! a newer one when it is needed.
+//! *held* for their readers, readers themselves hold nothing, and the place of a version that nobody gets on with, or
+//! that takes too long, is given to a newer one when it is needed.
 
 use std::fmt;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -16,7 +16,7 @@ use comic_proto::v1::{Behaviour, ParametersChunk};
 use tokio::sync::{Notify, watch};
 
 /// Bytes of parameters in a piece. Each piece is memory of its own, so a reader that stalls for ever holds one or two
-/// pieces and never the version they are of.
+/// pieces, or where its network is stuck as many as hyper buffers, and never the version they are of.
 pub(crate) const PIECE: usize = 32 * 1024;
 /// Versions that readers can be in the middle of.
 const HELD: usize = 6;
@@ -36,7 +36,7 @@ pub struct Holding {
 
 impl Default for Holding {
     fn default() -> Self {
-        Self { versions: HELD, idle: Duration::from_secs(2), longest: Duration::from_secs(60) }
+        Self { versions: HELD, idle: Duration::from_secs(5), longest: Duration::from_secs(60) }
     }
 }
 
@@ -81,12 +81,12 @@ impl Published {
 #[derive(Clone)]
 pub struct Publisher {
     inner: Arc<Inner>,
+    newest: watch::Sender<Option<Arc<Published>>>,
 }
 
 struct Inner {
     epoch: u64,
     holding: Holding,
-    newest: watch::Sender<Option<Arc<Published>>>,
     held: Mutex<Vec<Held>>,
     /// A place among the held is free.
     freed: Notify,
@@ -115,8 +115,8 @@ impl Publisher {
 
     /// One that holds versions otherwise than by default.
     pub fn holding(epoch: u64, holding: Holding) -> Self {
-        let (newest, held) = (watch::Sender::new(None), Mutex::default());
-        Self { inner: Arc::new(Inner { epoch, holding, newest, held, freed: Notify::new() }) }
+        let inner = Inner { epoch, holding, held: Mutex::default(), freed: Notify::new() };
+        Self { inner: Arc::new(inner), newest: watch::Sender::new(None) }
     }
 
     /// Makes this the newest version; nobody waits for anybody. Versions grow, except that the same version may come
@@ -128,7 +128,7 @@ impl Publisher {
             return;
         }
         let published = Published::new(self.inner.epoch, version, behaviour, serial + 1, payload);
-        self.inner.newest.send_replace(Some(Arc::new(published)));
+        self.newest.send_replace(Some(Arc::new(published)));
     }
 
     /// The newest version; 0 before the first.
@@ -138,7 +138,7 @@ impl Publisher {
 
     /// What was published last.
     pub fn newest(&self) -> Option<Arc<Published>> {
-        self.inner.newest.borrow().clone()
+        self.newest.borrow().clone()
     }
 
     /// Versions that are in memory because somebody reads them, or began to.
@@ -153,8 +153,8 @@ impl Publisher {
 
     /// A reader that begins with the newest version.
     pub fn subscribe(&self) -> Subscription {
-        let newest = self.inner.newest.subscribe();
-        Subscription { inner: Arc::clone(&self.inner), newest, finished: 0, reading: None, left: false }
+        let (inner, newest) = (Arc::clone(&self.inner), self.newest.subscribe());
+        Subscription { inner, newest, finished: 0, reading: None, left: false }
     }
 }
 
@@ -242,18 +242,21 @@ impl Subscription {
         if !self.newest.borrow().as_ref().is_some_and(leaving) {
             return None;
         }
-        self.begin();
+        if self.newest.has_changed().unwrap_or(false) {
+            self.begin();
+        }
         self.piece()
     }
 
     /// Begins the newest version if there is room to hold it, or else the newest that is held already.
     fn begin(&mut self) -> Begun {
+        // Locked first: what is begun is the newest then, too.
+        let mut held = self.inner.held();
         let Some(newest) = self.newest.borrow_and_update().clone() else { return Begun::NothingNew };
         if newest.serial == self.finished {
             return Begun::NothingNew;
         }
         let (now, holding) = (Instant::now(), self.inner.holding);
-        let mut held = self.inner.held();
         if held.iter().all(|held| held.published.serial != newest.serial) {
             // The last word is one piece, and heard by everybody.
             let small = newest.frames.len() == 1;

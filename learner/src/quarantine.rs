@@ -155,7 +155,7 @@ impl Cell {
 }
 
 fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
-    let mut file = File::create(path)?;
+    let mut file = File::create_new(path)?;
     parts.iter().try_for_each(|part| file.write_all(part))
 }
 

@@ -1,7 +1,6 @@
 //! Gradient steps that were skipped, since a loss or gradient was not finite, and what they lead to.
 
 use anyhow::{Result, bail};
-use comic_proto::v1::Behaviour;
 use serde_json::{Map, Value, json};
 
 use crate::service::complaints::Complaints;
@@ -53,11 +52,12 @@ impl Trainer {
         self.setbacks.in_row == 0 && self.learner.is_finite()
     }
 
-    /// Keeps the newest losses for the metrics, and sees to the steps that were skipped.
+    /// Keeps the newest losses for the metrics, and sees to the steps that were skipped. Says whether they led back to the
+    /// last good state, which actors have to hear of.
     ///
     /// # Errors
     /// When the way back was taken already and led nowhere.
-    pub(crate) fn report(&mut self, losses: &vmpo::Metrics) -> Result<()> {
+    pub(crate) fn report(&mut self, losses: &vmpo::Metrics) -> Result<bool> {
         let vmpo::Metrics { steps, skipped, skipped_last, .. } = *losses;
         let update = self.progress.updates;
         self.metrics.count_skipped(skipped);
@@ -65,7 +65,8 @@ impl Trainer {
         if skipped > 0 && self.setbacks.complaints.due(()).is_some() {
             tracing::warn!(update, skipped, of = steps, "gradient steps skipped: a loss or gradient is not finite");
         }
-        match self.setbacks.count(steps, skipped, skipped_last) {
+        let way = self.setbacks.count(steps, skipped, skipped_last);
+        match way {
             Way::On => {}
             Way::Back => self.turn_back()?,
             Way::Nowhere => bail!(
@@ -77,20 +78,16 @@ impl Trainer {
         if losses.is_finite() {
             self.losses = self.shown(losses);
         }
-        Ok(())
+        Ok(way == Way::Back)
     }
 
-    /// Goes on with the parameters, moments and statistics of the last good state, as a new version; what counts goes on
-    /// counting. Unrolls of the versions before are superseded: whatever made them is what went wrong.
+    /// Goes on with the parameters, moments and statistics of the last good state; what counts goes on counting. Unrolls of the versions before are superseded: whatever made them is what went wrong.
     fn turn_back(&mut self) -> Result<()> {
         self.restore_learner(&self.good.clone())?;
         self.shared.telemetry.restores.inc();
         self.oldest = self.progress.version + 1;
-        let warm_started = self.progress.warm_started;
-        self.publish(if warm_started { Behaviour::Policy } else { Behaviour::Demonstrate })?;
         tracing::warn!(
             update = self.progress.updates,
-            version = self.progress.version,
             "too many gradient steps in a row were skipped: went back to the last good state"
         );
         Ok(())

@@ -14,10 +14,13 @@ use crate::trainer::{Progress, Trainer};
 impl Trainer {
     /// Hands a snapshot to the writer; while it is still busy with the last one, only a `final_one` waits.
     pub(crate) fn checkpoint(&mut self, final_one: bool) -> Result<()> {
-        if !final_one && self.writer.is_busy() {
-            return Ok(());
+        let name = Name::Updates(self.progress.updates);
+        match final_one {
+            // A step that was skipped at the very end changed nothing.
+            true if self.learner.is_finite() => self.write(name),
+            false if self.writer.is_busy() => Ok(()),
+            _ => self.keep(name),
         }
-        self.keep(Name::Updates(self.progress.updates))
     }
 
     /// Has the state written, and keeps it in memory to turn back to; only a sound one.
@@ -26,6 +29,10 @@ impl Trainer {
             tracing::warn!(checkpoint = %name, "not written: the last gradient steps were not finite");
             return Ok(());
         }
+        self.write(name)
+    }
+
+    fn write(&mut self, name: Name) -> Result<()> {
         self.good = Arc::new(self.snapshot()?);
         self.checkpointed = Instant::now();
         self.writer.write(name, self.good.clone())

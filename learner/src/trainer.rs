@@ -214,15 +214,16 @@ impl Trainer {
         for minibatch in self.minibatches(&tensors) {
             losses.push(self.learner.step(&minibatch)?);
         }
-        if let Some(losses) = Losses::mean(&losses) {
-            self.report(&losses.to_metrics())?;
-        }
+        let turned_back = match Losses::mean(&losses) {
+            Some(losses) => self.report(&losses.to_metrics())?,
+            None => false,
+        };
         self.progress.updates += 1;
         self.metrics.count_update();
         self.metrics.absorb(batch.headers(), self.progress.version);
         let ages = batch.headers().iter().map(|header| self.progress.version.saturating_sub(header.version)).collect();
         // Published before the batch goes back: whoever waits for its room goes on with these parameters.
-        if self.progress.updates.is_multiple_of(self.experiment.vmpo.target_period) {
+        if turned_back || self.progress.updates.is_multiple_of(self.experiment.vmpo.target_period) {
             self.publish(Behaviour::Policy)?;
         } else {
             self.keep_step(Behaviour::Policy);
@@ -321,6 +322,7 @@ impl Trainer {
     pub(crate) fn publish(&mut self, behaviour: Behaviour) -> Result<()> {
         if !self.is_sound() {
             tracing::warn!(update = self.progress.updates, "not published: the last gradient steps were not finite");
+            self.keep_step(behaviour);
             return Ok(());
         }
         self.target = Bytes::from(to_safetensors(self.learner.policy_store())?);

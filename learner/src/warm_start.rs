@@ -25,17 +25,22 @@ impl Trainer {
         self.good = Arc::new(self.snapshot()?);
         let config = self.experiment.warm_start.clone();
         tracing::info!(steps = config.steps, "regressing on them");
-        let mut unreported = Vec::new();
-        for step in 0..config.steps {
+        let (mut unreported, mut step) = (Vec::new(), 0);
+        // A last step that was skipped is made up for: what is not sound would not be published.
+        while step < config.steps || !self.is_sound() {
             self.learner.set_learning_rates(config.learning_rate, self.experiment.optimiser.multiplier_learning_rate);
             unreported.push(self.regress(&mut demonstrations, config.minibatch_unrolls)?);
-            if (step % 50 == 0 || step + 1 == config.steps)
+            if (step % 50 == 0 || step + 1 >= config.steps)
                 && let Some(losses) = Losses::mean(&std::mem::take(&mut unreported))
             {
                 let losses = losses.to_metrics();
-                self.report(&losses)?;
                 tracing::info!(step, regression = losses.regression_loss, latent_kl = losses.latent_kl, "regressing");
+                if self.report(&losses)? {
+                    step = 0;
+                    continue;
+                }
             }
+            step += 1;
             self.write_metrics_when_due()?;
             if self.batcher.is_closed() {
                 return Ok(None);

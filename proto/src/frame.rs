@@ -3,16 +3,13 @@
 use bytes::{BufMut as _, Bytes, BytesMut};
 use prost::Message;
 
-/// A message as gRPC sends it: the byte 0 for "not compressed", the length in four bytes, big end first, the message.
-///
-/// # Panics
-/// When the message has 4 GiB or more.
+/// A message as gRPC sends it: the byte 0 for "not compressed", the length in four bytes, big end first, the message,
+/// which is smaller than 4 GiB.
 pub fn frame(message: &impl Message) -> Bytes {
     let length = message.encoded_len();
-    let prefix = u32::try_from(length).expect("a message is smaller than 4 GiB");
     let mut frame = BytesMut::with_capacity(5 + length);
     frame.put_u8(0);
-    frame.put_u32(prefix);
+    frame.put_u32(length as u32);
     message.encode_raw(&mut frame);
     frame.freeze()
 }

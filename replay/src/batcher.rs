@@ -113,7 +113,9 @@ pub struct Batcher {
 impl Batcher {
     /// An empty batcher that carries on these books.
     pub fn new(layout: Arc<UnrollLayout>, config: Config, phase: Phase, ledger: Ledger) -> Self {
-        let config = Config { unrolls: config.unrolls.max(1), ..config };
+        // An environment's next unroll is of the next batch, which has to wait.
+        let ahead = if config.order == Order::Environment { 0 } else { config.ahead };
+        let config = Config { unrolls: config.unrolls.max(1), ahead, ..config };
         let mut free: Vec<_> = (0..=config.ahead).map(|_| Buffer::new(&layout, config.unrolls)).collect();
         let open = free.pop();
         let state = Mutex::new(State { ledger, phase, next: None, open, free, taken: 0, closed: false });

@@ -2,6 +2,7 @@
 //!
 //! Hosts are network namespaces, which take root: `cargo xtask test` runs these where it is, and says so where it is not.
 
+use std::net::Ipv4Addr;
 use std::process::Command;
 use std::time::Duration;
 
@@ -17,8 +18,8 @@ struct Host {
     name: String,
     /// The learner's end.
     cable: String,
-    /// The first three numbers of both addresses; the learner's ends with 1, the actor's with 2.
-    network: String,
+    learner: String,
+    actor: String,
 }
 
 impl Host {
@@ -26,14 +27,17 @@ impl Host {
     fn new(number: u8) -> Result<Self> {
         let name = format!("comic-{}-{number}", std::process::id());
         let (cable, end) = (format!("cl{}{number}", std::process::id()), format!("ca{}{number}", std::process::id()));
-        let host = Self { name, cable, network: format!("10.213.{number}") };
-        let Self { name, cable, network } = &host;
+        // Four addresses of 10.128.0.0/9 that are this test's alone; what an interrupted run left behind has others.
+        let block = (std::process::id().wrapping_mul(4) + u32::from(number)) % (1 << 21);
+        let address = |end: u32| Ipv4Addr::from_bits(0x0a80_0000 + 4 * block + end).to_string();
+        let host = Self { learner: address(1), actor: address(2), name, cable };
+        let Self { name, cable, learner, actor } = &host;
         for command in [
             format!("netns add {name}"),
             format!("link add {cable} type veth peer name {end} netns {name}"),
-            format!("address add {network}.1/24 dev {cable}"),
+            format!("address add {learner}/30 dev {cable}"),
             format!("link set {cable} up"),
-            format!("-n {name} address add {network}.2/24 dev {end}"),
+            format!("-n {name} address add {actor}/30 dev {end}"),
             format!("-n {name} link set {end} name cable"),
             format!("-n {name} link set cable up"),
         ] {
@@ -44,21 +48,12 @@ impl Host {
 
     /// What is sent to this host gets lost from now on, or no more.
     fn lose_what_comes(&self, lost: bool) -> Result<()> {
-        ip(&format!("neighbour {} dev {}", self.misdirected(2, lost), self.cable))
+        ip(&format!("neighbour {} dev {}", misdirected(&self.actor, lost), self.cable))
     }
 
     /// What this host sends gets lost from now on, or no more.
     fn lose_what_goes(&self, lost: bool) -> Result<()> {
-        ip(&format!("-n {} neighbour {} dev cable", self.name, self.misdirected(1, lost)))
-    }
-
-    /// Packets for a hardware address that nobody has vanish without a word.
-    fn misdirected(&self, end: u8, lost: bool) -> String {
-        let address = format!("{}.{end}", self.network);
-        match lost {
-            true => format!("replace {address} lladdr 02:00:00:00:00:99 nud permanent"),
-            false => format!("delete {address}"),
-        }
+        ip(&format!("-n {} neighbour {} dev cable", self.name, misdirected(&self.learner, lost)))
     }
 }
 
@@ -66,6 +61,14 @@ impl Drop for Host {
     fn drop(&mut self) {
         // The cable goes with it.
         let _ = ip(&format!("netns delete {}", self.name));
+    }
+}
+
+/// Packets for a hardware address that nobody has vanish without a word.
+fn misdirected(address: &str, lost: bool) -> String {
+    match lost {
+        true => format!("replace {address} lladdr 02:00:00:00:00:99 nud permanent"),
+        false => format!("delete {address}"),
     }
 }
 
@@ -80,9 +83,8 @@ fn ip(arguments: &str) -> Result<()> {
 /// Cuts the network, waits until both sides have given the other up, mends it, and sees that nothing was lost.
 async fn a_partition_heals(number: u8, cut: impl Fn(&Host, bool) -> Result<()>) -> Result<()> {
     let host = Host::new(number)?;
-    let learner = format!("{}.1", host.network);
-    let mut system = System::new(&[&SMALL[..], &["--address", &learner, "--insecure"]].concat())?;
-    system.host = learner;
+    let mut system = System::new(&[&SMALL[..], &["--address", &host.learner, "--insecure"]].concat())?;
+    system.host.clone_from(&host.learner);
     system.start_learner(LIMIT).await?;
     let mut actor = system.start_actor_on(&host.name)?;
     trains_on(&mut system, "the actor's unrolls are trained on").await?;

@@ -77,7 +77,7 @@ pub struct Evaluate {
     rewards: Option<PathBuf>,
     /// Report the evaluation of a checkpoint to this learner too, which keeps it in `evaluations.jsonl`, and the checkpoint
     /// as `checkpoints/best` if none was better.
-    #[arg(long, value_name = "URL", requires = "checkpoint")]
+    #[arg(long, value_name = "URL", requires = "checkpoint", conflicts_with_all = ["untrained", "servo"])]
     learner: Option<String>,
     #[command(flatten)]
     access: Access,

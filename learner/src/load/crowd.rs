@@ -51,10 +51,10 @@ pub(super) struct Options {
     #[arg(long)]
     stall_within: Option<u64>,
     /// Mean seconds of an actor's life, and between its stalls.
-    #[arg(long)]
+    #[arg(long, value_parser = super::positive)]
     churn: Option<f64>,
     /// Bytes of a version, where only sockets are read.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     parameters: u64,
 }
 
@@ -264,7 +264,7 @@ impl Crowd {
     /// One connection, up to the end of this life.
     async fn live(&self, index: usize, number: &mut Option<u64>, rng: &mut StdRng) -> Result<()> {
         let Options { window, watch, stall_within, churn, kind, .. } = self.options;
-        let incarnation = rng.random();
+        let incarnation = rand::random();
         let endpoint = Access::default()
             .endpoint(&format!("http://{}", self.options.host))?
             .tcp_nodelay(true)

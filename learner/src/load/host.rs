@@ -37,13 +37,13 @@ pub(super) struct Options {
     #[arg(long, default_value_t = 0)]
     parameters: usize,
     /// Seconds between versions; none but those asked for otherwise.
-    #[arg(long)]
+    #[arg(long, value_parser = super::positive)]
     publish_every: Option<f64>,
     /// Seconds of an update.
-    #[arg(long, default_value_t = 0.0)]
-    update: f64,
+    #[arg(long, value_parser = super::positive)]
+    update: Option<f64>,
     /// Updates between versions.
-    #[arg(long)]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     target_period: Option<u64>,
 }
 
@@ -147,7 +147,8 @@ impl Stand {
         if options.target_period.is_some() {
             self.publish();
         }
-        let (stand, update, period) = (self.clone(), Duration::from_secs_f64(options.update), options.target_period);
+        let (stand, update, period) =
+            (self.clone(), Duration::from_secs_f64(options.update.unwrap_or_default()), options.target_period);
         spawn("training", move || stand.train(update, period))
     }
 

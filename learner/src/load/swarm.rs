@@ -20,19 +20,19 @@ pub(super) struct Options {
     #[arg(long, default_value_t = 4000)]
     actors: usize,
     /// Minutes, a tenth of which are warm-up.
-    #[arg(long, default_value_t = 20.0)]
+    #[arg(long, default_value_t = 20.0, value_parser = super::positive)]
     minutes: f64,
     /// Bytes of a version of the parameters.
     #[arg(long, value_name = "BYTES", default_value_t = 5_000_000)]
     parameters: usize,
     /// Batches that the stand-in for the device takes in a second.
-    #[arg(long, default_value_t = 10.0)]
+    #[arg(long, default_value_t = 10.0, value_parser = super::positive)]
     batches: f64,
     /// Batches between versions.
     #[arg(long, default_value_t = 100)]
     target_period: u64,
     /// Mean seconds of an actor's life, and between its stalls of 5 to 60 s.
-    #[arg(long, default_value_t = 300.0)]
+    #[arg(long, default_value_t = 300.0, value_parser = super::positive)]
     churn: f64,
 }
 

@@ -38,8 +38,8 @@ impl Shares {
         Self { owners: Mutex::new(vec![None; environments]) }
     }
 
-    /// What an actor has, or else the first stretch of free environments, up to `wanted` of them. Free is also what
-    /// belongs to an actor that is not `expected` any more. An actor that `returns` gets what it had or nothing.
+    /// What an actor has, or else the first stretch of free environments, up to `wanted` of them. Free is also, when
+    /// nothing else is, what belongs to an actor that is not `expected` any more. An actor that `returns` gets what it had or nothing.
     pub(super) fn claim(
         &self,
         incarnation: u64,
@@ -55,7 +55,8 @@ impl Shares {
             if returns {
                 return Err(Denied::Lost);
             }
-            let first = owners.iter().position(free).ok_or(Denied::Taken)?;
+            let nobodys = owners.iter().position(Option::is_none);
+            let first = nobodys.or_else(|| owners.iter().position(free)).ok_or(Denied::Taken)?;
             let wanted = usize::try_from(wanted.max(1)).unwrap_or(usize::MAX);
             let count = owners[first..].iter().take(wanted).take_while(|owner| free(owner)).count();
             let gone: Vec<_> = owners[first..first + count].iter().copied().flatten().collect();
@@ -70,6 +71,11 @@ impl Shares {
         let count = owners.iter().filter(|owner| own(owner)).count();
         let left = owners.iter().filter(|owner| free(owner)).count();
         Ok(Share { environments: first as u32..(first + count) as u32, inherited, left })
+    }
+
+    /// Whether an environment is this actor's.
+    pub(super) fn owns(&self, incarnation: u64, environment: u32) -> bool {
+        lock(&self.owners).get(environment as usize).is_some_and(|owner| *owner == Some(incarnation))
     }
 }
 

@@ -17,12 +17,13 @@ pub(super) struct UnrollStream {
     shared: Arc<Shared>,
     incoming: Streaming<UnrollMessage>,
     closing: Closing,
+    answered: bool,
     over: bool,
 }
 
 impl UnrollStream {
     pub(super) fn new(shared: Arc<Shared>, incoming: Streaming<UnrollMessage>) -> Self {
-        Self { closing: shared.closing(), shared, incoming, over: false }
+        Self { closing: shared.closing(), shared, incoming, answered: false, over: false }
     }
 
     /// Takes one unroll and answers it. `None` when the actor has no more, or the server closes; an unroll that was
@@ -30,6 +31,11 @@ impl UnrollStream {
     pub(super) async fn next(mut self) -> Option<(Result<UnrollAck, Status>, Self)> {
         if self.over {
             return None;
+        }
+        // tonic asks for the next answer while it still holds the last one, and nobody may be there to take that. Who waits
+        // for a place in a batch meanwhile would get one and never fill it, and training would stand.
+        if std::mem::replace(&mut self.answered, true) {
+            tokio::task::yield_now().await;
         }
         let answer = tokio::select! {
             biased;
@@ -66,6 +72,12 @@ async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAc
     };
     shared.telemetry.unroll_bytes.observe(payload.len() as f64);
     shared.roster.heard(header.incarnation, Instant::now());
+    if let Some(shares) = &shared.shares
+        && !shares.owns(header.incarnation, header.environment)
+    {
+        let environment = header.environment;
+        return Err(Status::failed_precondition(format!("in lockstep environment {environment} is not this actor's")));
+    }
     let expected = Expected {
         clips: &shared.clips,
         epoch: shared.publisher.epoch(),

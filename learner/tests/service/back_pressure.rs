@@ -8,8 +8,10 @@ use std::time::Duration;
 
 use crate::support::{BATCH, World, within};
 use comic_proto::v1::Verdict;
+use comic_proto::v1::learner_client::LearnerClient;
 use comic_replay::Next;
 use futures::{StreamExt as _, stream};
+use tonic::transport::Endpoint;
 
 /// Slots without a trainer: the open batch and the full one.
 const SLOTS: usize = 2 * BATCH;
@@ -87,4 +89,33 @@ async fn an_actor_that_dies_while_it_waits_leaves_no_trace_and_its_slot_to_other
     // The dead actor's last unroll may or may not have come through before the end of its connection was noticed.
     assert_eq!(books.produced, books.trained + books.in_flight);
     assert!((SLOTS as u64 + 1..=SLOTS as u64 + 2).contains(&books.produced));
+}
+
+#[tokio::test]
+async fn an_actor_that_takes_no_acknowledgements_holds_no_place_that_others_could_fill() {
+    let world = World::start().await;
+    let silent = world.actor(70).await;
+    // One byte is less than an acknowledgement.
+    let endpoint = Endpoint::from_shared(world.address.clone()).unwrap().initial_stream_window_size(1);
+    let mut client = LearnerClient::new(endpoint.connect().await.unwrap());
+    let unrolls: Vec<_> = (0..100).map(|sequence| silent.unroll(sequence)).collect();
+    let _unread = client.send_unrolls(stream::iter(unrolls)).await.unwrap();
+
+    let mut other = world.actor(71).await;
+    let unrolls: Vec<_> = (0..100).map(|sequence| other.unroll(sequence)).collect();
+    let mut acks = other.client.send_unrolls(stream::iter(unrolls)).await.unwrap().into_inner();
+    let trainer = tokio::task::spawn_blocking({
+        let batcher = world.batcher.clone();
+        move || {
+            for _ in 0..20 {
+                let Next::Batch(batch) = batcher.next_batch_within(Duration::from_secs(10)) else { panic!("no batch") };
+                batcher.trained(batch);
+            }
+        }
+    });
+    for _ in 0..20 {
+        let ack = within(Duration::from_secs(10), acks.message()).await.unwrap().unwrap();
+        assert_eq!(ack.verdict(), Verdict::Taken);
+    }
+    trainer.await.unwrap();
 }
