@@ -17,6 +17,7 @@ mod metrics;
 mod minibatch;
 mod multipliers;
 mod returns;
+mod stores;
 
 pub use improvement::{Evidence, Improvement, Limits, masked_mean, policy_improvement};
 pub use learner::{Error, VmpoLearner};

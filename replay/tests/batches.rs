@@ -85,7 +85,7 @@ fn what_grew_too_old_while_it_waited_is_dropped_and_its_slots_are_filled_again()
     assert_eq!((batcher.books().dropped.stale, batcher.books().in_flight), (3, 2));
     let late = UnrollHeader { version: newest(1), ..actor.header(5) };
     assert_eq!(insert_now(&batcher, &late), Some(Outcome::Taken));
-    assert_holds(&batch_now(&batcher).unwrap(), &[sent[1].clone(), sent[4].clone(), late]);
+    assert_holds(&batch_now(&batcher).unwrap(), &[sent[4].clone(), sent[1].clone(), late]);
     // Every slot is there again.
     for sequence in 6..6 + SLOTS as u64 {
         assert_eq!(insert_now(&batcher, &actor.header(sequence)), Some(Outcome::Taken));

@@ -2,11 +2,13 @@
 //!
 //! # Layout
 //! - [`certificates`] makes certificates, expired ones too.
+//! - [`process`] is one program that runs.
 //! - [`repository`] looks at the workspace's own files and dependencies.
 //! - [`steps`] is what they make a learner and its actors go through.
 //! - [`system`] runs a learner and actors as a user would: real programs, real sockets, one directory for the run.
 
 pub mod certificates;
+pub mod process;
 pub mod repository;
 pub mod steps;
 pub mod system;

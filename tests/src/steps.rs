@@ -6,7 +6,8 @@ use std::time::Duration;
 use anyhow::{Context, Result, ensure};
 use comic_proto::v1::{Books, Status};
 
-use crate::system::{Process, System, balance, metric};
+use crate::process::Process;
+use crate::system::{System, balance, metric};
 
 /// Long enough for the slowest machine; no step waits longer than it needs.
 pub const LIMIT: Duration = Duration::from_secs(120);

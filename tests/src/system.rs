@@ -1,24 +1,22 @@
 //! A learner and actors as real processes on this machine.
 
 use std::ffi::OsString;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, OpenOptions};
 use std::net::TcpListener;
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::path::PathBuf;
+use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use comic_proto::Access;
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{Books, Status, StatusRequest};
-use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use tempfile::TempDir;
 
+use crate::process::{POLL, Process};
 use crate::repository::root;
 
-/// How often a condition is looked at again.
-const POLL: Duration = Duration::from_millis(50);
 /// Variables that would say where the learner is and what to show it.
 const SETTINGS: [&str; 6] = ["COMIC_LEARNER", "COMIC_CA", "COMIC_CERT", "COMIC_KEY", "COMIC_TOKEN_FILE", "COMIC_TOKEN"];
 /// How long a status call may take.
@@ -323,129 +321,4 @@ fn free_port() -> Result<u16> {
     let candidates = (0..10_000).map(|step| 20_000 + (offset + step) % 10_000);
     let mut free = candidates.filter(|port| TcpListener::bind(("127.0.0.1", *port)).is_ok());
     free.next().context("no port from 20000 to 29999 is free")
-}
-
-/// A process with a log, killed when dropped.
-pub struct Process {
-    child: Child,
-    log: PathBuf,
-}
-
-impl Process {
-    /// Ends it on the spot (SIGKILL), as a power cut would.
-    ///
-    /// # Errors
-    /// When the system refuses.
-    pub fn kill(mut self) -> Result<()> {
-        self.child.kill().context("cannot kill")?;
-        self.child.wait().context("cannot wait")?;
-        Ok(())
-    }
-
-    /// Bytes of memory it has.
-    ///
-    /// # Errors
-    /// When the system does not say.
-    pub fn resident(&self) -> Result<u64> {
-        let status = fs::read_to_string(format!("/proc/{}/status", self.child.id())).context("no such process")?;
-        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).context("no VmRSS")?;
-        let kilobytes: u64 = line.trim().trim_end_matches(" kB").parse().context("VmRSS is no number")?;
-        Ok(kilobytes * 1024)
-    }
-
-    /// Asks it to leave (SIGTERM) and waits.
-    ///
-    /// # Errors
-    /// When it is still there after `limit`.
-    pub async fn terminate(mut self, limit: Duration) -> Result<ExitStatus> {
-        self.signal(Signal::TERM)?;
-        let deadline = Instant::now() + limit;
-        while Instant::now() < deadline {
-            if let Some(status) = self.ended()? {
-                return Ok(status);
-            }
-            tokio::time::sleep(POLL).await;
-        }
-        bail!("still there {limit:?} after SIGTERM: {}", self.log())
-    }
-
-    /// Stops it where it is (SIGSTOP), until it [`resumes`](Self::resume).
-    ///
-    /// # Errors
-    /// When the system refuses.
-    pub fn pause(&self) -> Result<()> {
-        self.signal(Signal::STOP)
-    }
-
-    /// Lets it go on (SIGCONT).
-    ///
-    /// # Errors
-    /// When the system refuses.
-    pub fn resume(&self) -> Result<()> {
-        self.signal(Signal::CONT)
-    }
-
-    fn signal(&self, signal: Signal) -> Result<()> {
-        let pid = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw).context("no process id")?;
-        kill_process(pid, signal).context("cannot signal")
-    }
-
-    /// How it ended, if it has.
-    ///
-    /// # Errors
-    /// When the system refuses.
-    pub fn ended(&mut self) -> Result<Option<ExitStatus>> {
-        self.child.try_wait().context("cannot wait")
-    }
-
-    /// Waits until it ends by itself.
-    ///
-    /// # Errors
-    /// When it is still there after `limit`, with its log.
-    pub async fn until_it_ends(&mut self, limit: Duration) -> Result<ExitStatus> {
-        let deadline = Instant::now() + limit;
-        loop {
-            match self.ended()? {
-                Some(status) => return Ok(status),
-                None if Instant::now() > deadline => bail!("still there after {limit:?}: {}", self.log()),
-                None => tokio::time::sleep(POLL).await,
-            }
-        }
-    }
-
-    /// Everything it has written.
-    pub fn log(&self) -> String {
-        read(&self.log)
-    }
-
-    /// Waits until its log holds `text`.
-    ///
-    /// # Errors
-    /// When it ends or `limit` is over before that, with the log.
-    pub async fn until_log_holds(&mut self, text: &str, limit: Duration) -> Result<()> {
-        let deadline = Instant::now() + limit;
-        loop {
-            if self.log().contains(text) {
-                return Ok(());
-            }
-            let ended = self.ended()?;
-            if ended.is_some() || Instant::now() > deadline {
-                bail!("`{text}` is not in the log ({ended:?}): {}", self.log());
-            }
-            tokio::time::sleep(POLL).await;
-        }
-    }
-}
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-fn read(path: &Path) -> String {
-    let mut text = Vec::new();
-    let _ = File::open(path).and_then(|mut file| std::io::Read::read_to_end(&mut file, &mut text));
-    String::from_utf8_lossy(&text).into_owned()
 }

@@ -7,8 +7,9 @@ use std::net::{Shutdown, TcpListener, TcpStream};
 use std::thread;
 
 use anyhow::{Context, Result, ensure};
+use comic_tests::process::Process;
 use comic_tests::steps::{LIMIT, books, trains_on};
-use comic_tests::system::{Process, SMALL, System};
+use comic_tests::system::{SMALL, System};
 
 /// Environments in all: one for each unroll of a batch.
 const ALL: u32 = 8;

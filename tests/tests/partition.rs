@@ -1,6 +1,6 @@
 //! A learner and an actor on hosts of their own, and a network between them that loses everything for a while.
 //!
-//! Hosts are network namespaces, which take root: `cargo xtask test` runs these where it is, and says so where it is not.
+//! Hosts are network namespaces, which take root: where they cannot be made, `cargo xtask test` says so and leaves these out.
 
 use std::net::Ipv4Addr;
 use std::process::Command;
@@ -102,7 +102,6 @@ async fn a_partition_heals(number: u8, cut: impl Fn(&Host, bool) -> Result<()>) 
 }
 
 #[tokio::test]
-#[ignore = "makes network namespaces, which takes root; `cargo xtask test` runs it as root"]
 async fn a_network_that_is_cut_heals() -> Result<()> {
     a_partition_heals(1, |host, lost| {
         host.lose_what_comes(lost)?;
@@ -112,13 +111,11 @@ async fn a_network_that_is_cut_heals() -> Result<()> {
 }
 
 #[tokio::test]
-#[ignore = "makes network namespaces, which takes root; `cargo xtask test` runs it as root"]
 async fn a_network_that_loses_what_the_actor_sends_heals() -> Result<()> {
     a_partition_heals(2, Host::lose_what_goes).await
 }
 
 #[tokio::test]
-#[ignore = "makes network namespaces, which takes root; `cargo xtask test` runs it as root"]
 async fn a_network_that_loses_what_the_learner_sends_heals() -> Result<()> {
     a_partition_heals(3, Host::lose_what_comes).await
 }

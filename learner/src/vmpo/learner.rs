@@ -5,6 +5,7 @@ use comic_networks::{Acting, ActionDistribution, Memory, NormaliserStatistics, P
 use comic_proto::UnrollShape;
 use tch::{Device, Kind, Tensor, nn};
 
+use super::stores::{named, trainable};
 use super::{
     Evidence, Improvement, Limits, Losses, MinibatchShape, MinibatchTensors, Multipliers, masked_mean,
     policy_improvement, returns,
@@ -446,17 +447,4 @@ fn variance_explained(pass: &Pass) -> Tensor {
 /// `[B, T, D]` as rows `[B·T, D]`.
 fn rows(tensor: &Tensor) -> Tensor {
     tensor.flatten(0, 1)
-}
-
-/// The parameters of `store`, trained or not, as `prefix.name`, sorted by name.
-fn named(prefix: &str, store: &nn::VarStore) -> Vec<(String, Tensor)> {
-    let mut variables: Vec<(String, Tensor)> =
-        store.variables().into_iter().map(|(name, tensor)| (format!("{prefix}.{name}"), tensor)).collect();
-    variables.sort_by(|a, b| a.0.cmp(&b.0));
-    variables
-}
-
-/// [`named`], without what is not trained.
-fn trainable(prefix: &str, store: &nn::VarStore) -> Vec<(String, Tensor)> {
-    named(prefix, store).into_iter().filter(|(_, tensor)| tensor.requires_grad()).collect()
 }
