@@ -41,6 +41,8 @@ pub struct Position {
     pub epoch: u64,
     /// Which version.
     pub version: u64,
+    /// Updates until then, by which checkpoints are named.
+    pub updates: u64,
 }
 
 /// Reads the newest complete checkpoint that `path` names: a run directory (which holds `checkpoints/`), a directory of
@@ -77,7 +79,7 @@ fn read_exported(path: &Path) -> Result<Checkpoint, Error> {
         let part = spec.part;
         return Err(refuse(path, format!("{part} does not act for itself: export a policy, with --part policy")));
     }
-    let position = Position { epoch: spec.source.epoch, version: spec.source.version };
+    let position = Position { epoch: spec.source.epoch, version: spec.source.version, updates: spec.source.updates };
     Ok(Checkpoint { path: path.to_path_buf(), experiment, policy: bytes, position })
 }
 

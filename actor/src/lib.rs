@@ -7,6 +7,7 @@
 //! - [`session`] is the connection to the learner: it joins, fetches assets, watches parameters, sends unrolls until
 //!   each is acknowledged, and comes back by itself after every loss.
 //! - [`dump`] keeps episodes whose simulation diverged, and plays them again.
+//! - [`pulse`] is the process's sign of life, for a container's health check.
 //! - [`run`] puts these together into an actor process.
 //! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads what the learner wrote.
 //! - [`render`] films a policy at work, or shows it in a window.
@@ -25,6 +26,7 @@ mod error;
 pub mod evaluate;
 pub mod mailbox;
 pub mod policy;
+pub mod pulse;
 pub mod render;
 pub mod round;
 pub mod run;

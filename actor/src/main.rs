@@ -9,6 +9,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use comic_actor::clips::Clips;
 use comic_actor::dump;
 use comic_actor::evaluate::command::Evaluate;
+use comic_actor::pulse::Health;
 use comic_actor::render::command::Render;
 use comic_actor::render::view::View;
 use comic_actor::{Error, bench, policy, run};
@@ -46,6 +47,8 @@ enum Command {
     Clips(Clips),
     /// Plays a diverged episode again, as --dump-diverged wrote it down.
     Replay(dump::Command),
+    /// Exit with 0 if an actor steps environments and with 1 if not, for a container's health check.
+    Health(Health),
     /// Measures how fast an actor is, one JSON line a figure.
     #[command(hide = true)]
     Bench(bench::Bench),
@@ -70,6 +73,9 @@ struct Act {
     /// Write episodes whose simulation diverged there, at most 16; see `comic-actor replay`.
     #[arg(long, value_name = "DIR")]
     dump_diverged: Option<PathBuf>,
+    /// Write this file while environments are stepped; see `comic-actor health`.
+    #[arg(long, value_name = "FILE", env = "COMIC_PULSE")]
+    pulse: Option<PathBuf>,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -105,14 +111,15 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
         Some(Command::View(view)) => view.run().context("cannot show"),
         Some(Command::Clips(clips)) => clips.run().map_err(anyhow::Error::from),
         Some(Command::Replay(replay)) => replay.run().context("cannot replay"),
+        Some(Command::Health(health)) => health.run(),
         Some(Command::Bench(bench)) => bench.run().context("cannot measure"),
         None => {
-            let Act { learner, access, threads, environments, cache, dump_diverged } = arguments.act;
+            let Act { learner, access, threads, environments, cache, dump_diverged, pulse } = arguments.act;
             let learner = learner.ok_or_else(|| {
                 Error::Usage("no learner: give its address with --learner http://host:7070, or see --help".into())
             })?;
             let (threads, environments) = (threads.map(usize::from), environments.map(usize::from));
-            run::run(&run::Options { learner, access, threads, environments, cache, dump_diverged })
+            run::run(&run::Options { learner, access, threads, environments, cache, dump_diverged, pulse })
                 .context("cannot act")
         }
     }

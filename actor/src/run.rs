@@ -18,6 +18,7 @@ use crate::acting::{ActingSizes, ForwardPass, OneByOne};
 use crate::dump::{Dumps, Watched};
 use crate::mailbox::Mailbox;
 use crate::policy::TorchPolicy;
+use crate::pulse::Pulse;
 use crate::seeds::EnvironmentSeeds;
 use crate::session::{self, Joined, Limits};
 use crate::worker::{FinishedUnroll, Pace, Progress, Worker};
@@ -47,6 +48,8 @@ pub struct Options {
     pub cache: Option<PathBuf>,
     /// Directory for episodes that diverged, if they are to be kept.
     pub dump_diverged: Option<PathBuf>,
+    /// File that is written while environments are stepped, if somebody looks at it.
+    pub pulse: Option<PathBuf>,
 }
 
 type TaskWorker = Worker<Watched, Box<dyn ForwardPass + Send>>;
@@ -70,6 +73,7 @@ pub fn run(options: &Options) -> Result<(), Error> {
 }
 
 fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
+    let pulse = options.pulse.as_deref().map(Pulse::new).transpose()?;
     let mailbox = Arc::new(Mailbox::default());
     let (stopping, stop) = watch::channel(false);
     let closing = Closing { mailbox: Arc::clone(&mailbox), stopping };
@@ -101,11 +105,15 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
     let progress = Arc::new(Progress::default());
     let session = runtime.spawn(joined.run(limits, unrolls, Arc::clone(&mailbox), stop));
     let reporter = runtime.spawn(report(Arc::clone(&progress)));
+    let pulse = pulse.map(|pulse| runtime.spawn(pulse.beat(Arc::clone(&progress))));
 
     let handles = start(workers, pace, &closing, sender, &progress)?;
     let settled = runtime.block_on(session);
     mailbox.close();
     reporter.abort();
+    if let Some(pulse) = pulse {
+        pulse.abort();
+    }
     for handle in handles {
         handle.join().map_err(|_| Error::WorkerPanicked)??;
     }

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
 use clap::Args;
+use rand::Rng as _;
 use rcgen::{
     BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, KeyUsagePurpose,
 };
@@ -31,6 +32,9 @@ pub struct Certs {
     /// Days for which the learner's and the actors' certificates hold, from now on.
     #[arg(long, default_value_t = 90, value_parser = clap::value_parser!(u16).range(1..=3650))]
     pub days: u16,
+    /// A token for both, too, in DIR/token, unless there is one already.
+    #[arg(long)]
+    pub token: bool,
 }
 
 /// Days for which an authority holds.
@@ -61,6 +65,10 @@ impl Certs {
             let certificate = params.signed_by(&key, &issuer)?;
             self.write(name, &certificate.pem(), &key)?;
         }
+        if self.token && !self.out.join("token").exists() {
+            let token: String = rand::rng().random_iter::<u8>().take(32).map(|byte| format!("{byte:02x}")).collect();
+            self.put("token", 0o600, &format!("{token}\n"))?;
+        }
         Ok(())
     }
 
@@ -90,21 +98,21 @@ impl Certs {
 
     fn write(&self, name: &str, certificate: &str, key: &KeyPair) -> Result<()> {
         // The key first: a learner that looks in between finds two that do not fit, and keeps what it has.
-        for (file, mode, text) in [
-            (format!("{name}-key.pem"), 0o600, key.serialize_pem()),
-            (format!("{name}.pem"), 0o644, certificate.into()),
-        ] {
-            let path = self.out.join(file);
-            let mut open = OpenOptions::new();
-            let file = open.create(true).write(true).truncate(true).mode(mode).open(&path);
-            let mut file = file.with_context(|| format!("cannot write {}", path.display()))?;
-            // A file that was there keeps its own mode.
-            file.set_permissions(fs::Permissions::from_mode(mode))?;
-            file.write_all(text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
-        }
+        self.put(&format!("{name}-key.pem"), 0o600, &key.serialize_pem())?;
+        self.put(&format!("{name}.pem"), 0o644, certificate)?;
         // Nobody has to read it.
         let _ = writeln!(std::io::stdout(), "{}", self.out.join(format!("{name}.pem")).display());
         Ok(())
+    }
+
+    fn put(&self, file: &str, mode: u32, text: &str) -> Result<()> {
+        let path = self.out.join(file);
+        let mut open = OpenOptions::new();
+        let file = open.create(true).write(true).truncate(true).mode(mode).open(&path);
+        let mut file = file.with_context(|| format!("cannot write {}", path.display()))?;
+        // A file that was there keeps its own mode.
+        file.set_permissions(fs::Permissions::from_mode(mode))?;
+        file.write_all(text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
     }
 }
 
@@ -114,7 +122,7 @@ mod tests {
     use crate::security::Tls;
 
     fn certs(out: &Path) -> Certs {
-        Certs { out: out.into(), names: vec!["localhost".into()], days: 1 }
+        Certs { out: out.into(), names: vec!["localhost".into()], days: 1, token: true }
     }
 
     #[test]
@@ -124,7 +132,7 @@ mod tests {
         let file = |name: &str| directory.path().join(name);
         Tls::new(&file("server.pem"), &file("server-key.pem"), Some(&file("ca.pem"))).unwrap();
         assert!(Tls::new(&file("server.pem"), &file("client-key.pem"), None).is_err(), "another's key");
-        for key in ["ca-key.pem", "server-key.pem", "client-key.pem"] {
+        for key in ["ca-key.pem", "server-key.pem", "client-key.pem", "token"] {
             assert_eq!(fs::metadata(file(key)).unwrap().permissions().mode() & 0o777, 0o600, "{key}");
         }
     }
@@ -134,9 +142,10 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let read = |name: &str| fs::read_to_string(directory.path().join(name)).unwrap();
         certs(directory.path()).run().unwrap();
-        let (authority, server) = (read("ca.pem"), read("server.pem"));
+        let (authority, server, token) = (read("ca.pem"), read("server.pem"), read("token"));
+        assert_eq!(token.trim().len(), 64);
         certs(directory.path()).run().unwrap();
-        assert_eq!(read("ca.pem"), authority);
+        assert_eq!((read("ca.pem"), read("token")), (authority, token));
         assert_ne!(read("server.pem"), server);
         fs::remove_file(directory.path().join("ca-key.pem")).unwrap();
         assert!(certs(directory.path()).run().unwrap_err().is::<Misuse>());

@@ -5,19 +5,26 @@
 //! synced, so that a crash leaves either the whole checkpoint or none. Two more, `initial` and `warm-started`, are kept
 //! for comparison. `best.json` says which one was evaluated best; it is kept, too, and the link `best` leads to it.
 
+#[cfg(test)]
+mod crash;
+mod steps;
+
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
+use steps::{Step, carry_out, hidden, put, replace};
+
 const MANIFEST: &str = "MANIFEST.json";
 const EPOCH: &str = "epoch";
 const BEST: &str = "best";
 const BEST_RECORD: &str = "best.json";
+/// Of a checkpoint that another one of the same name takes the place of.
+const FORMER: &str = "former-";
 /// The part that says which life of the learner made a checkpoint, and what it had published.
 pub(crate) const PROGRESS: &str = "progress.json";
 
@@ -57,6 +64,21 @@ pub enum Name {
     Updates(u64),
 }
 
+impl Name {
+    /// The name that is spelt like this, if it is one.
+    fn parse(text: &str) -> Option<Self> {
+        match text {
+            "initial" => Some(Self::Initial),
+            "warm-started" => Some(Self::WarmStarted),
+            _ => {
+                let digits = text.strip_prefix("checkpoint-")?;
+                let well_formed = digits.len() == 10 && digits.bytes().all(|byte| byte.is_ascii_digit());
+                well_formed.then(|| digits.parse().ok().map(Self::Updates)).flatten()
+            }
+        }
+    }
+}
+
 impl std::fmt::Display for Name {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
@@ -67,13 +89,13 @@ impl std::fmt::Display for Name {
     }
 }
 
-/// The parameters that an evaluation is about, as its report names them, and how good they are.
+/// The checkpoint that an evaluation is about, as its report names it, and how good it is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Evaluated {
     /// The life of the learner.
     pub epoch: u64,
-    /// The version.
-    pub version: u64,
+    /// Updates until then.
+    pub updates: u64,
     /// Mean over the episodes of return / the most they could have paid.
     pub normalised_reward: f64,
 }
@@ -137,8 +159,7 @@ impl Store {
         Ok(file)
     }
 
-    /// Begins a new life of the learner: an epoch larger than every earlier one, on disk before it is returned. What an
-    /// earlier life left half-done is put right.
+    /// Begins a new life of the learner: an epoch larger than every earlier one, on disk before it is returned.
     ///
     /// # Errors
     /// When the epoch file is unreadable or cannot be written.
@@ -152,37 +173,53 @@ impl Store {
             Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),
         };
         let epoch = last.checked_add(1).context("the learner epoch is exhausted")?;
-        let temporary = self.directory.join(".epoch");
-        write_synced(&temporary, epoch.to_string().as_bytes())?;
-        self.put(&temporary, &path)?;
+        carry_out(&replace(&path, epoch.to_string().into_bytes()))?;
         if let Some(best) = self.best() {
             self.lead_to(best.name())?;
         }
         Ok(epoch)
     }
 
-    /// Keeps the checkpoint that was evaluated, besides the newest few, if none was better. Of several of the same version
-    /// the newest is meant.
+    /// Clears away what is half-written, and brings back what had stepped aside for it.
+    fn put_right(&self) -> Result<()> {
+        carry_out(&self.repairs()?)
+    }
+
+    fn repairs(&self) -> Result<Vec<Step<'static>>> {
+        let mut repairs = Vec::new();
+        for path in entries(&self.directory)? {
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let Some(name) = name.strip_prefix('.') else { continue };
+            match name.strip_prefix(FORMER).and_then(Name::parse) {
+                Some(former) if !self.has(former) => repairs.extend(put(path, &self.path(former))),
+                Some(_) => repairs.push(Step::Remove(path)),
+                None if Name::parse(name).is_some() => repairs.push(Step::Remove(path)),
+                None => {}
+            }
+        }
+        if !repairs.is_empty() {
+            // What took a former one's name keeps it, before the former one goes.
+            repairs.insert(0, Step::SyncDirectory(self.directory.clone()));
+        }
+        Ok(repairs)
+    }
+
+    /// Keeps the checkpoint that was evaluated, besides the newest few, if none was better.
     ///
     /// # Errors
     /// When the disk refuses.
     pub fn judge(&self, evaluated: Evaluated) -> Result<Judgement> {
-        let Evaluated { epoch: learner_epoch, version, normalised_reward } = evaluated;
-        let of_version = |updates: &u64| {
-            let position = position(&self.path(Name::Updates(*updates)));
-            position.is_some_and(|found| (found.epoch, found.version) == (learner_epoch, version))
-        };
-        let Some(updates) = numbered(&self.directory)?.into_iter().map(|(updates, _)| updates).rev().find(of_version)
-        else {
+        let Evaluated { epoch: learner_epoch, updates, normalised_reward } = evaluated;
+        let position = position(&self.path(Name::Updates(updates)));
+        // An earlier life may have come as far, and left another checkpoint of this name.
+        let Some(Position { version, .. }) = position.filter(|found| found.epoch == learner_epoch) else {
             return Ok(Judgement::Gone);
         };
         if self.best().is_some_and(|best| best.normalised_reward >= normalised_reward) {
             return Ok(Judgement::NotBetter);
         }
         let best = Best { updates, learner_epoch, version, normalised_reward };
-        let temporary = self.directory.join(".best.json");
-        write_synced(&temporary, &serde_json::to_vec_pretty(&best)?)?;
-        self.put(&temporary, &self.directory.join(BEST_RECORD))?;
+        carry_out(&replace(&self.directory.join(BEST_RECORD), serde_json::to_vec_pretty(&best)?))?;
         self.lead_to(best.name())?;
         Ok(Judgement::Best(best.name()))
     }
@@ -214,20 +251,15 @@ impl Store {
 
     /// Has the link `best` lead to a checkpoint.
     fn lead_to(&self, name: Name) -> Result<()> {
-        let (link, temporary) = (self.directory.join(BEST), self.directory.join(".best"));
+        let link = self.directory.join(BEST);
         let target = name.to_string();
         if fs::read_link(&link).is_ok_and(|found| found == Path::new(&target)) {
             return Ok(());
         }
-        match fs::remove_file(&temporary) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                return Err(error).with_context(|| format!("cannot remove {}", temporary.display()));
-            }
-            _ => {}
-        }
-        std::os::unix::fs::symlink(&target, &temporary)
-            .with_context(|| format!("cannot link {}", temporary.display()))?;
-        self.put(&temporary, &link)
+        let temporary = hidden("", &link);
+        let made = [Step::Remove(temporary.clone()), Step::Link(temporary.clone(), target)];
+        carry_out(&made)?;
+        carry_out(&put(temporary, &link))
     }
 
     fn path(&self, name: Name) -> PathBuf {
@@ -237,37 +269,69 @@ impl Store {
     /// Writes a checkpoint whole, and forgets the oldest beyond the number kept.
     ///
     /// # Errors
-    /// When the disk refuses; earlier checkpoints stay as they were.
+    /// When the disk refuses; earlier checkpoints stay as they were, and what was written of this one is taken away.
     pub fn write(&self, name: Name, snapshot: &Snapshot) -> Result<PathBuf> {
         let path = self.path(name);
-        let temporary = self.directory.join(format!(".{name}"));
-        remove_if_there(&temporary)?;
-        fs::create_dir(&temporary).with_context(|| format!("cannot make {}", temporary.display()))?;
-        let mut manifest = BTreeMap::new();
-        for (part, bytes) in &snapshot.parts {
-            write_synced(&temporary.join(part), bytes)?;
-            manifest.insert(part, hex(&Sha256::digest(bytes)));
+        if let Err(error) = carry_out(&self.steps(name, snapshot)?) {
+            // On a full disk the next one may need the room.
+            if let Err(left) = self.put_right() {
+                tracing::warn!("{left:#}");
+            }
+            return Err(error);
         }
-        write_synced(&temporary.join(MANIFEST), &serde_json::to_vec_pretty(&manifest)?)?;
-        sync_directory(&temporary)?;
-        // One of the same name steps aside first: at no moment is neither of them there.
-        let former = self.directory.join(format!(".former-{name}"));
-        remove_if_there(&former)?;
-        if path.exists() {
-            self.put(&path, &former)?;
-        }
-        self.put(&temporary, &path)?;
-        remove_if_there(&former)?;
-        self.forget_oldest(&path)?;
         Ok(path)
     }
 
-    /// The newest checkpoint whose every part verifies. Damaged ones are put aside as `damaged-…`, with a warning.
+    /// How a checkpoint comes to be: the whole of it under another name, then its own.
+    fn steps<'a>(&self, name: Name, snapshot: &'a Snapshot) -> Result<Vec<Step<'a>>> {
+        let path = self.path(name);
+        let temporary = hidden("", &path);
+        let mut steps = vec![Step::Remove(temporary.clone()), Step::MakeDirectory(temporary.clone())];
+        let mut part = |name: &str, bytes: std::borrow::Cow<'a, [u8]>| {
+            let path = temporary.join(name);
+            steps.extend([Step::Write(path.clone(), bytes), Step::SyncFile(path)]);
+        };
+        let mut manifest = BTreeMap::new();
+        for (name, bytes) in &snapshot.parts {
+            manifest.insert(name, hex(&Sha256::digest(bytes)));
+            part(name, bytes.into());
+        }
+        part(MANIFEST, serde_json::to_vec_pretty(&manifest)?.into());
+        steps.push(Step::SyncDirectory(temporary.clone()));
+        // One of the same name steps aside first: at no moment is neither of them there.
+        let former = hidden(FORMER, &path);
+        steps.push(Step::Remove(former.clone()));
+        if path.exists() {
+            steps.push(Step::Rename(path.clone(), former.clone()));
+        }
+        steps.extend(put(temporary, &path));
+        steps.push(Step::Remove(former));
+        steps.extend(self.oldest_beside(name)?.into_iter().map(Step::Remove));
+        Ok(steps)
+    }
+
+    /// Those that are beyond the number kept once there is another, and are not the best.
+    fn oldest_beside(&self, written: Name) -> Result<Vec<PathBuf>> {
+        let mut numbers: Vec<u64> = numbered(&self.directory)?.into_iter().map(|(updates, _)| updates).collect();
+        if let Name::Updates(updates) = written {
+            numbers.push(updates);
+            numbers.sort_unstable();
+            numbers.dedup();
+        }
+        numbers.truncate(numbers.len().saturating_sub(self.kept));
+        let best = self.best().map(Best::name);
+        let forgotten = numbers.into_iter().map(Name::Updates).filter(|name| *name != written && Some(*name) != best);
+        Ok(forgotten.map(|name| self.path(name)).collect())
+    }
+
+    /// The newest checkpoint whose every part verifies. Damaged ones are put aside as `damaged-…`, with a warning, and
+    /// what an earlier life left half-done is put right.
     ///
     /// # Errors
     /// When the directory cannot be listed, or when there are checkpoints and none of them verifies: beginning anew
     /// beside them would be a loss nobody asked for.
     pub fn newest(&self) -> Result<Option<(PathBuf, Snapshot)>> {
+        self.put_right()?;
         let numbered = numbered(&self.directory)?;
         for (_, path) in numbered.iter().rev() {
             match read(path) {
@@ -285,34 +349,17 @@ impl Store {
         tracing::warn!(checkpoint = %path.display(), "a damaged checkpoint is put aside: {error:#}");
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let aside = self.directory.join(format!("damaged-{name}"));
-        remove_if_there(&aside)?;
-        self.put(path, &aside)
+        Step::Remove(aside.clone()).carry_out()?;
+        carry_out(&put(path.to_path_buf(), &aside))
     }
 
     /// Whether a checkpoint of this name is there.
     pub fn has(&self, name: Name) -> bool {
         self.path(name).is_dir()
     }
-
-    /// Keeps the newest few, the best, and in any case the one just written.
-    fn forget_oldest(&self, written: &Path) -> Result<()> {
-        let numbered = numbered(&self.directory)?;
-        let oldest = &numbered[..numbered.len().saturating_sub(self.kept)];
-        let best = self.best().map(|best| best.updates);
-        oldest
-            .iter()
-            .filter(|(updates, path)| path != written && Some(*updates) != best)
-            .try_for_each(|(_, path)| remove_if_there(path))
-    }
-
-    #[allow(clippy::disallowed_methods, reason = "the one durable rename: contents synced before, directory after")]
-    fn put(&self, temporary: &Path, path: &Path) -> Result<()> {
-        fs::rename(temporary, path).with_context(|| format!("cannot put {} in place", path.display()))?;
-        sync_directory(&self.directory)
-    }
 }
 
-/// Where a run stood when a checkpoint was made, as far as an evaluation names it.
+/// Where a run stood when a checkpoint was made.
 #[derive(Deserialize)]
 struct Position {
     epoch: u64,
@@ -323,16 +370,17 @@ fn position(checkpoint: &Path) -> Option<Position> {
     serde_json::from_slice(&fs::read(checkpoint.join(PROGRESS)).ok()?).ok()
 }
 
+fn entries(directory: &Path) -> Result<Vec<PathBuf>> {
+    let listed = || fs::read_dir(directory)?.map(|entry| entry.map(|entry| entry.path())).collect();
+    std::io::Result::with_context(listed(), || format!("cannot list {}", directory.display()))
+}
+
 /// Numbered checkpoints and their numbers, oldest first.
 fn numbered(directory: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let mut found = Vec::new();
-    for entry in fs::read_dir(directory).with_context(|| format!("cannot list {}", directory.display()))? {
-        let path = entry?.path();
+    for path in entries(directory)? {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let digits = name.strip_prefix("checkpoint-").unwrap_or_default();
-        let well_formed = digits.len() == 10 && digits.bytes().all(|byte| byte.is_ascii_digit());
-        if let Ok(updates) = digits.parse()
-            && well_formed
+        if let Some(Name::Updates(updates)) = Name::parse(&name)
             && path.is_dir()
         {
             found.push((updates, path));
@@ -385,24 +433,6 @@ pub fn read(path: &Path) -> Result<Snapshot> {
         snapshot.parts.insert(part, bytes);
     }
     Ok(snapshot)
-}
-
-fn write_synced(path: &Path, bytes: &[u8]) -> Result<()> {
-    let mut file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
-    file.write_all(bytes).and_then(|()| file.sync_all()).with_context(|| format!("cannot write {}", path.display()))
-}
-
-fn sync_directory(path: &Path) -> Result<()> {
-    File::open(path).and_then(|file| file.sync_all()).with_context(|| format!("cannot sync {}", path.display()))
-}
-
-fn remove_if_there(path: &Path) -> Result<()> {
-    match fs::remove_dir_all(path) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            Err(error).with_context(|| format!("cannot remove {}", path.display()))
-        }
-        _ => Ok(()),
-    }
 }
 
 fn hex(bytes: &[u8]) -> String {

@@ -3,14 +3,18 @@
 //! # Layout
 //! - `host` is a process with the service in it, or with the floor that it is compared with; a stand-in takes the place of
 //!   the device.
-//! - `crowd` is a process with many actors in it, each with a connection and an identity of its own, that send unrolls
-//!   of the real layout and read parameters; `reader` is one that does the least a reader can do.
-//! - `process` starts both and asks them how they are, `usage` is what a process says of itself.
+//! - `crowd` is a process with many actors in it, each with a connection and an identity (`identity`) of its own, that
+//!   send unrolls of the real layout and read parameters; `reader` is one that does the least a reader can do.
+//! - `process` starts both and asks them how they are, `usage` is what a process says of itself, `certificates` are for
+//!   figures of TLS.
 //!
-//! A figure is one JSON line: value, floor and ratio, medians of rounds in which service and floor take turns.
+//! A figure is one JSON line: value, floor and ratio, medians of rounds in which service and floor take turns; of memory,
+//! value, bound and the share of it that is used.
 
+mod certificates;
 mod crowd;
 mod host;
+mod identity;
 mod process;
 mod reader;
 mod swarm;
@@ -25,6 +29,7 @@ use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::{UnrollLayout, UnrollShape};
 use serde_json::json;
 
+use certificates::Certificates;
 use process::Process;
 use usage::Usage;
 
@@ -45,7 +50,8 @@ pub struct Load {
 
 #[derive(Debug, Subcommand)]
 enum Figure {
-    /// Unrolls up, validated and laid into batches, against a bare tonic stream that drops what it reads.
+    /// Unrolls up, validated and laid into batches, against a bare tonic stream that drops what it reads; and by TLS,
+    /// against the same without.
     Ingest {
         /// Connections; a figure for each.
         #[arg(long, value_name = "N", num_args = 1.., default_values_t = [32, 1000])]
@@ -158,22 +164,28 @@ fn show(figure: &str, rounds: &[Round], floors: &[Round], rest: serde_json::Valu
 
 fn ingest(connections: usize, seconds: f64, rounds: usize) -> Result<()> {
     let bytes = experiment()?.2.size();
-    let mut found = [Vec::new(), Vec::new()];
+    let certificates = Certificates::new()?;
+    let tls = certificates.option();
+    let kinds = [("learner", "grpc", &[][..]), ("tonic", "bare-grpc", &[]), ("learner", "grpc", &tls)];
+    let mut found = [Vec::new(), Vec::new(), Vec::new()];
     for _ in 0..rounds {
-        for (kind, found) in [("learner", "grpc"), ("tonic", "bare-grpc")].into_iter().zip(&mut found) {
-            found.push(ingest_round(kind, connections, seconds)?);
+        for (kind, found) in kinds.iter().zip(&mut found) {
+            found.push(ingest_round(*kind, connections, seconds)?);
         }
     }
-    let [ours, floors] = &found;
-    show(&format!("ingest.{connections}"), ours, floors, json!({ "connections": connections, "unroll_bytes": bytes }));
+    let [ours, floors, by_tls] = &found;
+    let rest = json!({ "connections": connections, "unroll_bytes": bytes });
+    show(&format!("ingest.{connections}"), ours, floors, rest.clone());
+    show(&format!("ingest.{connections}.tls"), by_tls, ours, rest);
     Ok(())
 }
 
-fn ingest_round((kind, crowd): (&str, &str), connections: usize, seconds: f64) -> Result<Round> {
-    let mut host = Process::host(&["--kind", kind])?;
+fn ingest_round((kind, crowd, tls): (&str, &str, &[&str]), connections: usize, seconds: f64) -> Result<Round> {
+    let mut host = Process::host(&[&["--kind", kind], tls].concat())?;
     let before = host.usage()?;
     let connections = connections.to_string();
-    let mut crowd = Process::crowd(&host, &["--kind", crowd, "--actors", &connections, "--window", "4"])?;
+    let arguments = [&["--kind", crowd, "--actors", &connections, "--window", "4"], tls].concat();
+    let mut crowd = Process::crowd(&host, &arguments)?;
     crowd.wait_for("acked", 1000.0, PATIENCE)?;
     let (start, began) = (Instant::now(), (host.usage()?, host.number("bytes")?));
     sleep(Duration::from_secs_f64(seconds));
@@ -183,32 +195,38 @@ fn ingest_round((kind, crowd): (&str, &str), connections: usize, seconds: f64) -
     Ok(Round { growth: (ended.0.peak - before.resident) / MEGABYTE, ..round })
 }
 
-/// The readers of service and floor drop what they read; those of a third round decode it, as actors do.
+/// The readers of service and floor drop what they read; those of a third kind decode it, as actors do, and those of a
+/// fourth decrypt it as well.
 fn publish(connections: usize, parameters: u64, rounds: usize) -> Result<()> {
-    let mut found = [Vec::new(), Vec::new(), Vec::new()];
+    let certificates = Certificates::new()?;
+    let tls = certificates.option();
+    let kinds = [
+        ("learner", "readers", &[][..]),
+        ("sockets", "sockets", &[]),
+        ("learner", "grpc", &[]),
+        ("learner", "grpc", &tls),
+    ];
+    let mut found = [Vec::new(), Vec::new(), Vec::new(), Vec::new()];
     for _ in 0..rounds {
-        let kinds = [("learner", "readers"), ("sockets", "sockets"), ("learner", "grpc")];
-        for (kind, found) in kinds.into_iter().zip(&mut found) {
-            found.push(publish_round(kind, connections, parameters)?);
+        for (kind, found) in kinds.iter().zip(&mut found) {
+            found.push(publish_round(*kind, connections, parameters)?);
         }
     }
-    let [ours, floors, decoding] = &found;
-    let decoding = median(decoding.iter().map(|round| round.megabytes_per_second).collect());
-    let rest = json!({
-        "connections": connections, "parameters_bytes": parameters, "when_actors_decode_on_this_machine": decoding,
-    });
-    show(&format!("publish.{connections}"), ours, floors, rest);
+    let [ours, floors, decoding, by_tls] = &found;
+    let rest = json!({ "connections": connections, "parameters_bytes": parameters });
+    show(&format!("publish.{connections}"), ours, floors, rest.clone());
+    show(&format!("publish.{connections}.decoded"), decoding, floors, rest.clone());
+    show(&format!("publish.{connections}.decoded.tls"), by_tls, decoding, rest);
     Ok(())
 }
 
 /// Three versions, each to everybody before the next.
-fn publish_round((kind, crowd): (&str, &str), connections: usize, parameters: u64) -> Result<Round> {
+fn publish_round((kind, crowd, tls): (&str, &str, &[&str]), connections: usize, parameters: u64) -> Result<Round> {
     const VERSIONS: usize = 3;
-    let mut host = Process::host(&["--kind", kind, "--parameters", &parameters.to_string()])?;
-    let everybody = connections.to_string();
-    let size = parameters.to_string();
-    let mut crowd =
-        Process::crowd(&host, &["--kind", crowd, "--actors", &everybody, "--watch", "--parameters", &size])?;
+    let (everybody, size) = (connections.to_string(), parameters.to_string());
+    let mut host = Process::host(&[&["--kind", kind, "--parameters", &size], tls].concat())?;
+    let arguments = [&["--kind", crowd, "--actors", &everybody, "--watch", "--parameters", &size], tls].concat();
+    let mut crowd = Process::crowd(&host, &arguments)?;
     crowd.wait_for("connected", connections as f64, PATIENCE)?;
     // One to warm up.
     host.ask("publish")?;
@@ -241,7 +259,7 @@ fn lag(connections: usize, parameters: u64, target_period: usize, every: f64) ->
         "{}",
         json!({
             "figure": format!("publish.{connections}.period_{target_period}"), "value": round.megabytes_per_second,
-            "unit": "MB/s", "floor": 0.0, "ratio": 0.0, "cpu_s_per_gb": round.cpu_seconds_per_gigabyte,
+            "unit": "MB/s", "cpu_s_per_gb": round.cpu_seconds_per_gigabyte,
             "peak_growth_mb": (host.usage()?.peak - before.resident) / MEGABYTE,
             "lag_versions": stats["lag_versions"], "lag_seconds": stats["lag_seconds"],
             "longest_without_a_version_s": stats["longest_without_a_version"],
@@ -277,7 +295,7 @@ fn stalled(connections: usize, parameters: u64) -> Result<()> {
         "{}",
         json!({
             "figure": "publish.stalled", "value": (after.peak - before.resident) / MEGABYTE, "unit": "MB",
-            "floor": 60.0, "ratio": (after.peak - before.resident) / MEGABYTE / 60.0, "stalled": stalled,
+            "bound": 60.0, "of_bound": (after.peak - before.resident) / MEGABYTE / 60.0, "stalled": stalled,
             "resident_growth_mb": (after.resident - before.resident) / MEGABYTE,
             "a_healthy_reader_waits_s": median(times.split_off(VERSIONS)),
         })

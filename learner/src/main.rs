@@ -8,6 +8,7 @@ use clap::Parser as _;
 use comic_learner::bench::Subject;
 use comic_learner::options::{Command, LogFormat, Misuse, Options};
 use tracing_subscriber::EnvFilter;
+use tracing_subscriber::fmt::format::FmtSpan;
 
 fn main() -> ExitCode {
     let options = Options::parse();
@@ -15,6 +16,7 @@ fn main() -> ExitCode {
     let log = tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
+        .with_span_events(FmtSpan::CLOSE)
         .with_env_filter(filter);
     match options.log_format {
         LogFormat::Text => log.init(),

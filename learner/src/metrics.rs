@@ -152,7 +152,8 @@ impl Metrics {
     fn append_evaluation(&self, evaluation: &Evaluation) -> Result<()> {
         let path = self.run.join("evaluations.jsonl");
         let report: Value = serde_json::from_str(&evaluation.json).unwrap_or(Value::Null);
-        let line = json!({ "learner_epoch": evaluation.epoch, "version": evaluation.version, "evaluation": report });
+        let line = json!({ "learner_epoch": evaluation.epoch, "version": evaluation.version,
+            "updates": evaluation.updates, "evaluation": report });
         let mut file = append(&path)?;
         writeln!(file, "{line}").with_context(|| format!("cannot write {}", path.display()))
     }
@@ -291,6 +292,6 @@ mod tests {
             let line = metrics.write(position, Value::Null, Map::new());
             assert!(line.contains("\"updates\":3"), "{line}");
         }
-        metrics.keep_evaluation(&Evaluation { epoch: 5, version: 4, json: "{}".into() });
+        metrics.keep_evaluation(&Evaluation { epoch: 5, version: 4, updates: 3, json: "{}".into() });
     }
 }

@@ -31,6 +31,8 @@ use crate::trainer::{Ending, Setup, Trainer};
 const OTHER_FILES: u64 = 256;
 /// How long actors are given to hear that the run is over.
 const FAREWELL: Duration = Duration::from_millis(1500);
+/// The same where it was over already: actors are on their way, and wait for up to five seconds between two attempts.
+const LATE_FAREWELL: Duration = Duration::from_secs(10);
 
 /// Serves and trains until the budget is used up or a signal comes. Prints one JSON line to stdout once it listens.
 ///
@@ -70,6 +72,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     let _lock = Store::open(&options.run, experiment.learner.checkpoints_kept)?.lock()?;
     let (setup, shared) = prepare(options, experiment, security)?;
     let (batcher, publisher, epoch) = (setup.batcher.clone(), setup.publisher.clone(), setup.epoch);
+    let began = batcher.books().trained;
     let mut training = start_trainer(setup)?;
     let (stop_serving, stopped) = oneshot::channel::<()>();
     let address = listener.local_addr()?;
@@ -107,7 +110,8 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
         && let Some(newest) = publisher.newest()
     {
         publisher.publish(newest.version, Behaviour::Leave, &Bytes::new());
-        tokio::time::sleep(FAREWELL).await;
+        let trained = batcher.books().trained > began;
+        tokio::time::sleep(if trained { FAREWELL } else { LATE_FAREWELL }).await;
     }
     batcher.close();
     let _ = stop_serving.send(());

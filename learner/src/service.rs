@@ -106,6 +106,8 @@ pub struct Evaluation {
     pub epoch: u64,
     /// Their version.
     pub version: u64,
+    /// Updates until the checkpoint they lie in.
+    pub updates: u64,
     /// As `comic-actor evaluate --json` prints it.
     pub json: String,
 }
@@ -115,7 +117,7 @@ impl Evaluation {
     pub(crate) fn evaluated(&self) -> Option<Evaluated> {
         let report: serde_json::Value = serde_json::from_str(&self.json).ok()?;
         let normalised_reward = report["overall"]["normalised_reward"].as_f64()?;
-        Some(Evaluated { epoch: self.epoch, version: self.version, normalised_reward })
+        Some(Evaluated { epoch: self.epoch, updates: self.updates, normalised_reward })
     }
 }
 

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_networks::to_safetensors;
 use comic_proto::Field;
-use comic_proto::v1::{Behaviour, EpisodeEnd};
+use comic_proto::v1::{Behaviour, EpisodeEnd, UnrollHeader};
 use comic_replay::{Batch, Batcher, Next, Phase, Reason};
 use rand::SeedableRng as _;
 use rand::seq::SliceRandom as _;
@@ -195,7 +195,8 @@ impl Trainer {
     /// One batch: gradient steps on it, its books, and new parameters when they are due.
     fn learn(&mut self, batch: Batch) -> Result<()> {
         let began = Instant::now();
-        let tensors = self.tensors(&batch)?;
+        let _update = tracing::debug_span!("update", update = self.progress.updates + 1).entered();
+        let tensors = tracing::debug_span!("to_device").in_scope(|| self.tensors(&batch))?;
         let unseen = self.normalises() && self.statistics.lacks(&tasks_of_unrolls(&batch, &self.spec));
         if unseen || self.normalises_still() {
             self.absorb(&batch);
@@ -212,7 +213,7 @@ impl Trainer {
         self.schedule_learning_rate();
         let mut losses = Vec::new();
         for minibatch in self.minibatches(&tensors) {
-            losses.push(self.learner.step(&minibatch)?);
+            losses.push(tracing::debug_span!("gradient_step").in_scope(|| self.learner.step(&minibatch))?);
         }
         let turned_back = match Losses::mean(&losses) {
             Some(losses) => self.report(&losses.to_metrics())?,
@@ -312,6 +313,9 @@ impl Trainer {
         self.progress.environment_steps += steps;
         self.shared.telemetry.environment_steps.inc_by(steps);
         let episodes = batch.headers().iter().flat_map(|header| &header.episodes);
+        for UnrollHeader { actor, incarnation, sequence, .. } in batch.headers() {
+            tracing::trace!(actor, incarnation = format_args!("{incarnation:016x}"), sequence, "trained on");
+        }
         let diverged = episodes.filter(|episode| episode.end() == EpisodeEnd::Diverged).count();
         self.shared.telemetry.episodes_diverged.inc_by(diverged as u64);
         self.batcher.trained(batch);
@@ -325,6 +329,7 @@ impl Trainer {
             self.keep_step(behaviour);
             return Ok(());
         }
+        let _publish = tracing::debug_span!("publish", version = self.progress.version + 1).entered();
         self.target = Bytes::from(to_safetensors(self.learner.policy_store())?);
         self.progress.version += 1;
         self.announce(behaviour);

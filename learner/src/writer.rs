@@ -99,14 +99,14 @@ fn obey(store: &Store, queue: &Receiver<Order>, pending: &AtomicUsize, telemetry
 }
 
 fn judge(store: &Store, evaluated: Evaluated) {
-    let Evaluated { epoch, version, normalised_reward } = evaluated;
+    let Evaluated { epoch, updates, normalised_reward } = evaluated;
     match store.judge(evaluated) {
         Ok(Judgement::Best(name)) => {
             tracing::info!(checkpoint = %name, normalised_reward, "the best checkpoint so far")
         }
         Ok(Judgement::NotBetter) => {}
         Ok(Judgement::Gone) => {
-            tracing::warn!(epoch, version, normalised_reward, "the checkpoint that was evaluated is not kept any more");
+            tracing::warn!(epoch, updates, normalised_reward, "the checkpoint that was evaluated is not kept any more");
         }
         Err(error) => tracing::error!(normalised_reward, "the best checkpoint is not noted: {error:#}"),
     }

@@ -242,7 +242,7 @@ fn the_checkpoint_of_the_best_evaluation_outlives_the_newest_few() {
     let life = |updates: u64, report: &str| {
         let experiment = experiment("tracking-mlp", updates);
         // One version in the first life, which begins with epoch 1.
-        let evaluation = Evaluation { epoch: 1, version: 2, json: report.into() };
+        let evaluation = Evaluation { epoch: 1, version: 2, updates: 1, json: report.into() };
         let unrolls = (updates + 1) * BATCH;
         live_evaluated(&experiment, run.path(), unrolls, |_, _| {}, &[evaluation]).ended.unwrap();
     };

@@ -1,13 +1,17 @@
-//! A peer that is there and does not answer: noticed within half a minute, on both sides, and welcome again afterwards.
+//! A peer that is there and does not answer for a minute: noticed within half of it, on both sides, and welcome again
+//! afterwards.
 
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
 use comic_tests::steps::{LIMIT, leaves, the_books_balance_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
+use tokio::time::{Instant, sleep_until};
 
 /// Thirty seconds are promised; the rest is for a busy machine.
 const NOTICED: Duration = Duration::from_secs(60);
+/// How long a peer is stopped.
+const STOPPED: Duration = Duration::from_secs(60);
 
 #[tokio::test]
 async fn a_stopped_actor_is_given_up_and_comes_back() -> Result<()> {
@@ -19,10 +23,12 @@ async fn a_stopped_actor_is_given_up_and_comes_back() -> Result<()> {
     other.until_log_holds("acting", LIMIT).await?;
     trains_on(&mut system, "two actors' unrolls are trained on").await?;
 
+    let until = Instant::now() + STOPPED;
     stopped.pause()?;
     let lost = |status: &comic_proto::v1::Status| status.actors.is_some_and(|actors| actors.lost == 1);
     system.until("the learner gives the stopped actor up", NOTICED, |status| lost(status).then_some(())).await?;
     trains_on(&mut system, "the other's unrolls are trained on meanwhile").await?;
+    sleep_until(until).await;
     stopped.resume()?;
 
     stopped.until_log_holds("reconnected to the learner", LIMIT).await?;
@@ -41,8 +47,10 @@ async fn a_stopped_learner_is_noticed_and_served_again() -> Result<()> {
     trains_on(&mut system, "the actor's unrolls are trained on").await?;
 
     let learner = system.learner.as_ref().context("no learner")?;
+    let until = Instant::now() + STOPPED;
     learner.pause()?;
     actor.until_log_holds("no connection to the learner", NOTICED).await?;
+    sleep_until(until).await;
     learner.resume()?;
 
     actor.until_log_holds("reconnected to the learner", LIMIT).await?;

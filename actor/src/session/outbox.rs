@@ -77,6 +77,7 @@ impl Outbox {
 
     /// Gives the unroll its sequence number.
     pub(super) fn push(&mut self, unroll: FinishedUnroll) {
+        tracing::debug!(sequence = self.next_sequence, environment = unroll.environment, "made");
         self.waiting.push_back((self.next_sequence, unroll));
         self.next_sequence += 1;
     }
@@ -96,6 +97,13 @@ impl Outbox {
             episodes: unroll.episodes.clone(),
             environment: unroll.environment,
         };
+        tracing::debug!(
+            actor,
+            incarnation = format_args!("{incarnation:016x}"),
+            sequence,
+            version = unroll.version,
+            "sent"
+        );
         Some(UnrollMessage { header: Some(header), payload: unroll.payload.clone() })
     }
 
@@ -109,6 +117,7 @@ impl Outbox {
             tracing::warn!(sequence = ack.sequence, "an acknowledgement of what was not sent");
             return;
         }
+        tracing::debug!(sequence = ack.sequence, verdict = ?ack.verdict(), "acknowledged");
         self.waiting.remove(place);
         self.sent -= 1;
         match Verdict::try_from(ack.verdict) {

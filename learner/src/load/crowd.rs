@@ -1,5 +1,6 @@
 //! Many actors in one process.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Mutex, OnceLock, PoisonError};
@@ -10,7 +11,7 @@ use bytes::Bytes;
 use clap::{Args, ValueEnum};
 use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::v1::learner_client::LearnerClient;
-use comic_proto::v1::{JoinReply, JoinRequest, ParametersChunk, UnrollHeader, UnrollMessage, Verdict, WatchRequest};
+use comic_proto::v1::{JoinReply, JoinRequest, ParametersChunk, Verdict, WatchRequest};
 use comic_proto::{Access, Field, PROTOCOL_VERSION, UnrollBuffer, UnrollLayout, UnrollShape};
 use rand::rngs::StdRng;
 use rand::{Rng as _, SeedableRng as _};
@@ -22,6 +23,7 @@ use tokio::time::{sleep, sleep_until};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status};
 
+use super::identity::Identity;
 use super::process::obey;
 use super::reader;
 
@@ -53,6 +55,9 @@ pub(super) struct Options {
     /// Mean seconds of an actor's life, and between its stalls.
     #[arg(long, value_parser = super::positive)]
     churn: Option<f64>,
+    /// Reach the learner by TLS, with the authority that `comic-learner certs` made there.
+    #[arg(long)]
+    tls: Option<PathBuf>,
     /// Bytes of a version, where only sockets are read.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     parameters: u64,
@@ -219,18 +224,20 @@ impl Crowd {
 
     async fn actor(self: Arc<Self>, index: usize) {
         let mut rng = StdRng::seed_from_u64(index as u64);
-        let mut number = None;
+        let mut identity = Identity::new(None);
         loop {
             let lived = match self.options.kind {
                 Kind::Sockets => self.read_socket().await,
                 Kind::Readers => self.read_frames().await,
-                Kind::Grpc | Kind::BareGrpc => self.live(index, &mut number, &mut rng).await,
+                Kind::Grpc | Kind::BareGrpc => self.live(index, &mut identity, &mut rng).await,
             };
             self.wait_from(index, [NEVER; 2]);
-            if let Err(error) = lived
-                && self.failures.fetch_add(1, Relaxed) < 10
-            {
-                eprintln!("actor {index} of the crowd: {error:#}");
+            match lived {
+                Ok(()) => identity = Identity::new(identity.actor),
+                Err(error) if self.failures.fetch_add(1, Relaxed) < 10 => {
+                    eprintln!("actor {index} of the crowd: {error:#}");
+                }
+                Err(_) => {}
             }
             sleep(PAUSE.mul_f64(rng.random_range(0.5..2.0))).await;
         }
@@ -262,11 +269,13 @@ impl Crowd {
     }
 
     /// One connection, up to the end of this life.
-    async fn live(&self, index: usize, number: &mut Option<u64>, rng: &mut StdRng) -> Result<()> {
+    async fn live(&self, index: usize, identity: &mut Identity, rng: &mut StdRng) -> Result<()> {
         let Options { window, watch, stall_within, churn, kind, .. } = self.options;
-        let incarnation = rand::random();
-        let endpoint = Access::default()
-            .endpoint(&format!("http://{}", self.options.host))?
+        let Identity { actor, incarnation, .. } = *identity;
+        let ca = self.options.tls.as_ref().map(|directory| directory.join("ca.pem"));
+        let scheme = if ca.is_some() { "https" } else { "http" };
+        let endpoint = Access { ca, ..Access::default() }
+            .endpoint(&format!("{scheme}://{}", self.options.host))?
             .tcp_nodelay(true)
             .http2_keep_alive_interval(Duration::from_secs(15))
             .keep_alive_timeout(Duration::from_secs(10))
@@ -278,14 +287,13 @@ impl Crowd {
         let mut client = LearnerClient::new(endpoint.connect().await?);
         let reply = match kind {
             Kind::Grpc => {
-                let request =
-                    JoinRequest { incarnation, actor: *number, protocol: PROTOCOL_VERSION, ..JoinRequest::default() };
+                let request = JoinRequest { incarnation, actor, protocol: PROTOCOL_VERSION, ..JoinRequest::default() };
                 client.join(request).await.context("join")?.into_inner()
             }
             _ => JoinReply::default(),
         };
         let unroll = self.unroll(&reply)?;
-        *number = Some(reply.actor);
+        identity.actor = Some(reply.actor);
         let (up, outbound) = mpsc::channel(window.max(1));
         let mut acks = client.send_unrolls(ReceiverStream::new(outbound)).await.context("unrolls")?.into_inner();
         let mut parameters = match watch {
@@ -303,10 +311,10 @@ impl Crowd {
             tokio::time::Instant::now() + seconds.map_or(FOREVER, Duration::from_secs_f64)
         };
         let (death, mut stall) = (after(rng), after(rng));
-        let mut unrolls = Unrolls { reply, incarnation, sequence: 0, unroll };
+        identity.send_again(&up, &reply, &unroll.0)?;
         // With nothing to watch, an actor acts with what the learner says is the newest.
         if !watch {
-            unrolls.send(&up, window, 0)?;
+            identity.fill(&up, &reply, unroll, window, 0)?;
         }
         let mut acting = None;
         let since = self.now();
@@ -315,15 +323,20 @@ impl Crowd {
             tokio::select! {
                 ack = acks.message(), if window > 0 => {
                     let ack = ack.context("acknowledgements")?.context("no more acknowledgements")?;
-                    self.waited(index, 0);
                     self.acked.fetch_add(1, Relaxed);
+                    identity.settle(&ack);
                     match ack.verdict() {
-                        Verdict::Taken => &self.taken,
+                        // Of a duplicate it was the acknowledgement that was lost.
+                        Verdict::Taken | Verdict::Duplicate => &self.taken,
                         Verdict::Stale | Verdict::Superseded => &self.stale,
                         _ => anyhow::bail!("refused: {}", ack.detail),
                     }
                     .fetch_add(1, Relaxed);
-                    unrolls.send(&up, 1, acting.unwrap_or(ack.version))?;
+                    // What was sent again is answered before anything is acted with.
+                    if acting.is_some() || !watch {
+                        self.waited(index, 0);
+                        identity.fill(&up, &reply, unroll, window, acting.unwrap_or(ack.version))?;
+                    }
                 }
                 piece = next_piece(&mut parameters), if watch => {
                     let piece = piece.context("parameters")?;
@@ -331,7 +344,7 @@ impl Crowd {
                         self.waited(index, 1);
                         if acting.replace(version).is_none() && window > 0 {
                             self.wait_from(index, [self.now(); 2]);
-                            unrolls.send(&up, window, version)?;
+                            identity.fill(&up, &reply, unroll, window, version)?;
                         }
                     }
                     if stall_within.is_some_and(|versions| piece.version > index as u64 % versions) {
@@ -383,36 +396,6 @@ async fn next_piece(stream: &mut Option<tonic::Streaming<ParametersChunk>>) -> R
     match stream {
         Some(stream) => stream.message().await?.ok_or_else(|| Status::new(Code::Unavailable, "no more parameters")),
         None => std::future::pending().await,
-    }
-}
-
-/// The unrolls of one life.
-struct Unrolls<'a> {
-    reply: JoinReply,
-    incarnation: u64,
-    sequence: u64,
-    unroll: &'a (Bytes, Vec<u8>),
-}
-
-impl Unrolls<'_> {
-    fn send(&mut self, up: &mpsc::Sender<UnrollMessage>, unrolls: usize, version: u64) -> Result<()> {
-        let (payload, layout_hash) = self.unroll;
-        for _ in 0..unrolls {
-            let header = UnrollHeader {
-                actor: self.reply.actor,
-                incarnation: self.incarnation,
-                sequence: self.sequence,
-                learner_epoch: self.reply.learner_epoch,
-                version,
-                layout_hash: layout_hash.clone(),
-                ..UnrollHeader::default()
-            };
-            self.sequence += 1;
-            // As many as are acknowledged: there is room, or the connection is lost.
-            up.try_send(UnrollMessage { header: Some(header), payload: payload.clone() })
-                .context("the stream of unrolls is lost")?;
-        }
-        Ok(())
     }
 }
 

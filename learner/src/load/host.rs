@@ -1,6 +1,7 @@
 //! The service with a stand-in for the device, and the two floors.
 
 use std::net::Ipv4Addr;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::thread;
@@ -24,7 +25,7 @@ use super::process::obey;
 use crate::publish::Publisher;
 use crate::quarantine::QuarantineOptions;
 use crate::run::service_runtime;
-use crate::security::{Limits, Security};
+use crate::security::{Limits, Security, Tls};
 use crate::service::{Setup, Shared, serve, server};
 
 const EPOCH: u64 = 1;
@@ -42,6 +43,9 @@ pub(super) struct Options {
     /// Seconds of an update.
     #[arg(long, value_parser = super::positive)]
     update: Option<f64>,
+    /// Serve by TLS with the certificates that `comic-learner certs` made there.
+    #[arg(long)]
+    tls: Option<PathBuf>,
     /// Updates between versions.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     target_period: Option<u64>,
@@ -122,7 +126,7 @@ impl Stand {
         crate::run::allow_descriptors(16_384);
         let shared = Shared::new(Setup {
             run: "runs/load".into(),
-            security: Security::default(),
+            security: security(options.tls.as_deref())?,
             limits,
             experiment,
             spec,
@@ -193,6 +197,12 @@ impl Stand {
             "books": books,
         })
     }
+}
+
+/// Whatever the environment says of tokens.
+fn security(certificates: Option<&Path>) -> Result<Security> {
+    let serving = |directory: &Path| Tls::new(&directory.join("server.pem"), &directory.join("server-key.pem"), None);
+    Ok(Security { tls: certificates.map(serving).transpose()?, tokens: None })
 }
 
 fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> Result<()> {

@@ -80,14 +80,11 @@ impl Options {
             "cores": (usage.cpu_seconds - cpu) / seconds, "crowd": stats, "books": state["books"],
         });
         let slope = slope(&samples);
-        println!(
-            "{}",
-            json!({ "figure": "swarm.rss_slope", "value": slope, "unit": "MB/min", "floor": 0.0, "ratio": 0.0 })
-        );
+        println!("{}", json!({ "figure": "swarm.rss_slope", "value": slope, "unit": "MB/min" }));
         let peak = usage.peak / MEGABYTE;
         let bound = 2048.0 * 1.048_576;
         let mut line = json!({
-            "figure": "swarm.rss_peak", "value": peak, "unit": "MB", "floor": bound, "ratio": peak / bound,
+            "figure": "swarm.rss_peak", "value": peak, "unit": "MB", "bound": bound, "of_bound": peak / bound,
         });
         if let (Some(line), serde_json::Value::Object(rest)) = (line.as_object_mut(), rest) {
             line.extend(rest);

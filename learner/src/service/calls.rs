@@ -96,11 +96,11 @@ impl Learner for Calls {
     }
 
     async fn report_evaluation(&self, request: Request<EvaluationReport>) -> Result<Response<EvaluationAck>, Status> {
-        let EvaluationReport { learner_epoch: epoch, version, json } = request.into_inner();
+        let EvaluationReport { learner_epoch: epoch, version, updates, json } = request.into_inner();
         if let Err(error) = serde_json::from_str::<IgnoredAny>(&json) {
             return Err(Status::invalid_argument(format!("the report is no JSON: {error}")));
         }
-        if !self.shared.keep_evaluation(Evaluation { epoch, version, json }) {
+        if !self.shared.keep_evaluation(Evaluation { epoch, version, updates, json }) {
             return Err(Status::resource_exhausted("too many evaluations wait for the trainer: report this one later"));
         }
         self.shared.telemetry.evaluations.inc();

@@ -8,6 +8,7 @@ use comic_proto::v1::{UnrollAck, UnrollHeader, UnrollMessage, Verdict};
 use comic_proto::{Expected, Invalid, validate};
 use comic_replay::Outcome;
 use tonic::{Code, Status, Streaming};
+use tracing::{Instrument as _, Span};
 
 use super::{Closing, Shared};
 
@@ -50,7 +51,10 @@ impl UnrollStream {
 
 async fn answer(shared: &Shared, incoming: &mut Streaming<UnrollMessage>) -> Option<Result<UnrollAck, Status>> {
     match incoming.message().await {
-        Ok(Some(message)) => take(shared, message).await.transpose(),
+        Ok(Some(message)) => {
+            let span = span(message.header.as_ref());
+            take(shared, message).instrument(span).await.transpose()
+        }
         Ok(None) => None,
         Err(broken) => {
             // Undecodable or too large; what has a source is a connection that broke, and costs nothing.
@@ -61,6 +65,12 @@ async fn answer(shared: &Shared, incoming: &mut Streaming<UnrollMessage>) -> Opt
             Some(Err(broken))
         }
     }
+}
+
+/// What an unroll is called in every log: the actor gives it the same three numbers.
+fn span(header: Option<&UnrollHeader>) -> Span {
+    let Some(UnrollHeader { actor, incarnation, sequence, version, .. }) = header else { return Span::none() };
+    tracing::debug_span!("unroll", actor, incarnation = format_args!("{incarnation:016x}"), sequence, version)
 }
 
 /// Checks an unroll and puts it into a batch. `None` when the batcher is closed.
@@ -85,11 +95,13 @@ async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAc
     };
     // An unroll of an earlier life of the learner may have had another layout: it is superseded, whatever it holds.
     let earlier = header.learner_epoch < expected.epoch;
-    let valid = if earlier { Ok(()) } else { validate(shared.batcher.layout(), &header, &payload, &expected) };
+    let check = || validate(shared.batcher.layout(), &header, &payload, &expected);
+    let valid = if earlier { Ok(()) } else { tracing::debug_span!("validate").in_scope(check) };
     let (outcome, invalid) = match valid {
         Ok(()) => {
             let _waiting = shared.roster.wait(header.incarnation);
-            (shared.batcher.insert(&header, payload).await, None)
+            let insertion = shared.batcher.insert(&header, payload).instrument(tracing::debug_span!("insert"));
+            (insertion.await, None)
         }
         Err(invalid) => {
             let outcome = shared.batcher.refuse_invalid(&header);

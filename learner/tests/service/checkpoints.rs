@@ -103,6 +103,21 @@ fn one_that_was_not_finished_is_not_there() {
 }
 
 #[test]
+fn one_that_cannot_be_written_leaves_nothing_behind_and_the_former_in_its_place() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 1).unwrap();
+    store.write(Name::Updates(1), &snapshot("one")).unwrap();
+    let mut unwritable = snapshot("another");
+    unwritable.parts.insert("no/such/directory".into(), Vec::new());
+    for updates in [1, 2] {
+        assert!(store.write(Name::Updates(updates), &unwritable).is_err());
+    }
+    assert_eq!(store.newest().unwrap().unwrap().1, snapshot("one"));
+    let left = std::fs::read_dir(run.path().join("checkpoints")).unwrap().map(|entry| entry.unwrap().file_name());
+    assert_eq!(left.collect::<Vec<_>>(), ["checkpoint-0000000001"]);
+}
+
+#[test]
 fn the_oldest_beyond_the_number_kept_are_forgotten_and_the_named_ones_stay() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 2).unwrap();
@@ -139,7 +154,7 @@ fn a_damaged_epoch_is_an_error_that_names_the_file() {
     assert!(format!("{:#}", store.begin_life().unwrap_err()).contains("epoch"));
 }
 
-/// A run of which every checkpoint published a version of its own, a tenth of its updates.
+/// A run with these checkpoints, all of one life.
 fn evaluated_run(updates: &[u64]) -> (tempfile::TempDir, Store) {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 2).unwrap();
@@ -149,27 +164,27 @@ fn evaluated_run(updates: &[u64]) -> (tempfile::TempDir, Store) {
 
 fn write_evaluated(store: &Store, updates: u64) {
     let mut snapshot = snapshot("policy");
-    let progress = format!("{{\"epoch\": 3, \"version\": {}, \"updates\": {updates}}}", updates / 10);
+    let progress = format!("{{\"epoch\": 3, \"version\": 1, \"updates\": {updates}}}");
     snapshot.parts.insert("progress.json".into(), progress.into_bytes());
     store.write(Name::Updates(updates), &snapshot).unwrap();
 }
 
-fn judge(store: &Store, version: u64, normalised_reward: f64) -> Judgement {
-    store.judge(Evaluated { epoch: 3, version, normalised_reward }).unwrap()
+fn judge(store: &Store, updates: u64, normalised_reward: f64) -> Judgement {
+    store.judge(Evaluated { epoch: 3, updates, normalised_reward }).unwrap()
 }
 
 #[test]
 fn the_best_is_kept_besides_the_newest_until_another_is_better() {
     let (run, store) = evaluated_run(&[10, 20]);
-    assert_eq!(judge(&store, 1, 0.3), Judgement::Best(Name::Updates(10)));
-    assert_eq!(judge(&store, 2, 0.2), Judgement::NotBetter);
+    assert_eq!(judge(&store, 10, 0.3), Judgement::Best(Name::Updates(10)));
+    assert_eq!(judge(&store, 20, 0.2), Judgement::NotBetter);
     write_evaluated(&store, 30);
     write_evaluated(&store, 40);
     let there = |updates| store.has(Name::Updates(updates));
     assert_eq!([10, 20, 30, 40].map(there), [true, false, true, true]);
     let best = run.path().join("checkpoints/best");
     assert_eq!(find(&best).unwrap().1, read(&run.path().join("checkpoints/checkpoint-0000000010")).unwrap());
-    assert_eq!(judge(&store, 4, 0.4), Judgement::Best(Name::Updates(40)));
+    assert_eq!(judge(&store, 40, 0.4), Judgement::Best(Name::Updates(40)));
     write_evaluated(&store, 50);
     assert_eq!([10, 40, 50].map(there), [false, true, true]);
     assert_eq!(std::fs::read_link(&best).unwrap().to_str(), Some("checkpoint-0000000040"));
@@ -179,7 +194,7 @@ fn the_best_is_kept_besides_the_newest_until_another_is_better() {
 #[test]
 fn which_one_is_the_best_survives_a_restart_in_the_middle_of_noting_it() {
     let (run, store) = evaluated_run(&[10, 20]);
-    judge(&store, 1, 0.3);
+    judge(&store, 10, 0.3);
     // As a crash leaves it: the record is written, and the link is not, or half.
     let best = run.path().join("checkpoints/best");
     std::fs::remove_file(&best).unwrap();
@@ -188,7 +203,7 @@ fn which_one_is_the_best_survives_a_restart_in_the_middle_of_noting_it() {
     let store = Store::open(run.path(), 1).unwrap();
     store.begin_life().unwrap();
     assert_eq!(std::fs::read_link(&best).unwrap().to_str(), Some("checkpoint-0000000010"));
-    assert_eq!(judge(&store, 2, 0.2), Judgement::NotBetter);
+    assert_eq!(judge(&store, 20, 0.2), Judgement::NotBetter);
     write_evaluated(&store, 30);
     assert!(store.has(Name::Updates(10)));
 }
@@ -196,15 +211,15 @@ fn which_one_is_the_best_survives_a_restart_in_the_middle_of_noting_it() {
 #[test]
 fn an_evaluation_of_a_checkpoint_that_is_gone_or_of_another_life_changes_nothing() {
     let (run, store) = evaluated_run(&[10, 20, 30]);
-    assert_eq!(judge(&store, 1, 0.9), Judgement::Gone);
-    assert_eq!(store.judge(Evaluated { epoch: 2, version: 3, normalised_reward: 0.9 }).unwrap(), Judgement::Gone);
+    assert_eq!(judge(&store, 10, 0.9), Judgement::Gone);
+    assert_eq!(store.judge(Evaluated { epoch: 2, updates: 30, normalised_reward: 0.9 }).unwrap(), Judgement::Gone);
     assert!(!run.path().join("checkpoints/best.json").exists());
 }
 
 #[test]
-fn of_several_with_the_same_version_the_newest_was_meant() {
+fn of_several_with_the_same_version_the_one_that_was_evaluated_is_meant() {
     let (_run, store) = evaluated_run(&[11, 12]);
-    assert_eq!(judge(&store, 1, 0.1), Judgement::Best(Name::Updates(12)));
+    assert_eq!(judge(&store, 11, 0.1), Judgement::Best(Name::Updates(11)));
 }
 
 #[test]
@@ -215,6 +230,6 @@ fn a_damaged_record_of_the_best_is_ignored_and_replaced() {
         store.begin_life().unwrap();
         write_evaluated(&store, 30);
         assert!(!store.has(Name::Updates(10)), "{damaged}");
-        assert_eq!(judge(&store, 3, 0.1), Judgement::Best(Name::Updates(30)), "{damaged}");
+        assert_eq!(judge(&store, 30, 0.1), Judgement::Best(Name::Updates(30)), "{damaged}");
     }
 }

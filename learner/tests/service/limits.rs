@@ -73,8 +73,12 @@ async fn calls_in_flight() {
 async fn bytes_of_a_message() {
     let world = World::limited(Limits { max_message_bytes: Some(64 * 1024), ..Limits::default() }).await;
     let mut client = world.client().await;
-    let report =
-        |bytes| EvaluationReport { learner_epoch: EPOCH, version: 1, json: format!("\"{}\"", "x".repeat(bytes)) };
+    let report = |bytes| EvaluationReport {
+        learner_epoch: EPOCH,
+        version: 1,
+        updates: 1,
+        json: format!("\"{}\"", "x".repeat(bytes)),
+    };
     client.report_evaluation(report(60 * 1024)).await.unwrap();
     assert_eq!(client.report_evaluation(report(64 * 1024)).await.unwrap_err().code(), Code::OutOfRange);
 }

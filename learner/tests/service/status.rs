@@ -22,12 +22,13 @@ async fn the_newest_metrics_are_what_is_answered() {
 async fn reported_evaluations_wait_for_the_trainer_in_order_and_in_limited_number() {
     let world = World::start().await;
     let mut client = world.client().await;
-    let report = |version| EvaluationReport { learner_epoch: EPOCH, version, json: "{}".into() };
+    let report = |version| EvaluationReport { learner_epoch: EPOCH, version, updates: 7, json: "{}".into() };
     for version in 0..16 {
         client.report_evaluation(report(version)).await.unwrap();
     }
     assert_eq!(client.report_evaluation(report(16)).await.unwrap_err().code(), Code::ResourceExhausted);
-    let expected: Vec<_> = (0..16).map(|version| Evaluation { epoch: EPOCH, version, json: "{}".into() }).collect();
+    let expected: Vec<_> =
+        (0..16).map(|version| Evaluation { epoch: EPOCH, version, updates: 7, json: "{}".into() }).collect();
     assert_eq!(world.shared.take_evaluations(), expected);
     assert!(client.report_evaluation(report(17)).await.is_ok());
 }
@@ -35,7 +36,7 @@ async fn reported_evaluations_wait_for_the_trainer_in_order_and_in_limited_numbe
 #[tokio::test]
 async fn a_report_that_is_no_json_is_refused() {
     let world = World::start().await;
-    let report = EvaluationReport { learner_epoch: EPOCH, version: 1, json: "{broken".into() };
+    let report = EvaluationReport { learner_epoch: EPOCH, version: 1, updates: 1, json: "{broken".into() };
     let refused = world.client().await.report_evaluation(report).await.unwrap_err();
     assert_eq!(refused.code(), Code::InvalidArgument);
     assert!(world.shared.take_evaluations().is_empty());

@@ -11,7 +11,7 @@ use comic_proto::v1::StatusRequest;
 use comic_proto::{Access, distrusted};
 
 fn certificates(directory: &Path) {
-    Certs { out: directory.into(), names: vec!["localhost".into()], days: 1 }.run().unwrap();
+    Certs { out: directory.into(), names: vec!["localhost".into()], days: 1, token: false }.run().unwrap();
 }
 
 /// A learner that asks for certificates if `mutual`.

@@ -1,0 +1,60 @@
+//! A disk without room: training goes on, says so, and checkpoints come back as soon as there is room again.
+//!
+//! The learner gets a disk of its own, which takes root: where that cannot be made, `cargo xtask test` says so and leaves
+//! this out.
+
+use std::fs::{self, OpenOptions};
+use std::io::Write as _;
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::{Context as _, Result, ensure};
+use comic_tests::steps::{LIMIT, checkpoint_in, half_written, leaves, the_books_balance_at_the_end, trains_on};
+use comic_tests::system::{SMALL, System};
+
+/// Room for a few dozen checkpoints.
+const DISK: u64 = 64 << 20;
+
+#[tokio::test]
+async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
+    let mut system = System::new(&SMALL)?;
+    system.disk = Some(DISK);
+    system.start_learner(LIMIT).await?;
+    let actor = system.start_actor()?;
+    trains_on(&mut system, "the actor's unrolls are trained on").await?;
+    let learner = system.learner.as_ref().context("no learner")?;
+    let run = learner.sees(&system.run());
+    system.until("a checkpoint is written", LIMIT, |_| checkpoint_in(&run)).await?;
+
+    let filler = run.join("filler");
+    let deadline = Instant::now() + LIMIT;
+    let refused = |system: &System| {
+        system.learner.as_ref().map_or(0, |learner| learner.log().matches("checkpoint not written").count())
+    };
+    while refused(&system) < 2 {
+        fill(&filler)?;
+        ensure!(Instant::now() < deadline, "no checkpoint was refused");
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    trains_on(&mut system, "training goes on").await?;
+    system.until("what is half-written goes away", LIMIT, |_| (half_written(&run)? == 0).then_some(())).await?;
+
+    let before = checkpoint_in(&run);
+    fs::remove_file(&filler)?;
+    system.until("checkpoints are written again", LIMIT, |_| (checkpoint_in(&run) > before).then_some(())).await?;
+    leaves(actor).await?;
+    the_books_balance_at_the_end(system).await
+}
+
+/// Takes what room there is.
+fn fill(path: &Path) -> Result<()> {
+    let mut file = OpenOptions::new().create(true).append(true).open(path)?;
+    let block = [0; 4096];
+    loop {
+        match file.write_all(&block) {
+            Ok(()) => {}
+            Err(error) if error.kind() == std::io::ErrorKind::StorageFull => return Ok(()),
+            Err(error) => return Err(error.into()),
+        }
+    }
+}

@@ -1,0 +1,58 @@
+//! One unroll can be followed through the logs, from the actor that makes it to the update it is trained on in.
+
+use anyhow::{Context as _, Result, ensure};
+use comic_tests::process::Process;
+use comic_tests::steps::{LIMIT, leaves, the_books_balance_at_the_end, trains_on};
+use comic_tests::system::{SMALL, System};
+use serde_json::Value;
+
+#[tokio::test]
+async fn one_unroll_can_be_followed_from_its_actor_to_the_gradient() -> Result<()> {
+    let mut system = System::new(&[&SMALL[..], &["--log-format", "json"]].concat())?;
+    system.log_level = Some("info,comic_learner=trace".into());
+    system.start_learner(LIMIT).await?;
+    let access = system.access.clone();
+    let actor = system.start_actor_with(&access, |command| {
+        command.args(["--log-format", "json"]).env("RUST_LOG", "info,comic_actor=debug");
+    })?;
+    trains_on(&mut system, "the actor's unrolls are trained on").await?;
+
+    let learner = system.learner.as_ref().context("no learner")?;
+    let trained = lines(learner).find(|line| said(line) == "trained on").context("nothing was trained on")?;
+    ensure!(trained["span"]["name"] == "update", "the learner does not say in which update: {trained}");
+    let name = ["actor", "incarnation", "sequence"].map(|part| trained["fields"][part].clone());
+    let sequence = &name[2];
+    let sent = lines(&actor).any(|line| said(&line) == "sent" && is(&line["fields"], &name));
+    ensure!(sent, "the actor does not say when {sequence} was sent");
+    for step in ["made", "acknowledged"] {
+        let found = lines(&actor).any(|line| said(&line) == step && line["fields"]["sequence"] == *sequence);
+        ensure!(found, "the actor does not say when {sequence} was {step}");
+    }
+    for step in ["validate", "insert"] {
+        let found = lines(learner).any(|line| {
+            let unroll = line["spans"].as_array().and_then(|spans| spans.iter().find(|span| span["name"] == "unroll"));
+            line["span"]["name"] == step && unroll.is_some_and(|unroll| is(unroll, &name)) && takes_time(&line)
+        });
+        ensure!(found, "the learner does not say how long it took to {step} {sequence}");
+    }
+    leaves(actor).await?;
+    the_books_balance_at_the_end(system).await
+}
+
+/// The whole lines of a log, the last one of which may be half-written.
+fn lines(process: &Process) -> impl Iterator<Item = Value> {
+    let log = process.log();
+    log.lines().filter_map(|line| serde_json::from_str(line).ok()).collect::<Vec<_>>().into_iter()
+}
+
+fn said(line: &Value) -> &str {
+    line["fields"]["message"].as_str().unwrap_or_default()
+}
+
+fn is(found: &Value, name: &[Value; 3]) -> bool {
+    ["actor", "incarnation", "sequence"].iter().zip(name).all(|(part, value)| found[*part] == *value)
+}
+
+fn takes_time(line: &Value) -> bool {
+    line["fields"]["time.busy"].is_string()
+}
