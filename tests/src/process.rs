@@ -39,6 +39,12 @@ impl Process {
         Ok(kilobytes * 1024)
     }
 
+    /// `path` as this process sees it, if it has disks of its own.
+    pub fn sees(&self, path: &Path) -> PathBuf {
+        let root = PathBuf::from(format!("/proc/{}/root", self.child.id()));
+        root.join(path.strip_prefix("/").unwrap_or(path))
+    }
+
     /// Asks it to leave (SIGTERM) and waits.
     ///
     /// # Errors

@@ -1,6 +1,7 @@
 //! What whole-system tests make a learner and its actors go through.
 
 use std::fs;
+use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
@@ -63,15 +64,25 @@ pub async fn kill_and_restart_the_learner(system: &mut System) -> Result<Status>
 }
 
 /// Updates of the newest whole checkpoint, once there is one.
-async fn newest_checkpoint(system: &mut System) -> Result<u64> {
-    let directory = system.run().join("checkpoints");
-    system
-        .until("a checkpoint is written", LIMIT, |_| {
-            let entries = fs::read_dir(&directory).ok()?.flatten();
-            let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
-            names.filter_map(|name| name.strip_prefix("checkpoint-")?.parse().ok()).max()
-        })
-        .await
+///
+/// # Errors
+/// When there is none, in time.
+pub async fn newest_checkpoint(system: &mut System) -> Result<u64> {
+    let run = system.run();
+    system.until("a checkpoint is written", LIMIT, |_| checkpoint_in(&run)).await
+}
+
+/// Updates of the newest whole checkpoint of a run, if there is one.
+pub fn checkpoint_in(run: &Path) -> Option<u64> {
+    let entries = fs::read_dir(run.join("checkpoints")).ok()?.flatten();
+    let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
+    names.filter_map(|name| name.strip_prefix("checkpoint-")?.parse().ok()).max()
+}
+
+/// How many checkpoints of a run are being written, or were when the learner died.
+pub fn half_written(run: &Path) -> Option<usize> {
+    let names = fs::read_dir(run.join("checkpoints")).ok()?.flatten().map(|entry| entry.file_name());
+    Some(names.filter(|name| name.to_string_lossy().starts_with(".checkpoint-")).count())
 }
 
 /// An actor leaves when it is asked to, with 1: it was told to stop before the run was over, and whoever counts what ends

@@ -3,7 +3,7 @@
 use std::ffi::OsString;
 use std::fs::{self, OpenOptions};
 use std::net::TcpListener;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
@@ -18,7 +18,8 @@ use crate::process::{POLL, Process};
 use crate::repository::root;
 
 /// Variables that would say where the learner is and what to show it.
-const SETTINGS: [&str; 6] = ["COMIC_LEARNER", "COMIC_CA", "COMIC_CERT", "COMIC_KEY", "COMIC_TOKEN_FILE", "COMIC_TOKEN"];
+const SETTINGS: [&str; 7] =
+    ["COMIC_PULSE", "COMIC_LEARNER", "COMIC_CA", "COMIC_CERT", "COMIC_KEY", "COMIC_TOKEN_FILE", "COMIC_TOKEN"];
 /// How long a status call may take.
 const CALL_LIMIT: Duration = Duration::from_secs(5);
 
@@ -76,6 +77,15 @@ pub fn program(name: &str) -> Result<PathBuf> {
     Ok(path)
 }
 
+/// What a program says of a command's options.
+///
+/// # Errors
+/// When it does not.
+pub fn help(name: &str, command: &[&str]) -> Result<String> {
+    let output = Command::new(program(name)?).args(command).arg("--help").output();
+    Ok(String::from_utf8(output.with_context(|| format!("cannot start {name}"))?.stdout)?)
+}
+
 /// The Python that has dm_control and torch.
 ///
 /// # Errors
@@ -97,6 +107,10 @@ pub struct System {
     pub access: Access,
     /// What the learner logs, as RUST_LOG has it; the usual unless given.
     pub log_level: Option<String>,
+    /// Bytes of a disk for nothing but the run, which goes when the learner does and takes root to make.
+    pub disk: Option<u64>,
+    /// A library with a clock that every program goes by, and the file from which it takes the time.
+    pub clock: Option<(PathBuf, PathBuf)>,
     /// The learner's process, while there is one.
     pub learner: Option<Process>,
     started: usize,
@@ -115,6 +129,8 @@ impl System {
             arguments: arguments.iter().map(|argument| (*argument).to_owned()).collect(),
             access: Access::default(),
             log_level: None,
+            disk: None,
+            clock: None,
             learner: None,
             started: 0,
         })
@@ -128,7 +144,12 @@ impl System {
     /// The learner's address.
     pub fn url(&self) -> String {
         let scheme = if self.access.ca.is_some() { "https" } else { "http" };
-        format!("{scheme}://{}:{}", self.host, self.port)
+        format!("{scheme}://{}", self.address())
+    }
+
+    /// Host and port of the learner.
+    pub fn address(&self) -> String {
+        format!("{}:{}", self.host, self.port)
     }
 
     /// The run's directory.
@@ -141,7 +162,10 @@ impl System {
     /// # Errors
     /// When it does not serve within `limit`, with the end of its log.
     pub async fn start_learner(&mut self, limit: Duration) -> Result<Status> {
-        let mut command = Command::new(program("comic-learner")?);
+        let mut command = match self.disk {
+            Some(bytes) => on_a_disk_of(bytes, &self.run())?,
+            None => Command::new(program("comic-learner")?),
+        };
         command.args(&self.arguments).args(["--port", &self.port.to_string()]);
         command.arg("--run").arg(self.run());
         if let Some(level) = &self.log_level {
@@ -188,14 +212,7 @@ impl System {
     /// When it cannot be started.
     pub fn start_crowd(&mut self, actors: usize) -> Result<Process> {
         let mut command = Command::new(program("comic-learner")?);
-        command.args([
-            "load",
-            "crowd",
-            "--host",
-            &format!("{}:{}", self.host, self.port),
-            "--actors",
-            &actors.to_string(),
-        ]);
+        command.args(["load", "crowd", "--host", &self.address(), "--actors", &actors.to_string()]);
         command.args(["--window", "1", "--watch"]);
         self.spawn("crowd", command)
     }
@@ -236,6 +253,9 @@ impl System {
         }
         if !command.get_envs().any(|(name, _)| name == "RUST_LOG") {
             command.env_remove("RUST_LOG");
+        }
+        if let Some((library, clock)) = &self.clock {
+            command.env("LD_PRELOAD", library).env("COMIC_CLOCK", clock);
         }
         // A crowd goes on until its input ends, which is when the test lets go of it.
         let child = command.stdin(Stdio::piped()).stdout(output.try_clone()?).stderr(output).spawn();
@@ -291,6 +311,15 @@ impl System {
         let log = self.learner.as_ref().map(Process::log).unwrap_or_default();
         bail!("{what}: not within {limit:?}; last status: {last}; learner's log: {log}")
     }
+}
+
+/// The learner, with a disk mounted at `run` that it alone sees.
+fn on_a_disk_of(bytes: u64, run: &Path) -> Result<Command> {
+    fs::create_dir_all(run).context("cannot make the run's directory")?;
+    let mut command = Command::new("unshare");
+    let script = r#"mount -t tmpfs -o "size=$1" tmpfs "$2" && shift 2 && exec "$@""#;
+    command.args(["--mount", "sh", "-c", script, "sh", &bytes.to_string()]).arg(run).arg(program("comic-learner")?);
+    Ok(command)
 }
 
 /// The options that say the same.

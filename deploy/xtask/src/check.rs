@@ -5,13 +5,28 @@ use std::process::{Command, Stdio};
 use anyhow::Result;
 
 use crate::workspace::{cargo, cargo_has, run};
-use crate::{python, setup, workspace};
+use crate::{images, python, setup, workspace};
 
 #[derive(clap::Args)]
 pub(crate) struct TestOptions {
+    /// Build the images and test the containers, too; that takes a Docker engine, and on two cores a quarter of an hour the first time
+    #[arg(long)]
+    docker: bool,
     /// Arguments for the test runner, for instance a part of a test's name
     #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
     arguments: Vec<String>,
+}
+
+/// Tests that not every machine can run.
+struct Demanding {
+    /// A file in `tests/tests`.
+    binary: &'static str,
+    /// What all of its tests' names begin with.
+    prefix: &'static str,
+    /// What they do, and what that takes.
+    what: &'static str,
+    /// Whether it is there.
+    possible: bool,
 }
 
 /// Sets up and runs every test: by cargo-nextest where it is installed, else by cargo itself.
@@ -21,6 +36,9 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
     python::prepare_tests()?;
     // The whole-system tests start the programs, so these are built first.
     workspace::build()?;
+    if options.docker {
+        images::build()?;
+    }
     let mut command = cargo();
     let nextest = cargo_has("nextest");
     if nextest {
@@ -30,19 +48,60 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
         command.arg("test");
     }
     command.args(["--release", "--workspace"]).args(&options.arguments);
-    if !makes_hosts() {
-        eprintln!("NOT RUN: tests/tests/partition.rs, which cuts networks: that takes root and iproute2");
-        command.args(if nextest { ["--filterset", "not binary(partition)"] } else { ["--", "--skip=a_network_that"] });
+    let mut left_out = demanding(options);
+    left_out.retain(|tests| !tests.possible);
+    for Demanding { binary, what, .. } in &left_out {
+        eprintln!("NOT RUN: tests/tests/{binary}.rs, which {what}");
+    }
+    if nextest && !left_out.is_empty() {
+        let binaries: Vec<_> = left_out.iter().map(|tests| format!("not binary({})", tests.binary)).collect();
+        command.args(["--filterset", &binaries.join(" and ")]);
+    } else if !left_out.is_empty() {
+        command.arg("--").args(left_out.iter().map(|tests| format!("--skip={}", tests.prefix)));
     }
     eprintln!("running `{}`", workspace::describe(&command));
     run(&mut command)
 }
 
+fn demanding(options: &TestOptions) -> Vec<Demanding> {
+    vec![
+        Demanding {
+            binary: "partition",
+            prefix: "a_network_that",
+            what: "cuts networks: that takes root and iproute2",
+            possible: makes_hosts(),
+        },
+        Demanding {
+            binary: "disk_full",
+            prefix: "a_full_disk",
+            what: "fills a disk of its own: that takes root and util-linux",
+            // A disk that this process alone sees.
+            possible: answers("unshare", &["--mount", "mount", "-t", "tmpfs", "tmpfs", "/mnt"]),
+        },
+        Demanding {
+            binary: "compose",
+            prefix: "containers_",
+            what: "runs the images: that takes `cargo xtask test --docker`",
+            possible: options.docker,
+        },
+        Demanding {
+            binary: "kustomize",
+            prefix: "kustomize_",
+            what: "renders the Kubernetes manifests a second time: that takes kustomize or kubectl",
+            possible: answers("kustomize", &["version"]) || answers("kubectl", &["version", "--client"]),
+        },
+    ]
+}
+
+fn answers(program: &str, arguments: &[&str]) -> bool {
+    let asked = Command::new(program).args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).status();
+    asked.is_ok_and(|status| status.success())
+}
+
 /// Whether network namespaces can be made here.
 fn makes_hosts() -> bool {
     let name = format!("comic-probe-{}", std::process::id());
-    let ip = |action| Command::new("ip").args(["netns", action, &name]).stderr(Stdio::null()).status();
-    ip("add").is_ok_and(|made| made.success()) && ip("delete").is_ok_and(|gone| gone.success())
+    answers("ip", &["netns", "add", &name]) && answers("ip", &["netns", "delete", &name])
 }
 
 /// Formatting and clippy, as far as the toolchain has them.

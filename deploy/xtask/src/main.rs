@@ -2,7 +2,7 @@
 //!
 //! # Layout
 //! - [`setup`] fills `.deps` with the native libraries; everything else calls it first.
-//! - [`check`] runs the tests and the linters.
+//! - [`check`] runs the tests and the linters; [`images`] builds what some of them run.
 //! - [`train`] runs one learner and its actors on this machine and shows what they do.
 //! - [`sweep`] does so with some of an experiment's fields varied, and compares.
 //! - [`bench`] and [`python`] make the figures of the README, [`plot`] its curves.
@@ -11,9 +11,8 @@
 
 mod bench;
 mod check;
-mod interrupt;
+mod images;
 mod plot;
-mod progress;
 mod python;
 mod setup;
 mod sweep;

@@ -3,10 +3,10 @@
 
 use std::time::Duration;
 
+use comic_setup::on_terminal;
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
 use super::plan::Run;
-use crate::progress::on_terminal;
 use crate::train::display::Display;
 
 pub(super) struct Board(Option<Bars>);

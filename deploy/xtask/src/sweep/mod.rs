@@ -12,8 +12,8 @@ use std::sync::mpsc::sync_channel;
 use std::thread;
 
 use anyhow::{Context, Result, bail};
+use comic_setup::Interrupt;
 
-use crate::interrupt::Interrupt;
 use crate::train::display::Display;
 use crate::{plot, train, workspace};
 use board::Board;

@@ -7,12 +7,12 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use comic_experiment::Budget;
+use comic_setup::on_terminal;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Map, Value};
 
 use super::metrics::Line;
 use super::process::append;
-use crate::progress::on_terminal;
 
 /// One run as a person sees it.
 pub(crate) struct Display {

@@ -6,11 +6,11 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, Result, bail};
+use comic_setup::Interrupt;
 use serde::{Deserialize, Serialize};
 
 use super::Job;
 use super::display::Display;
-use crate::interrupt::Interrupt;
 use crate::workspace;
 
 /// What `comic-actor evaluate --json` prints, as far as the table shows it.

@@ -13,8 +13,8 @@ use std::sync::atomic::{AtomicU16, Ordering};
 
 use anyhow::{Context, Result, bail};
 use comic_experiment::Experiment;
+use comic_setup::Interrupt;
 
-use crate::interrupt::Interrupt;
 use crate::{plot, setup, workspace};
 use display::Display;
 use evaluation::Evaluation;

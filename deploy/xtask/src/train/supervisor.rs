@@ -5,11 +5,11 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail};
 use comic_experiment::Experiment;
+use comic_setup::Interrupt;
 
 use super::Job;
 use super::display::Display;
 use super::process::{Process, Tail};
-use crate::interrupt::Interrupt;
 use crate::workspace;
 
 /// How long the learner may take to serve: it opens the clips and builds networks first.

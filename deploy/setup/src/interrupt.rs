@@ -11,11 +11,14 @@ use signal_hook::low_level::emulate_default_handler;
 /// How often this program has been asked to stop. While one lives the signals count and do not kill; when the last
 /// clone is gone they kill again.
 #[derive(Clone, Default)]
-pub(crate) struct Interrupt(Arc<AtomicUsize>);
+pub struct Interrupt(Arc<AtomicUsize>);
 
 impl Interrupt {
     /// Takes the signals over.
-    pub(crate) fn install() -> Result<Self> {
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn install() -> Result<Self> {
         let count = Arc::new(AtomicUsize::new(0));
         let shared = Arc::downgrade(&count);
         let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot take over signals")?;
@@ -31,18 +34,17 @@ impl Interrupt {
     }
 
     /// Asks this program to stop, as a signal does.
-    #[cfg(test)]
-    pub(crate) fn request(&self) {
+    pub fn request(&self) {
         self.0.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Requests to stop so far.
-    pub(crate) fn count(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.0.load(Ordering::Relaxed)
     }
 
     /// Whether there was any.
-    pub(crate) fn requested(&self) -> bool {
+    pub fn requested(&self) -> bool {
         self.count() > 0
     }
 }

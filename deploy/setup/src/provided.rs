@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
 
-use super::wheels::Part;
+use crate::wheels::Part;
 
 /// The directory the user provides for `part`, checked; `None` when set-up must provide it.
 ///
 /// `.cargo/config.toml` sets the same variables to places inside `dependencies` unless they are set already, so only a
 /// value that points elsewhere is the user's.
-pub(super) fn directory(
+pub(crate) fn directory(
     part: Part,
     dependencies: &Path,
     variable: impl Fn(&str) -> Option<PathBuf>,

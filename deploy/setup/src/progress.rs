@@ -9,7 +9,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Whether a person is watching.
-pub(crate) fn on_terminal() -> bool {
+pub fn on_terminal() -> bool {
     std::io::stderr().is_terminal()
 }
 

@@ -8,14 +8,14 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use zip::ZipArchive;
 
-use super::wheels::Wheel;
 use crate::interrupt::Interrupt;
 use crate::progress::Progress;
+use crate::wheels::Wheel;
 
 /// Takes what is wanted of `wheel`, lying at `archive`, into `dependencies`; returns the files with their sizes.
 ///
 /// Until every file is written nothing in `dependencies` has changed except the directory `unfinished`.
-pub(super) fn extract(
+pub(crate) fn extract(
     wheel: &Wheel,
     archive: &Path,
     dependencies: &Path,
@@ -113,6 +113,6 @@ fn make_link(link: &Path, target: &str) -> Result<()> {
 // The workspace disallows bare renames because they are not durable. Here they need not be: after a power cut a stamp
 // that does not agree with the files makes set-up take the wheel again.
 #[allow(clippy::disallowed_methods)]
-pub(super) fn rename(from: &Path, to: &Path) -> Result<()> {
+pub(crate) fn rename(from: &Path, to: &Path) -> Result<()> {
     fs::rename(from, to).with_context(|| format!("cannot move {} to {}", from.display(), to.display()))
 }

@@ -1,10 +1,15 @@
-//! `cargo xtask setup`: the native libraries and the humanoid, from pinned wheels into `.deps`.
+//! Set-up: the native libraries and the humanoid, from pinned wheels into a directory, `.deps` where nobody says otherwise.
 //!
 //! Each wheel is fetched, unpacked beside its place, moved into it, and stamped last; so set-up can be stopped at any
 //! moment and goes on at the first wheel that is not whole.
+//!
+//! It is a crate of its own, which `cargo xtask setup` calls, so that an image's layer with the libraries is made anew
+//! when a pin changes and not with every other change of this workspace.
 
 mod download;
 mod extract;
+mod interrupt;
+mod progress;
 mod provided;
 mod stamp;
 mod wheels;
@@ -14,28 +19,32 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 
-use crate::interrupt::Interrupt;
-use crate::workspace;
 use stamp::Stamp;
 use wheels::{Part, WHEELS, Wheel};
 
-#[derive(clap::Args, Default)]
-pub(crate) struct Options {
+pub use interrupt::Interrupt;
+pub use progress::on_terminal;
+
+/// What is taken.
+#[derive(clap::Args, Debug, Default)]
+pub struct Options {
     /// Keep all of libtorch, CUDA included (3.4 GB), instead of what a CPU needs (0.5 GB)
     #[arg(long)]
     cuda: bool,
 }
 
-/// Brings `.deps` to what the pins say; under a second when it is already.
-pub(crate) fn run(options: &Options) -> Result<()> {
-    let dependencies = workspace::dependencies();
-    fs::create_dir_all(&dependencies).with_context(|| format!("cannot make {}", dependencies.display()))?;
-    let _lock = lock(&dependencies)?;
+/// Brings the directory `dependencies` to what the pins say; under a second when it is already.
+///
+/// # Errors
+/// A machine without wheels, an index that does not answer, a full disk, Ctrl-C: each with its remedy.
+pub fn run(options: &Options, dependencies: &Path) -> Result<()> {
+    fs::create_dir_all(dependencies).with_context(|| format!("cannot make {}", dependencies.display()))?;
+    let _lock = lock(dependencies)?;
     let mut missing = Vec::new();
     for wheel in &WHEELS {
-        match provided::directory(wheel.part, &dependencies, |name| std::env::var_os(name).map(Into::into))? {
+        match provided::directory(wheel.part, dependencies, |name| std::env::var_os(name).map(Into::into))? {
             Some(own) => announce(wheel, &own),
-            None if !is_whole(wheel, &dependencies, options.cuda) => missing.push(wheel),
+            None if !is_whole(wheel, dependencies, options.cuda) => missing.push(wheel),
             None => {}
         }
     }
@@ -46,7 +55,7 @@ pub(crate) fn run(options: &Options) -> Result<()> {
     download::require_pip()?;
     let interrupt = Interrupt::install()?;
     for wheel in missing {
-        take(wheel, &dependencies, options.cuda, &interrupt)
+        take(wheel, dependencies, options.cuda, &interrupt)
             .with_context(|| format!("set-up of {} {} in {}", wheel.name, wheel.version, dependencies.display()))?;
     }
     let _ = fs::remove_dir_all(dependencies.join("wheels"));

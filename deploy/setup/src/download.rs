@@ -7,9 +7,9 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
 
-use super::wheels::Wheel;
 use crate::interrupt::Interrupt;
 use crate::progress::Progress;
+use crate::wheels::Wheel;
 
 /// What the pinned wheels are built for, whatever the user's own Python is.
 const PLATFORM: [&str; 8] = [
@@ -24,7 +24,7 @@ const PLATFORM: [&str; 8] = [
 ];
 
 /// Fails with the remedy unless `python3 -m pip` runs.
-pub(super) fn require_pip() -> Result<()> {
+pub(crate) fn require_pip() -> Result<()> {
     let pip = Command::new("python3").args(["-m", "pip", "--version"]).output();
     match pip {
         Ok(output) if output.status.success() => Ok(()),
@@ -42,7 +42,7 @@ pub(super) fn require_pip() -> Result<()> {
 /// Fetches `wheel` into `directory` under the user's own pip configuration; pip verifies the hash.
 ///
 /// A wheel that lies there whole already is kept.
-pub(super) fn fetch(wheel: &Wheel, directory: &Path, interrupt: &Interrupt) -> Result<PathBuf> {
+pub(crate) fn fetch(wheel: &Wheel, directory: &Path, interrupt: &Interrupt) -> Result<PathBuf> {
     let temporary = directory.join("unfinished");
     let _ = fs::remove_dir_all(&temporary);
     fs::create_dir_all(&temporary).with_context(|| format!("cannot make {}", temporary.display()))?;
@@ -154,8 +154,8 @@ fn size_below(directory: &Path) -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::wheels::WHEELS;
     use super::*;
+    use crate::wheels::WHEELS;
 
     #[test]
     fn a_failed_download_names_the_wheel_the_remedy_and_pips_last_words() {

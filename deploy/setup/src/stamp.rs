@@ -9,13 +9,13 @@ use serde::{Deserialize, Serialize};
 
 /// The record of one wheel: written after everything else, so that where it stands and agrees the wheel is whole.
 #[derive(Serialize, Deserialize)]
-pub(super) struct Stamp {
+pub(crate) struct Stamp {
     /// SHA-256 of the wheel.
-    pub(super) sha256: String,
+    pub(crate) sha256: String,
     /// Whether all of it was kept (`--cuda`).
-    pub(super) cuda: bool,
+    pub(crate) cuda: bool,
     /// Every file taken, relative to `.deps`, with its size in bytes.
-    pub(super) files: BTreeMap<PathBuf, u64>,
+    pub(crate) files: BTreeMap<PathBuf, u64>,
 }
 
 impl Stamp {
@@ -24,29 +24,29 @@ impl Stamp {
     }
 
     /// The stamp of `wheel`, if there is a readable one.
-    pub(super) fn read(dependencies: &Path, wheel: &str) -> Option<Self> {
+    pub(crate) fn read(dependencies: &Path, wheel: &str) -> Option<Self> {
         serde_json::from_str(&fs::read_to_string(Self::path(dependencies, wheel)).ok()?).ok()
     }
 
     /// Whether every file still stands there with its size.
-    pub(super) fn agrees(&self, dependencies: &Path) -> bool {
+    pub(crate) fn agrees(&self, dependencies: &Path) -> bool {
         self.files
             .iter()
             .all(|(file, size)| fs::metadata(dependencies.join(file)).is_ok_and(|found| found.len() == *size))
     }
 
     /// Writes the stamp; the wheel counts as whole from then on.
-    pub(super) fn write(&self, dependencies: &Path, wheel: &str) -> Result<()> {
+    pub(crate) fn write(&self, dependencies: &Path, wheel: &str) -> Result<()> {
         let path = Self::path(dependencies, wheel);
         let unfinished = path.with_extension("unfinished");
         fs::create_dir_all(dependencies.join("stamps")).context("cannot make the directory of stamps")?;
         fs::write(&unfinished, serde_json::to_vec(self)?)
             .with_context(|| format!("cannot write {}", unfinished.display()))?;
-        super::extract::rename(&unfinished, &path)
+        crate::extract::rename(&unfinished, &path)
     }
 
     /// Takes the wheel's files away, its stamp first.
-    pub(super) fn remove(self, dependencies: &Path, wheel: &str) -> Result<()> {
+    pub(crate) fn remove(self, dependencies: &Path, wheel: &str) -> Result<()> {
         let path = Self::path(dependencies, wheel);
         fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
         for file in self.files.keys() {

@@ -1,0 +1,250 @@
+//! A learner and actors in containers, as `deploy/compose.yaml` starts them.
+
+use std::env;
+use std::fmt::Write as _;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail, ensure};
+use serde_json::Value;
+
+use crate::repository::root;
+use crate::system::SMALL;
+
+/// How often a condition is looked at again: each look starts a process in a container.
+const POLL: Duration = Duration::from_millis(500);
+
+/// A project of its own; its containers, networks and volumes are gone when it is dropped, and the images stay.
+pub struct Project {
+    name: String,
+    files: &'static [&'static str],
+    /// What the learner is told beside what the file says.
+    options: String,
+}
+
+impl Project {
+    /// Of these files in `deploy`; nothing runs yet.
+    pub fn new(purpose: &str, files: &'static [&'static str]) -> Self {
+        // The files name the preset themselves.
+        Self { name: format!("comic-{purpose}-{}", std::process::id()), files, options: SMALL[2..].join(" ") }
+    }
+
+    /// Tells the learner something more when it starts the next time.
+    pub fn tell(&mut self, option: &str) {
+        // Writing to a string cannot fail.
+        let _ = write!(self.options, " {option}");
+    }
+
+    /// Runs a command of Compose to its end and returns what it says.
+    ///
+    /// # Errors
+    /// When it fails, with what it says.
+    pub fn compose(&self, arguments: &[&str]) -> Result<String> {
+        let mut command = compose();
+        for file in self.files {
+            command.arg("--file").arg(root().join("deploy").join(file));
+        }
+        command.args(["--project-name", &self.name]).args(arguments);
+        // Nothing is taken from who runs the test, and everything fits on the smallest machine.
+        for (name, _) in env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with("COMIC_")) {
+            command.env_remove(name);
+        }
+        command.env("COMIC_OPTIONS", &self.options).env("COMIC_METRICS_PORT", "");
+        command.env("COMIC_LEARNER_CPUS", "1").env("COMIC_ACTOR_CPUS", "0.5");
+        run(&mut command)
+    }
+
+    /// Starts what is not running yet, with so many actors.
+    ///
+    /// # Errors
+    /// When it cannot.
+    pub fn up(&self, actors: usize) -> Result<()> {
+        let scale = format!("actor={actors}");
+        self.compose(&["up", "--detach", "--no-build", "--no-recreate", "--scale", &scale]).map(drop)
+    }
+
+    /// Runs a program in the learner's container.
+    ///
+    /// # Errors
+    /// When it fails, with what it says.
+    pub fn in_learner(&self, command: &[&str]) -> Result<String> {
+        self.compose(&[&["exec", "-T", "learner"], command].concat())
+    }
+
+    /// The containers of a service, running or not.
+    ///
+    /// # Errors
+    /// When the engine does not say.
+    pub fn containers(&self, service: &str) -> Result<Vec<Container>> {
+        let filters = [("project", self.name.as_str()), ("service", service)];
+        let [project, service] = filters.map(|(label, value)| format!("label=com.docker.compose.{label}={value}"));
+        let found = docker(&["ps", "--all", "--quiet", "--no-trunc", "--filter", &project, "--filter", &service])?;
+        Ok(found.lines().map(|id| Container(id.to_owned())).collect())
+    }
+
+    /// The one container of a service.
+    ///
+    /// # Errors
+    /// When there are others.
+    pub fn container(&self, service: &str) -> Result<Container> {
+        let found = self.containers(service)?;
+        ensure!(found.len() == 1, "not one {service}: {found:?}");
+        found.into_iter().next().context("no container")
+    }
+
+    /// The network that all of them share.
+    pub fn network(&self) -> String {
+        format!("{}_default", self.name)
+    }
+
+    /// What `comic-learner status --json` says in the learner's container.
+    ///
+    /// # Errors
+    /// When nothing answers.
+    pub fn status(&self) -> Result<Value> {
+        Ok(serde_json::from_str(&self.in_learner(&["comic-learner", "status", "--json"])?)?)
+    }
+
+    /// Looks at the learner's status until `condition` holds; books that do not balance end the test at once.
+    ///
+    /// # Errors
+    /// After `limit`, with what was waited for, the last status, and all logs.
+    pub async fn until(&self, what: &str, limit: Duration, condition: impl Fn(&Value) -> bool) -> Result<Value> {
+        let begin = Instant::now();
+        let mut last = String::from("none");
+        while begin.elapsed() < limit {
+            match self.status() {
+                Ok(status) => {
+                    ensure!(balance(&status["books"]), "{what}: the books do not balance: {}", status["books"]);
+                    if condition(&status) {
+                        println!("{what}: after {:.1} s, books {}", begin.elapsed().as_secs_f64(), status["books"]);
+                        return Ok(status);
+                    }
+                    last = status.to_string();
+                }
+                Err(error) => last = format!("{error:#}"),
+            }
+            tokio::time::sleep(POLL).await;
+        }
+        bail!(
+            "{what}: not within {limit:?}; last status: {last}; {}",
+            self.compose(&["logs", "--no-color", "--tail=100"])?
+        )
+    }
+}
+
+impl Drop for Project {
+    fn drop(&mut self) {
+        if let Err(error) = self.compose(&["down", "--volumes", "--remove-orphans", "--timeout", "1"]) {
+            eprintln!("not everything is gone: {error:#}");
+        }
+    }
+}
+
+/// A container.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Container(String);
+
+impl Container {
+    /// Runs a command of docker's with this container as its last argument.
+    ///
+    /// # Errors
+    /// When it fails, with what it says.
+    pub fn docker(&self, arguments: &[&str]) -> Result<String> {
+        docker(&[arguments, &[&self.0]].concat())
+    }
+
+    /// Runs a program in it.
+    ///
+    /// # Errors
+    /// When it fails, with what it says.
+    pub fn exec(&self, command: &[&str]) -> Result<String> {
+        docker(&[&["exec", &self.0], command].concat())
+    }
+
+    /// What the engine knows of it, below the path `state`, for instance `.State.ExitCode`.
+    ///
+    /// # Errors
+    /// When it does not know.
+    pub fn inspect(&self, state: &str) -> Result<String> {
+        let format = format!("{{{{json {state}}}}}");
+        Ok(self.docker(&["inspect", "--format", &format])?.trim().trim_matches('"').to_owned())
+    }
+
+    /// What it has written.
+    ///
+    /// # Errors
+    /// When the engine does not say.
+    pub fn log(&self) -> Result<String> {
+        self.docker(&["logs"])
+    }
+
+    /// Waits until `state` is `wanted`.
+    ///
+    /// # Errors
+    /// After `limit`, with what it is and the log.
+    pub async fn until_is(&self, state: &str, wanted: &str, limit: Duration) -> Result<()> {
+        let begin = Instant::now();
+        loop {
+            let is = self.inspect(state)?;
+            if is == wanted {
+                return Ok(());
+            }
+            ensure!(begin.elapsed() < limit, "{state} is {is}, not {wanted}, after {limit:?}: {}", self.log()?);
+            tokio::time::sleep(POLL).await;
+        }
+    }
+
+    /// Waits until its log holds `text`.
+    ///
+    /// # Errors
+    /// After `limit`, with the log.
+    pub async fn until_log_holds(&self, text: &str, limit: Duration) -> Result<()> {
+        let begin = Instant::now();
+        while !self.log()?.contains(text) {
+            ensure!(begin.elapsed() < limit, "`{text}` is not in the log after {limit:?}: {}", self.log()?);
+            tokio::time::sleep(POLL).await;
+        }
+        Ok(())
+    }
+}
+
+/// produced = trained + dropped by reason + in flight.
+fn balance(books: &Value) -> bool {
+    let of = |value: &Value| value.as_u64();
+    let dropped = books["dropped"].as_object().map(|reasons| reasons.values().filter_map(of).sum::<u64>());
+    let parts = [of(&books["trained"]), dropped, of(&books["in_flight"])];
+    of(&books["produced"]) == parts.into_iter().sum::<Option<u64>>()
+}
+
+/// Compose, v2 or v1.
+fn compose() -> Command {
+    let mut second = Command::new("docker");
+    second.arg("compose");
+    let there = Command::new("docker").args(["compose", "version"]).output();
+    if there.is_ok_and(|answer| answer.status.success()) { second } else { Command::new("docker-compose") }
+}
+
+/// Runs a command of docker's to its end and returns what it says.
+///
+/// # Errors
+/// When it fails, with what it says.
+pub fn docker(arguments: &[&str]) -> Result<String> {
+    run(Command::new("docker").args(arguments))
+}
+
+/// The programs in the containers write their logs to stderr, so both are what a command says.
+fn run(command: &mut Command) -> Result<String> {
+    let output = command.output().with_context(|| format!("cannot start {command:?}"))?;
+    let said = |stream: &[u8]| String::from_utf8_lossy(stream).into_owned();
+    ensure!(
+        output.status.success(),
+        "{command:?}: {}: {}{}",
+        output.status,
+        said(&output.stdout),
+        said(&output.stderr)
+    );
+    let logs = command.get_args().any(|argument| argument == "logs");
+    let stderr = if logs { said(&output.stderr) } else { String::new() };
+    Ok(said(&output.stdout) + &stderr)
+}

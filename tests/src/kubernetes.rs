@@ -1,0 +1,202 @@
+//! The Kubernetes manifests: overlays rendered as kustomize renders them, and read strictly.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail, ensure};
+use k8s_openapi::api::apps::v1::StatefulSet;
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::{Namespace, PodSpec, Service};
+use k8s_openapi::api::networking::v1::NetworkPolicy;
+use k8s_openapi::api::policy::v1::PodDisruptionBudget;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::repository::root;
+
+/// Manifests by kind and name.
+pub type Manifests = BTreeMap<(String, String), Value>;
+
+/// Where base and overlays lie.
+pub fn directory() -> PathBuf {
+    root().join("deploy/kubernetes")
+}
+
+/// Every directory that a user may apply: the base, and each overlay.
+///
+/// # Errors
+/// When they are not there.
+pub fn applicable() -> Result<Vec<PathBuf>> {
+    let overlays = directory().join("overlays");
+    let entries = fs::read_dir(&overlays).with_context(|| format!("cannot list {}", overlays.display()))?;
+    let mut found = entries.map(|entry| Ok(entry?.path())).collect::<Result<Vec<_>>>()?;
+    ensure!(!found.is_empty(), "there are no overlays");
+    found.push(directory().join("base"));
+    Ok(found)
+}
+
+/// As much of a kustomization as ours use.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "camelCase")]
+struct Kustomization {
+    api_version: String,
+    kind: String,
+    namespace: Option<String>,
+    #[serde(default)]
+    resources: Vec<PathBuf>,
+    #[serde(default)]
+    patches: Vec<Patch>,
+}
+
+/// A file of JSON patches (RFC 6902) and the one manifest it is for.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Patch {
+    path: PathBuf,
+    target: Target,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Target {
+    kind: String,
+    name: String,
+}
+
+/// What `kubectl apply --kustomize DIRECTORY` would apply.
+///
+/// # Errors
+/// Files that are not there, fields of a kustomization that are not known here, patches that do not fit.
+pub fn render(directory: &Path) -> Result<Manifests> {
+    let file = directory.join("kustomization.yaml");
+    let read = || anyhow::Ok(serde_yaml_ng::from_str::<Kustomization>(&fs::read_to_string(&file)?)?);
+    let kustomization = read().with_context(|| file.display().to_string())?;
+    ensure!(kustomization.kind == "Kustomization", "{}: {}", file.display(), kustomization.kind);
+    ensure!(kustomization.api_version == "kustomize.config.k8s.io/v1beta1", "{}", kustomization.api_version);
+    let mut manifests = Manifests::new();
+    for resource in &kustomization.resources {
+        let path = directory.join(resource);
+        let found = if path.is_dir() { render(&path)? } else { manifests_in(&fs::read_to_string(&path)?)? };
+        for (name, manifest) in found {
+            ensure!(manifests.insert(name.clone(), manifest).is_none(), "{name:?} is there twice");
+        }
+    }
+    if let Some(namespace) = &kustomization.namespace {
+        for ((kind, name), manifest) in &mut manifests {
+            match kind.as_str() {
+                "Namespace" => ensure!(name == namespace, "another namespace: {name}"),
+                _ => manifest["metadata"]["namespace"] = namespace.as_str().into(),
+            }
+        }
+    }
+    for Patch { path, target: Target { kind, name } } in kustomization.patches {
+        let operations: json_patch::Patch = serde_yaml_ng::from_str(&fs::read_to_string(directory.join(&path))?)?;
+        let manifest = manifests.get_mut(&(kind, name)).with_context(|| format!("{}: no target", path.display()))?;
+        json_patch::patch(manifest, &operations).with_context(|| format!("{} does not fit", path.display()))?;
+    }
+    Ok(manifests)
+}
+
+/// The manifests of a file of several.
+///
+/// # Errors
+/// What is no YAML, or no manifest.
+pub fn manifests_in(text: &str) -> Result<Manifests> {
+    let documents = serde_yaml_ng::Deserializer::from_str(text).map(Value::deserialize);
+    let named = documents.map(|document| {
+        let document = document?;
+        let name = |value: &Value| value.as_str().map(str::to_owned);
+        let kind = name(&document["kind"]).context("a manifest without a kind")?;
+        let name = name(&document["metadata"]["name"]).context("a manifest without a name")?;
+        Ok(((kind, name), document))
+    });
+    named.collect()
+}
+
+/// A rendered overlay, read.
+#[derive(Debug)]
+pub struct Cluster {
+    /// The one namespace.
+    pub namespace: Namespace,
+    /// The learner's Service.
+    pub service: Service,
+    /// The learner.
+    pub learner: StatefulSet,
+    /// The actors.
+    pub actors: Job,
+    /// The actors' protection.
+    pub budget: PodDisruptionBudget,
+    /// Who reaches whom.
+    pub policies: BTreeMap<String, NetworkPolicy>,
+}
+
+impl Cluster {
+    /// Reads what was rendered.
+    ///
+    /// # Errors
+    /// Fields that Kubernetes does not know, values it would not take, manifests that are missing or too many.
+    pub fn read(mut manifests: Manifests) -> Result<Self> {
+        let policies = manifests.extract_if(.., |(kind, _), _| kind == "NetworkPolicy");
+        let policies = policies.map(|((_, name), manifest)| Ok((name, strictly(manifest)?))).collect::<Result<_>>()?;
+        let cluster = Self {
+            namespace: take(&mut manifests, "Namespace", "comic")?,
+            service: take(&mut manifests, "Service", "comic-learner")?,
+            learner: take(&mut manifests, "StatefulSet", "comic-learner")?,
+            actors: take(&mut manifests, "Job", "comic-actor")?,
+            budget: take(&mut manifests, "PodDisruptionBudget", "comic-actor")?,
+            policies,
+        };
+        ensure!(manifests.is_empty(), "nobody looks at {:?}", manifests.keys());
+        Ok(cluster)
+    }
+
+    /// The learner's pod.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn learner_pod(&self) -> Result<&PodSpec> {
+        self.learner.spec.template.spec.as_ref().context("no pod")
+    }
+
+    /// The actors' pod.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn actor_pod(&self) -> Result<&PodSpec> {
+        let spec = self.actors.spec.as_ref().context("no spec")?;
+        spec.template.spec.as_ref().context("no pod")
+    }
+}
+
+fn take<T: DeserializeOwned + Serialize>(manifests: &mut Manifests, kind: &str, name: &str) -> Result<T> {
+    let manifest = manifests.remove(&(kind.to_owned(), name.to_owned()));
+    strictly(manifest.with_context(|| format!("no {kind} {name}"))?).with_context(|| format!("{kind} {name}"))
+}
+
+/// A manifest as its type; what the type does not know, it would lose.
+///
+/// # Errors
+/// When something is lost, and where, or when it does not fit the type.
+pub fn strictly<T: DeserializeOwned + Serialize>(manifest: Value) -> Result<T> {
+    let typed: T = serde_json::from_value(manifest.clone())?;
+    keeps(&manifest, &serde_json::to_value(&typed)?, "")?;
+    Ok(typed)
+}
+
+/// Whether everything that was written is in what was read.
+fn keeps(written: &Value, read: &Value, at: &str) -> Result<()> {
+    match (written, read) {
+        (Value::Object(written), Value::Object(read)) => written.iter().try_for_each(|(name, value)| {
+            let at = format!("{at}.{name}");
+            keeps(value, read.get(name).with_context(|| format!("{at} is no field that Kubernetes knows"))?, &at)
+        }),
+        (Value::Array(written), Value::Array(read)) if written.len() == read.len() => {
+            let mut pairs = written.iter().zip(read).enumerate();
+            pairs.try_for_each(|(index, (written, read))| keeps(written, read, &format!("{at}[{index}]")))
+        }
+        (written, read) if written == read => Ok(()),
+        (written, read) => bail!("{at} is {written} and is read as {read}"),
+    }
+}

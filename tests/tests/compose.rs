@@ -1,0 +1,149 @@
+//! The images and the compose files: real containers, and what happens to them.
+//!
+//! `cargo xtask test --docker` builds the images first; without it these tests are left out, and it says so.
+
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail, ensure};
+use comic_tests::compose::{Project, docker};
+use serde_json::Value;
+
+/// Long enough for two slow cores; no step waits longer than it needs.
+const LIMIT: Duration = Duration::from_secs(180);
+/// More unrolls than containers that are gone can have left behind.
+const BEYOND_WHAT_IS_LEFT: u64 = 100;
+
+fn trained(status: &Value) -> u64 {
+    status["books"]["trained"].as_u64().unwrap_or_default()
+}
+
+fn alive(status: &Value) -> u64 {
+    status["actors"]["alive"].as_u64().unwrap_or_default()
+}
+
+/// So many actors are there, and what is trained on goes beyond whatever others have left behind.
+async fn trains_on_with(actors: u64, project: &Project, what: &str) -> Result<Value> {
+    let status = project.until(what, LIMIT, |status| alive(status) == actors).await?;
+    let before = trained(&status);
+    project
+        .until(what, LIMIT, |status| alive(status) == actors && trained(status) >= before + BEYOND_WHAT_IS_LEFT)
+        .await
+}
+
+#[tokio::test]
+async fn containers_survive_what_happens_to_them_and_their_books_balance() -> Result<()> {
+    let project = Project::new("faults", &["compose.yaml"]);
+    project.up(2)?;
+    trains_on_with(2, &project, "two actors train").await?;
+    they_are_what_the_image_promises(&project)?;
+    ensure!(metrics(&project)?.contains("comic_actors{state=\"alive\"} 2\n"), "Prometheus sees two actors");
+
+    let [killed, kept] = &project.containers("actor")?[..] else { bail!("not two actors") };
+    killed.docker(&["kill"])?;
+    trains_on_with(1, &project, "one goes on when the other is killed").await?;
+    ensure!(killed.inspect(".State.ExitCode")? == "137", "it was killed");
+    project.up(2)?;
+    trains_on_with(2, &project, "it is started again").await?;
+
+    let network = project.network();
+    docker(&["network", "disconnect", &network, &kept.inspect(".Id")?])?;
+    trains_on_with(1, &project, "one goes on when the other's network is cut").await?;
+    ensure!(kept.inspect(".State.Running")? == "true", "it waits for its learner");
+    docker(&["network", "connect", &network, &kept.inspect(".Id")?])?;
+    kept.until_log_holds("reconnected to the learner", LIMIT).await?;
+    trains_on_with(2, &project, "it is back when its network is").await?;
+
+    let learner = project.container("learner")?;
+    let before = project.status()?;
+    project.compose(&["stop", "learner"])?;
+    ensure!(learner.inspect(".State.ExitCode")? == "0", "SIGTERM reached the learner: {}", learner.log()?);
+    project.compose(&["start", "learner"])?;
+    let after = trains_on_with(2, &project, "the learner resumes and the actors find it").await?;
+    ensure!(learner.log()?.contains("resuming"), "it began anew: {}", learner.log()?);
+    ensure!(after["learner_epoch"].as_u64() > before["learner_epoch"].as_u64(), "it is another life");
+    ensure!(trained(&after) > trained(&before), "of the same run");
+
+    project.up(4)?;
+    trains_on_with(4, &project, "four actors").await?;
+    project.up(1)?;
+    trains_on_with(1, &project, "one actor").await?;
+    let healthy = project.container("actor")?;
+    for container in [&healthy, &learner] {
+        container.until_is(".State.Health.Status", "healthy", LIMIT).await?;
+    }
+    project.compose(&["stop", "actor"])?;
+    ensure!(healthy.inspect(".State.ExitCode")? == "1", "an actor that is told to stop is not done");
+    let last = project.until("nobody acts", LIMIT, |status| alive(status) == 0).await?;
+    ensure!(last["books"]["dropped"]["invalid"] == 0, "nobody sends what is invalid: {last}");
+    Ok(())
+}
+
+/// Nobody's root, nothing to write into, the program itself as the first process, and well by its own account.
+fn they_are_what_the_image_promises(project: &Project) -> Result<()> {
+    for (service, program) in [("learner", "comic-learner"), ("actor", "comic-actor")] {
+        for container in project.containers(service)? {
+            let size = docker(&["image", "inspect", "--format", "{{.Size}}", &container.inspect(".Image")?])?;
+            ensure!(size.trim().parse::<u64>()? < 700_000_000, "the image of the {service} has {size} bytes");
+            ensure!(container.exec(&["cat", "/proc/1/comm"])?.trim() == program, "another first process");
+            ensure!(container.exec(&["id", "--user"])?.trim() == "10001", "another user");
+            ensure!(container.exec(&["touch", "/usr/local/bin/file"]).is_err(), "it can write into its image");
+            ensure!(container.inspect(".HostConfig.ReadonlyRootfs")? == "true", "it could as root");
+            container.exec(&[program, "health"])?;
+        }
+    }
+    let actor = project.containers("actor")?.into_iter().next().context("no actor")?;
+    ensure!(actor.exec(&["python3", "--version"]).is_err(), "there is a Python in the actor's image");
+    let libraries = project.in_learner(&["find", "/opt/comic", "-name", "libmujoco*"])?;
+    ensure!(libraries.is_empty(), "there is a MuJoCo in the learner's image: {libraries}");
+    Ok(())
+}
+
+/// The page at the port that Compose publishes.
+fn metrics(project: &Project) -> Result<String> {
+    let address = project.compose(&["port", "learner", "9090"])?;
+    let mut stream = TcpStream::connect(address.trim())?;
+    stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: learner\r\n\r\n")?;
+    let mut page = String::new();
+    stream.read_to_string(&mut page)?;
+    Ok(page)
+}
+
+#[tokio::test]
+async fn containers_with_tls_and_a_token_make_both_themselves() -> Result<()> {
+    let project = Project::new("tls", &["compose.yaml", "compose.tls.yaml"]);
+    project.up(2)?;
+    trains_on_with(2, &project, "two actors train").await?;
+    project.in_learner(&["comic-learner", "health"])?;
+    let refused = project.in_learner(&["env", "--unset=COMIC_TOKEN_FILE", "comic-learner", "status"]);
+    ensure!(refused.is_err_and(|error| format!("{error:#}").contains("token")), "it tells whoever asks");
+    Ok(())
+}
+
+/// Ten times within two minutes, and then it is left as it is.
+#[tokio::test]
+async fn containers_whose_configuration_is_wrong_are_given_up() -> Result<()> {
+    let mut project = Project::new("mistake", &["compose.yaml"]);
+    project.tell("--set no.such.field=1");
+    project.compose(&["up", "--detach", "--no-build", "learner"])?;
+    let learner = project.container("learner")?;
+    learner.until_is(".RestartCount", "10", LIMIT).await?;
+    learner.until_is(".State.Status", "exited", LIMIT).await?;
+    ensure!(learner.inspect(".State.ExitCode")? == "2", "{}", learner.log()?);
+    Ok(())
+}
+
+#[tokio::test]
+async fn containers_end_when_their_run_is_over() -> Result<()> {
+    let mut project = Project::new("over", &["compose.yaml"]);
+    project.tell("--set budget.updates=20");
+    project.up(2)?;
+    let containers = [project.containers("actor")?, vec![project.container("learner")?]].concat();
+    ensure!(containers.len() == 3, "{containers:?}");
+    for container in containers {
+        container.until_is(".State.Status", "exited", LIMIT).await?;
+        ensure!(container.inspect(".State.ExitCode")? == "0", "{}", container.log()?);
+    }
+    Ok(())
+}

@@ -1,0 +1,117 @@
+//! The compose files and the Dockerfile agree with each other and with the programs; no engine is asked.
+
+use std::collections::BTreeSet;
+use std::fs;
+
+use anyhow::{Context, Result, ensure};
+use comic_tests::repository::root;
+use serde_yaml_ng::Value;
+
+/// A file of `deploy`, anchors and merges resolved.
+fn compose(file: &str) -> Result<Value> {
+    let mut document: Value = serde_yaml_ng::from_str(&text(file)?)?;
+    document.apply_merge()?;
+    Ok(document)
+}
+
+fn text(file: &str) -> Result<String> {
+    let path = root().join("deploy").join(file);
+    fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))
+}
+
+/// The words of a service's command.
+fn command(file: &str, service: &str) -> Result<Vec<String>> {
+    let document = compose(file)?;
+    let command = document["services"][service]["command"].as_str().context("no command")?.to_owned();
+    Ok(command.split_whitespace().map(str::to_owned).collect())
+}
+
+#[test]
+fn every_container_is_limited_and_writes_where_it_is_told() -> Result<()> {
+    let document = compose("compose.yaml")?;
+    for service in ["learner", "actor"] {
+        let service = &document["services"][service];
+        ensure!(service["read_only"] == true && service["cap_drop"][0] == "ALL", "{service:?}");
+        ensure!(service["security_opt"][0] == "no-new-privileges:true", "{service:?}");
+        ensure!(!service["cpus"].is_null() && !service["mem_limit"].is_null(), "{service:?}");
+        let restart = service["restart"].as_str().unwrap_or_default();
+        ensure!(
+            restart.starts_with("on-failure:"),
+            "{restart}: after 0 there is nothing to do, after 2 nothing to gain"
+        );
+    }
+    let certs = &compose("compose.tls.yaml")?["services"]["certs"];
+    ensure!(certs["read_only"] == true && certs["network_mode"] == "none", "{certs:?}");
+    Ok(())
+}
+
+#[test]
+fn each_has_longer_to_leave_than_it_takes() -> Result<()> {
+    let document = compose("compose.yaml")?;
+    for (service, seconds) in [("learner", 30), ("actor", 5)] {
+        let period = document["services"][service]["stop_grace_period"].as_str().unwrap_or_default().strip_suffix('s');
+        ensure!(period.context("no period")?.parse::<u32>()? > seconds, "{service}: {period:?}");
+    }
+    Ok(())
+}
+
+/// A file that is laid over another replaces its command, so everything else is there twice.
+#[test]
+fn with_tls_the_learner_is_told_the_same_but_for_who_gets_in() -> Result<()> {
+    let plain = command("compose.yaml", "learner")?;
+    let tls = command("compose.tls.yaml", "learner")?;
+    let at = tls.iter().position(|word| word == "--cert").context("no --cert")?;
+    ensure!(plain.split_last() == Some((&"--insecure".to_owned(), &tls[..at])), "{plain:?} and {tls:?}");
+    let options: Vec<_> = tls[at..].iter().map(String::as_str).collect();
+    let certificates =
+        ["--cert", "/access/server.pem", "--key", "/access/server-key.pem", "--client-ca", "/access/ca.pem"];
+    ensure!(options == certificates, "{options:?}");
+    Ok(())
+}
+
+#[test]
+fn every_argument_of_the_dockerfile_can_be_given_to_compose() -> Result<()> {
+    let dockerfile = text("Dockerfile")?;
+    let asked: BTreeSet<_> =
+        dockerfile.lines().filter_map(|line| line.strip_prefix("ARG ")?.split('=').next()).collect();
+    for service in ["learner", "actor"] {
+        let build = &compose("compose.yaml")?["services"][service]["build"];
+        let given = build["args"].as_mapping().context("no arguments")?;
+        let given: BTreeSet<_> = given.keys().filter_map(Value::as_str).collect();
+        ensure!(given == asked, "{service}: {given:?} for {asked:?}");
+        ensure!(dockerfile.contains(&format!(" AS {service}\n")) && build["target"] == service, "{service}: {build:?}");
+    }
+    Ok(())
+}
+
+#[test]
+fn images_are_built_with_the_workspaces_own_rust() -> Result<()> {
+    let manifest = fs::read_to_string(root().join("Cargo.toml"))?;
+    let version = manifest.lines().find_map(|line| line.strip_prefix("rust-version = \"")?.strip_suffix('"'));
+    let image = format!("rust:{}-bookworm", version.context("no rust-version")?);
+    for file in ["Dockerfile", "compose.yaml", "xtask/src/images.rs"] {
+        ensure!(text(file)?.contains(&image), "{file} names no {image}");
+    }
+    Ok(())
+}
+
+/// The learner's run, and nothing else, is worth keeping.
+#[test]
+fn what_is_in_volumes_is_where_the_image_lets_it_be_written() -> Result<()> {
+    let prepared = text("Dockerfile")?;
+    let prepared =
+        prepared.lines().find(|line| line.contains("install --directory --owner comic")).context("no directories")?;
+    let prepared: BTreeSet<_> = prepared.split_whitespace().filter(|word| word.starts_with('/')).collect();
+    for (file, services) in [("compose.yaml", ["learner", "actor"]), ("compose.tls.yaml", ["certs", "learner"])] {
+        for service in services {
+            let service = &compose(file)?["services"][service];
+            let volumes = [&service["volumes"], &service["tmpfs"]].into_iter().filter_map(Value::as_sequence).flatten();
+            for volume in volumes {
+                let volume = volume.as_str().context("a volume in words")?;
+                let place = volume.split(':').rfind(|part| part.starts_with('/')).unwrap_or(volume);
+                ensure!(prepared.contains(place), "{place} is not comic's");
+            }
+        }
+    }
+    Ok(())
+}

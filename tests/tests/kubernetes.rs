@@ -1,0 +1,421 @@
+//! The Kubernetes manifests of every overlay: read strictly, held against what a cluster should ask of them, and against the
+//! programs themselves.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail, ensure};
+use comic_proto::Access;
+use comic_tests::kubernetes::{Cluster, applicable, render, strictly};
+use comic_tests::repository::root;
+use comic_tests::system::{System, help, program};
+use k8s_openapi::api::core::v1::{Container, PodSpec, Probe};
+use k8s_openapi::api::networking::v1::{
+    NetworkPolicyEgressRule, NetworkPolicyIngressRule, NetworkPolicyPeer, NetworkPolicyPort, NetworkPolicySpec,
+};
+use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::LabelSelector;
+use k8s_openapi::apimachinery::pkg::util::intstr::IntOrString;
+use serde_json::{Value, json};
+
+const LIMIT: Duration = Duration::from_secs(120);
+const NAME: &str = "app.kubernetes.io/name";
+
+/// Does the same with every overlay.
+fn each(check: impl Fn(&Cluster) -> Result<()>) -> Result<()> {
+    for directory in applicable()? {
+        let cluster = render(&directory).and_then(Cluster::read);
+        cluster.and_then(|cluster| check(&cluster)).with_context(|| directory.display().to_string())?;
+    }
+    Ok(())
+}
+
+fn container(pod: &PodSpec) -> Result<&Container> {
+    let [container] = &pod.containers[..] else { bail!("{} containers", pod.containers.len()) };
+    ensure!(pod.init_containers.is_none() && pod.ephemeral_containers.is_none(), "other containers");
+    Ok(container)
+}
+
+fn both(cluster: &Cluster) -> Result<[&PodSpec; 2]> {
+    Ok([cluster.learner_pod()?, cluster.actor_pod()?])
+}
+
+/// The value behind an option.
+fn option<'a>(container: &'a Container, name: &str) -> Result<&'a str> {
+    let args = container.args.as_deref().unwrap_or_default();
+    let at = args.iter().position(|arg| arg == name).with_context(|| format!("no {name} in {args:?}"))?;
+    Ok(args.get(at + 1).with_context(|| format!("nothing behind {name}"))?)
+}
+
+fn environment(container: &Container) -> BTreeMap<&str, &str> {
+    let variables = container.env.iter().flatten();
+    variables.filter_map(|variable| Some((variable.name.as_str(), variable.value.as_deref()?))).collect()
+}
+
+#[test]
+fn what_kubernetes_does_not_know_is_refused() -> Result<()> {
+    let manifest = |field: &str| {
+        json!({
+            "apiVersion": "v1", "kind": "Service", "metadata": { "name": "a" },
+            "spec": { "ports": [{ "port": 1, field: "grpc" }] },
+        })
+    };
+    strictly::<k8s_openapi::api::core::v1::Service>(manifest("name"))?;
+    let refused = strictly::<k8s_openapi::api::core::v1::Service>(manifest("nmae"));
+    let refused = refused.err().context("it is taken")?.to_string();
+    ensure!(refused.contains(".spec.ports[0].nmae"), "{refused}");
+    Ok(())
+}
+
+#[test]
+fn what_is_taken_is_asked_for_and_limited() -> Result<()> {
+    each(|cluster| {
+        for pod in both(cluster)? {
+            let resources = container(pod)?.resources.as_ref().context("no resources")?;
+            let (requests, limits) = (resources.requests.as_ref(), resources.limits.as_ref());
+            for name in ["cpu", "memory"] {
+                let request = amount(requests.and_then(|all| all.get(name)).context("nothing is asked for")?)?;
+                let limit = amount(limits.and_then(|all| all.get(name)).context("there is no limit")?)?;
+                ensure!(request > 0.0 && request <= limit, "{name}: {request} of {limit}");
+            }
+        }
+        Ok(())
+    })
+}
+
+/// What a quantity stands for, as far as ours are written.
+fn amount(Quantity(text): &Quantity) -> Result<f64> {
+    let units = [("m", 1e-3), ("Mi", 2f64.powi(20)), ("Gi", 2f64.powi(30))];
+    let unit = units.iter().find_map(|(unit, factor)| Some((text.strip_suffix(unit)?, *factor)));
+    let (number, factor) = unit.unwrap_or((text, 1.0));
+    Ok(number.parse::<f64>().with_context(|| format!("{text} is no quantity"))? * factor)
+}
+
+/// https://kubernetes.io/docs/concepts/security/pod-security-standards, the standard `restricted`, and more.
+#[test]
+fn pods_are_restricted() -> Result<()> {
+    let user = dockerfile()?.lines().find_map(|line| line.strip_prefix("USER ")?.split(':').next()?.parse().ok());
+    each(|cluster| {
+        let labels = cluster.namespace.metadata.labels.as_ref().context("no labels")?;
+        ensure!(labels.get("pod-security.kubernetes.io/enforce").is_some_and(|level| level == "restricted"));
+        for pod in both(cluster)? {
+            let whole = pod.security_context.as_ref().context("no security context")?;
+            ensure!(whole.run_as_non_root == Some(true) && whole.run_as_user == user && user > Some(0), "who runs it?");
+            ensure!(whole.fs_group.is_some() && whole.fs_group == whole.run_as_group, "it cannot read its Secret");
+            ensure!(whole.seccomp_profile.as_ref().is_some_and(|profile| profile.type_ == "RuntimeDefault"), "seccomp");
+            ensure!([pod.host_network, pod.host_pid, pod.host_ipc].iter().all(Option::is_none), "a share of the host");
+            ensure!(pod.automount_service_account_token == Some(false), "a token for the cluster");
+            let container = container(pod)?;
+            let own = container.security_context.as_ref().context("no security context")?;
+            ensure!(own.allow_privilege_escalation == Some(false) && own.privileged.is_none(), "privileges");
+            ensure!(own.read_only_root_filesystem == Some(true), "it writes into its image");
+            let capabilities = own.capabilities.as_ref().context("capabilities")?;
+            ensure!(
+                capabilities.drop.as_deref() == Some(&["ALL".to_owned()]) && capabilities.add.is_none(),
+                "capabilities"
+            );
+            for volume in pod.volumes.iter().flatten() {
+                ensure!(volume.secret.is_some() || volume.empty_dir.is_some(), "what is {}?", volume.name);
+            }
+        }
+        Ok(())
+    })
+}
+
+#[test]
+fn probes_ask_what_answers() -> Result<()> {
+    each(|cluster| {
+        let learner = container(cluster.learner_pod()?)?;
+        for (probe, path) in [
+            (&learner.startup_probe, "/healthz"),
+            (&learner.liveness_probe, "/healthz"),
+            (&learner.readiness_probe, "/readyz"),
+        ] {
+            let asked = probe.as_ref().and_then(|probe| probe.http_get.as_ref()).context("no probe over HTTP")?;
+            ensure!(asked.path.as_deref() == Some(path) && asked.scheme.is_none(), "{asked:?}");
+            ensure!(asked.port == IntOrString::String("metrics".into()), "{asked:?}");
+        }
+        let actor = container(cluster.actor_pod()?)?;
+        let asked = actor.readiness_probe.as_ref().and_then(|probe: &Probe| probe.exec.as_ref()?.command.as_deref());
+        ensure!(asked == Some(&["comic-actor".to_owned(), "health".to_owned()]), "{asked:?}");
+        ensure!(actor.liveness_probe.is_none(), "an actor that waits for its learner would be restarted");
+        let pulse = dockerfile()?
+            .lines()
+            .find_map(|line| Some(line.split("COMIC_PULSE=").nth(1)?.split(' ').next()?.to_owned()));
+        let pulse = PathBuf::from(pulse.context("the image has no pulse")?);
+        let mounts = actor.volume_mounts.iter().flatten();
+        ensure!(
+            mounts.into_iter().any(|mount| pulse.starts_with(&mount.mount_path)),
+            "{} cannot be written",
+            pulse.display()
+        );
+        Ok(())
+    })
+}
+
+#[test]
+fn a_learner_has_time_for_its_last_checkpoint_and_an_actor_for_its_unrolls() -> Result<()> {
+    each(|cluster| {
+        ensure!(cluster.learner_pod()?.termination_grace_period_seconds > Some(30));
+        ensure!(cluster.actor_pod()?.termination_grace_period_seconds > Some(5));
+        Ok(())
+    })
+}
+
+#[test]
+fn names_and_ports_agree_with_each_other_and_with_the_programs() -> Result<()> {
+    let grpc = default_of("--port <PORT>", &help("comic-learner", &[])?)?;
+    each(|cluster| {
+        let learner = container(cluster.learner_pod()?)?;
+        let metrics: i32 = option(learner, "--metrics-port")?.parse()?;
+        let ports =
+            learner.ports.iter().flatten().map(|port| (port.name.as_deref().unwrap_or_default(), port.container_port));
+        ensure!(
+            ports.collect::<BTreeMap<_, _>>() == BTreeMap::from([("grpc", grpc), ("metrics", metrics)]),
+            "{:?}",
+            learner.ports
+        );
+        ensure!(dockerfile()?.contains(&format!("\nEXPOSE {grpc} {metrics}\n")), "the image exposes other ports");
+
+        let service = cluster.service.spec.as_ref().context("no spec")?;
+        for port in service.ports.iter().flatten() {
+            ensure!(port.target_port == port.name.clone().map(IntOrString::String), "{port:?}");
+            ensure!(
+                [("grpc", grpc), ("metrics", metrics)].contains(&(port.name.as_deref().unwrap_or_default(), port.port))
+            );
+        }
+        ensure!(service.cluster_ip.as_deref() == Some("None"), "one learner needs no virtual address");
+        ensure!(
+            service.publish_not_ready_addresses == Some(true),
+            "who is never ready could not say that a run is over"
+        );
+        let name = cluster.service.metadata.name.as_deref().unwrap_or_default();
+        let set = &cluster.learner.spec;
+        ensure!(set.service_name.as_deref() == Some(name) && set.replicas == Some(1), "one learner behind its Service");
+        let labels = set.template.metadata.as_ref().and_then(|metadata| metadata.labels.as_ref());
+        ensure!(labels == set.selector.match_labels.as_ref() && labels == service.selector.as_ref(), "{labels:?}");
+
+        let variables = environment(container(cluster.actor_pod()?)?);
+        ensure!(variables["COMIC_LEARNER"] == format!("https://{name}:{grpc}"), "{variables:?}");
+        ensure!(environment(learner)["COMIC_LEARNER"] == format!("https://localhost:{grpc}"));
+        Ok(())
+    })
+}
+
+/// What `--help` says is taken where nothing is given.
+fn default_of(option: &str, help: &str) -> Result<i32> {
+    let behind = help.split(option).nth(1).with_context(|| format!("no {option}"))?;
+    let default = behind.split("[default: ").nth(1).and_then(|text| text.split(']').next());
+    Ok(default.context("no default")?.parse()?)
+}
+
+#[test]
+fn images_are_pinned_to_this_version_everywhere() -> Result<()> {
+    let expected = ["comic-learner", "comic-actor"].map(|name| format!("{name}:{}", env!("CARGO_PKG_VERSION")));
+    each(|cluster| {
+        for (pod, image) in both(cluster)?.into_iter().zip(&expected) {
+            ensure!(container(pod)?.image.as_ref() == Some(image), "{:?}", container(pod)?.image);
+        }
+        Ok(())
+    })?;
+    for file in ["compose.yaml", "compose.tls.yaml", "Dockerfile", "README.md"] {
+        let text = fs::read_to_string(root().join("deploy").join(file))?;
+        let named = text.split([' ', '\n', '=', '`', '/']).filter(|word| word.contains(':'));
+        let ours: Vec<_> =
+            named.filter(|word| ["comic-learner:", "comic-actor:"].iter().any(|name| word.starts_with(name))).collect();
+        ensure!(!ours.is_empty(), "{file} names no image");
+        ensure!(ours.iter().all(|image| expected.iter().any(|expected| expected == image)), "{file}: {ours:?}");
+    }
+    Ok(())
+}
+
+#[test]
+fn actors_are_a_job_that_grows_and_ends_as_their_exit_codes_say() -> Result<()> {
+    each(|cluster| {
+        let job = cluster.actors.spec.as_ref().context("no spec")?;
+        ensure!(job.completion_mode.as_deref() == Some("Indexed"), "only an indexed Job grows");
+        let parallelism = job.parallelism.context("no parallelism")?;
+        ensure!(job.completions == Some(parallelism), "{parallelism} at once of {:?}", job.completions);
+        let pod = cluster.actor_pod()?;
+        ensure!(pod.restart_policy.as_deref() == Some("Never"), "a policy for failures takes this");
+        let name = container(pod)?.name.as_str();
+        let rules = &job.pod_failure_policy.as_ref().context("no policy for failures")?.rules;
+        let of_code = |code| {
+            let mut found = rules.iter().filter(|rule| {
+                let codes = rule.on_exit_codes.as_ref();
+                codes.is_some_and(|codes| {
+                    codes.container_name.as_deref() == Some(name)
+                        && codes.operator == "In"
+                        && codes.values.contains(&code)
+                })
+            });
+            found.next().map(|rule| rule.action.as_str())
+        };
+        ensure!(of_code(2) == Some("FailJob") && of_code(1) == Some("Ignore"), "{rules:?}");
+        let first = rules.first().and_then(|rule| Some((rule.action.as_str(), rule.on_pod_conditions.as_deref()?)));
+        ensure!(
+            first.is_some_and(|(action, conditions)| action == "Ignore" && conditions[0].type_ == "DisruptionTarget")
+        );
+
+        let budget = cluster.budget.spec.as_ref().context("no spec")?;
+        ensure!(
+            matches!(budget.min_available, Some(IntOrString::Int(kept)) if 0 < kept && kept < parallelism),
+            "{budget:?}"
+        );
+        ensure!(
+            budget.unhealthy_pod_eviction_policy.as_deref() == Some("AlwaysAllow"),
+            "a learner away holds up drains"
+        );
+        let labels = job.template.metadata.as_ref().and_then(|metadata| metadata.labels.as_ref());
+        ensure!(budget.selector.as_ref().and_then(|selector| selector.match_labels.as_ref()) == labels);
+        let spread = pod.topology_spread_constraints.iter().flatten().next().context("they are not spread")?;
+        ensure!(spread.label_selector.as_ref().and_then(|selector| selector.match_labels.as_ref()) == labels);
+        let allowed: i32 = option(container(cluster.learner_pod()?)?, "--max-actors")?.parse()?;
+        ensure!(parallelism <= allowed, "{parallelism} actors, and the learner takes {allowed}");
+        Ok(())
+    })
+}
+
+#[test]
+fn only_actors_reach_the_learners_port() -> Result<()> {
+    each(|cluster| {
+        let everybody = cluster.policies["comic"].spec.as_ref().context("no spec")?;
+        let chosen = everybody.pod_selector.as_ref().context("no pods")?;
+        ensure!(chosen.match_labels.is_none() && chosen.match_expressions.is_none(), "not everybody");
+        ensure!(everybody.policy_types.as_deref() == Some(&["Ingress".to_owned(), "Egress".to_owned()]), "one way");
+        ensure!(everybody.ingress.is_none() && everybody.egress.is_none(), "somebody gets through");
+        // Beside that one, each policy lets somebody through: this is all of it.
+        let learner =
+            allowed(cluster, "comic-learner", |policy| policy.ingress.iter().flatten().map(ingress).collect())?;
+        let from_actors = (json!({ NAME: "comic-actor" }), json!(null), vec!["TCP 7070".to_owned()]);
+        let from_monitoring =
+            (json!(null), json!({ "kubernetes.io/metadata.name": "monitoring" }), vec!["TCP 9090".to_owned()]);
+        ensure!(learner == [from_actors, from_monitoring], "{learner:?}");
+        let actor = allowed(cluster, "comic-actor", |policy| policy.egress.iter().flatten().map(egress).collect())?;
+        let to_learner = (json!({ NAME: "comic-learner" }), json!(null), vec!["TCP 7070".to_owned()]);
+        let names = (json!(null), json!(null), vec!["UDP 53".to_owned(), "TCP 53".to_owned()]);
+        ensure!(actor == [to_learner, names], "{actor:?}");
+        ensure!(cluster.policies.len() == 3, "{:?}", cluster.policies.keys());
+        Ok(())
+    })
+}
+
+/// Pods, namespaces and ports.
+type Way = (Value, Value, Vec<String>);
+
+/// Who gets through by the policy of this name, which is for the pods of this name.
+fn allowed(cluster: &Cluster, name: &str, ways: impl Fn(&NetworkPolicySpec) -> Result<Vec<Way>>) -> Result<Vec<Way>> {
+    let policy = cluster.policies.get(name).and_then(|policy| policy.spec.as_ref()).context("no such policy")?;
+    let chosen = policy.pod_selector.as_ref().context("no pods")?;
+    let labels = chosen.match_labels.as_ref().context("all pods")?;
+    ensure!(labels[NAME] == name && labels.len() == 1 && chosen.match_expressions.is_none(), "{chosen:?}");
+    ways(policy)
+}
+
+fn ingress(rule: &NetworkPolicyIngressRule) -> Result<Way> {
+    way(rule.from.as_deref(), rule.ports.as_deref())
+}
+
+fn egress(rule: &NetworkPolicyEgressRule) -> Result<Way> {
+    way(rule.to.as_deref(), rule.ports.as_deref())
+}
+
+fn way(peers: Option<&[NetworkPolicyPeer]>, ports: Option<&[NetworkPolicyPort]>) -> Result<Way> {
+    let labels = |selector: Option<&LabelSelector>| -> Result<Value> {
+        ensure!(selector.is_none_or(|selector| selector.match_expressions.is_none()), "an expression");
+        Ok(serde_json::to_value(selector.and_then(|selector| selector.match_labels.as_ref()))?)
+    };
+    let ports = ports.context("all ports")?.iter().map(|port| match port.port {
+        Some(IntOrString::Int(number)) if port.end_port.is_none() => {
+            Ok(format!("{} {number}", port.protocol.as_deref().unwrap_or("TCP")))
+        }
+        _ => bail!("not one number: {port:?}"),
+    });
+    let ports = ports.collect::<Result<_>>()?;
+    match peers {
+        None => Ok((Value::Null, Value::Null, ports)),
+        Some([peer]) => {
+            ensure!(peer.ip_block.is_none(), "{peer:?}");
+            Ok((labels(peer.pod_selector.as_ref())?, labels(peer.namespace_selector.as_ref())?, ports))
+        }
+        Some(several) => bail!("not one peer: {several:?}"),
+    }
+}
+
+/// Secrets are made by hand: everything that the programs read is in a Secret as deploy/README.md makes it.
+#[test]
+fn secrets_hold_what_the_programs_read() -> Result<()> {
+    let readme = fs::read_to_string(root().join("deploy/README.md"))?.replace("\\\n", "");
+    each(|cluster| {
+        for pod in both(cluster)? {
+            let container = container(pod)?;
+            let volume = pod.volumes.iter().flatten().find(|volume| volume.name == "access").context("no volume")?;
+            let secret =
+                volume.secret.as_ref().and_then(|secret| secret.secret_name.as_deref()).context("no Secret")?;
+            let command = readme.lines().find(|line| line.contains(&format!("create secret generic {secret} ")));
+            let made: BTreeSet<_> = command
+                .with_context(|| format!("nobody makes the Secret {secret}"))?
+                .split_whitespace()
+                .filter_map(|word| word.strip_prefix("--from-file=access/"))
+                .collect();
+            let read: BTreeSet<_> = container
+                .args
+                .iter()
+                .flatten()
+                .map(String::as_str)
+                .chain(environment(container).into_values())
+                .collect();
+            let read: BTreeSet<_> = read.into_iter().filter_map(|word| word.strip_prefix("/access/")).collect();
+            ensure!(read == made, "read are {read:?}, made are {made:?}");
+        }
+        Ok(())
+    })
+}
+
+/// The real programs with the arguments of the manifests: the learner serves, and an actor joins it.
+#[tokio::test]
+async fn the_programs_take_what_the_manifests_tell_them() -> Result<()> {
+    let access = tempfile::tempdir()?;
+    let mut certs = std::process::Command::new(program("comic-learner")?);
+    certs.args(["certs", "--token", "--name", "comic-learner", "localhost", "--out"]).arg(access.path());
+    ensure!(certs.output()?.status.success(), "no certificates");
+    let place = |word: &str| match word.strip_prefix("/access/") {
+        Some(file) => access.path().join(file).display().to_string(),
+        None => word.to_owned(),
+    };
+    for directory in applicable()? {
+        let cluster = Cluster::read(render(&directory)?)?;
+        let (learner, actor) = (container(cluster.learner_pod()?)?, container(cluster.actor_pod()?)?);
+        let mut told: Vec<String> = learner.args.iter().flatten().map(|word| place(word)).collect();
+        // Where the run lies and which ports are free, the test decides.
+        let run = told.iter().position(|word| word == "--run").context("no --run")?;
+        told.drain(run..run + 2);
+        let port = told.iter().position(|word| word == "--metrics-port").context("no --metrics-port")?;
+        "0".clone_into(&mut told[port + 1]);
+        let token = environment(learner).get("COMIC_TOKEN_FILE").map(|file| place(file)).context("no token")?;
+        told.extend(["--token-file".to_owned(), token]);
+        let mut system = System::new(&told.iter().map(String::as_str).collect::<Vec<_>>())?;
+        system.host = "localhost".into();
+        let variables = environment(actor);
+        let file = |name: &str| Some(PathBuf::from(place(variables.get(name)?)));
+        system.access = Access {
+            ca: file("COMIC_CA"),
+            cert: file("COMIC_CERT"),
+            key: file("COMIC_KEY"),
+            token_file: file("COMIC_TOKEN_FILE"),
+        };
+        system.start_learner(LIMIT).await.with_context(|| directory.display().to_string())?;
+        let access = system.access.clone();
+        let mut actor = system.start_actor_with(&access, |command| {
+            command.args(actor.args.iter().flatten());
+        })?;
+        actor.until_log_holds("joined the learner", LIMIT).await?;
+    }
+    Ok(())
+}
+
+fn dockerfile() -> Result<String> {
+    Ok(fs::read_to_string(root().join("deploy/Dockerfile"))?)
+}

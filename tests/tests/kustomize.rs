@@ -1,0 +1,26 @@
+//! The rendering that the other tests go by is kustomize's own.
+
+use std::path::Path;
+use std::process::Command;
+
+use anyhow::{Context, Result, ensure};
+use comic_tests::kubernetes::{applicable, manifests_in, render};
+
+#[test]
+fn kustomize_renders_the_same() -> Result<()> {
+    for directory in applicable()? {
+        let theirs = manifests_in(&kustomize(&directory)?)?;
+        let ours = render(&directory)?;
+        ensure!(ours == theirs, "{}: ours is {ours:#?}, theirs {theirs:#?}", directory.display());
+    }
+    Ok(())
+}
+
+/// What kustomize makes of a directory, or kubectl, which has it built in.
+fn kustomize(directory: &Path) -> Result<String> {
+    let alone = Command::new("kustomize").arg("build").arg(directory).output();
+    let output = alone.or_else(|_| Command::new("kubectl").arg("kustomize").arg(directory).output());
+    let output = output.context("neither kustomize nor kubectl can be started")?;
+    ensure!(output.status.success(), "{}: {}", directory.display(), String::from_utf8_lossy(&output.stderr));
+    Ok(String::from_utf8(output.stdout)?)
+}
