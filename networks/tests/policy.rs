@@ -212,7 +212,10 @@ fn statistics_that_do_not_fit_change_nothing() {
 fn the_value_has_one_output_per_reward_term_and_sees_the_clip() {
     let (_store, policy) = policy(&network(), 1, &[0.0; 3]);
     let store = nn::VarStore::new(Device::Cpu);
-    let value = Value::new(&store.root(), &spec(), &network());
+    let value = {
+        let _guard = GENERATOR.lock().unwrap();
+        Value::new(&store.root(), &spec(), &network())
+    };
     let [proprioception, task, ..] = inputs();
     let unrolled = |tensor: &Tensor| tensor.reshape([4, 6, -1]);
     let observation = policy.normalise(&unrolled(&proprioception), &unrolled(&task), None, &Routing::single());

@@ -117,10 +117,11 @@ impl Process {
     pub async fn until_log_holds(&mut self, text: &str, limit: Duration) -> Result<()> {
         let deadline = Instant::now() + limit;
         loop {
+            // Asked first: what it wrote before it ended is there then.
+            let ended = self.ended()?;
             if self.log().contains(text) {
                 return Ok(());
             }
-            let ended = self.ended()?;
             if ended.is_some() || Instant::now() > deadline {
                 bail!("`{text}` is not in the log ({ended:?}): {}", self.log());
             }

@@ -24,12 +24,20 @@ pub fn books(status: &Status) -> Books {
     status.books.unwrap_or_default()
 }
 
+/// A status; a learner that is too busy for an answer is asked again.
+///
+/// # Errors
+/// When it does not answer, in time.
+pub async fn now(system: &mut System) -> Result<Status> {
+    system.until("an answer", LIMIT, |status| Some(status.clone())).await
+}
+
 /// Training goes beyond whatever an actor that is gone can have left behind.
 ///
 /// # Errors
 /// When it does not, in time.
 pub async fn trains_on(system: &mut System, what: &str) -> Result<()> {
-    let before = books(&system.status().await?).trained;
+    let before = books(&now(system).await?).trained;
     system.until(what, LIMIT, |status| (books(status).trained >= before + BEYOND_WHAT_IS_LEFT).then_some(())).await
 }
 
@@ -38,7 +46,7 @@ pub async fn trains_on(system: &mut System, what: &str) -> Result<()> {
 /// # Errors
 /// When it does not, in time.
 pub async fn parameters_arrive(system: &mut System, what: &str) -> Result<()> {
-    let before = metric(&system.status().await?, "version");
+    let before = metric(&now(system).await?, "version");
     system
         .until(what, LIMIT, |status| {
             let grown = metric(status, "version") - before;
@@ -101,7 +109,7 @@ pub async fn leaves(actor: Process) -> Result<()> {
 /// # Errors
 /// When they do not.
 pub async fn the_books_balance_at_the_end(mut system: System) -> Result<()> {
-    let books = books(&system.status().await?);
+    let books = books(&now(&mut system).await?);
     ensure!(balance(&books), "{books:?}");
     ensure!(books.dropped_invalid == 0, "no actor sends what is invalid: {books:?}");
     let learner = system.learner.take().context("no learner")?;

@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::fs::{self, OpenOptions};
-use std::net::TcpListener;
+use std::net::{TcpListener, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -102,6 +102,8 @@ pub struct System {
     /// Where the learner listens; this machine alone unless given.
     pub host: String,
     port: u16,
+    /// While it lives the port is this system's.
+    _kept: UdpSocket,
     arguments: Vec<String>,
     /// How actors and the tests themselves reach the learner; with an authority, by https.
     pub access: Access,
@@ -122,10 +124,12 @@ impl System {
     /// # Errors
     /// No directory or port to be had.
     pub fn new(arguments: &[&str]) -> Result<Self> {
+        let (port, kept) = free_port()?;
         Ok(Self {
             directory: tempfile::tempdir().context("cannot make a directory")?,
             host: String::from("127.0.0.1"),
-            port: free_port()?,
+            port,
+            _kept: kept,
             arguments: arguments.iter().map(|argument| (*argument).to_owned()).collect(),
             access: Access::default(),
             log_level: None,
@@ -344,10 +348,15 @@ pub fn metric(status: &Status, name: &str) -> f64 {
     metrics[name].as_f64().unwrap_or_default()
 }
 
-/// A port that is free now, below the ephemeral range so that no client gets it while the learner is down.
-fn free_port() -> Result<u16> {
+/// A port that is free now, below the ephemeral range so that no client gets it while the learner is down, and what keeps
+/// other tests of this process from it: UDP has ports of its own, so the learner can listen there.
+fn free_port() -> Result<(u16, UdpSocket)> {
     let offset = u16::try_from(std::process::id() % 10_000)?;
-    let candidates = (0..10_000).map(|step| 20_000 + (offset + step) % 10_000);
-    let mut free = candidates.filter(|port| TcpListener::bind(("127.0.0.1", *port)).is_ok());
-    free.next().context("no port from 20000 to 29999 is free")
+    let mut candidates = (0..10_000).map(|step| 20_000 + (offset + step) % 10_000);
+    let free = candidates.find_map(|port| {
+        let kept = UdpSocket::bind(("127.0.0.1", port)).ok()?;
+        TcpListener::bind(("127.0.0.1", port)).ok()?;
+        Some((port, kept))
+    });
+    free.context("no port from 20000 to 29999 is free")
 }

@@ -8,7 +8,7 @@ use anyhow::{Context as _, Result, ensure};
 use comic_proto::v1::Status;
 use comic_tests::process::Process;
 use comic_tests::repository::root;
-use comic_tests::steps::{LIMIT, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on};
+use comic_tests::steps::{LIMIT, leaves, now, parameters_arrive, the_books_balance_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
 
 /// Far enough for another year in every line of a log.
@@ -31,7 +31,7 @@ async fn nothing_is_lost_when_the_clock_is_set() -> Result<()> {
         says_another_year(&mut actor, jump).await?;
         trains_on(&mut system, "training goes on").await?;
         parameters_arrive(&mut system, "new parameters arrive").await?;
-        let Status { actors, .. } = system.status().await?;
+        let Status { actors, .. } = now(&mut system).await?;
         let actors = actors.context("no actors")?;
         ensure!((actors.alive, actors.lost) == (1, 0), "after a jump of {jump} s: {actors:?}");
     }

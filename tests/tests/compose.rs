@@ -4,7 +4,7 @@
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use comic_tests::compose::{Project, docker};
@@ -37,7 +37,7 @@ async fn containers_survive_what_happens_to_them_and_their_books_balance() -> Re
     let project = Project::new("faults", &["compose.yaml"]);
     project.up(2)?;
     trains_on_with(2, &project, "two actors train").await?;
-    they_are_what_the_image_promises(&project)?;
+    they_are_what_the_image_promises(&project).await?;
     ensure!(metrics(&project)?.contains("comic_actors{state=\"alive\"} 2\n"), "Prometheus sees two actors");
 
     let [killed, kept] = &project.containers("actor")?[..] else { bail!("not two actors") };
@@ -81,7 +81,7 @@ async fn containers_survive_what_happens_to_them_and_their_books_balance() -> Re
 }
 
 /// Nobody's root, nothing to write into, the program itself as the first process, and well by its own account.
-fn they_are_what_the_image_promises(project: &Project) -> Result<()> {
+async fn they_are_what_the_image_promises(project: &Project) -> Result<()> {
     for (service, program) in [("learner", "comic-learner"), ("actor", "comic-actor")] {
         for container in project.containers(service)? {
             let size = docker(&["image", "inspect", "--format", "{{.Size}}", &container.inspect(".Image")?])?;
@@ -90,7 +90,12 @@ fn they_are_what_the_image_promises(project: &Project) -> Result<()> {
             ensure!(container.exec(&["id", "--user"])?.trim() == "10001", "another user");
             ensure!(container.exec(&["touch", "/usr/local/bin/file"]).is_err(), "it can write into its image");
             ensure!(container.inspect(".HostConfig.ReadonlyRootfs")? == "true", "it could as root");
-            container.exec(&[program, "health"])?;
+            // An actor is well from its first steps on, which are some seconds after it joined.
+            let begun = Instant::now();
+            while let Err(error) = container.exec(&[program, "health"]) {
+                ensure!(begun.elapsed() < LIMIT, "{service}: {error:#}");
+                tokio::time::sleep(Duration::from_secs(1)).await;
+            }
         }
     }
     let actor = project.containers("actor")?.into_iter().next().context("no actor")?;
@@ -137,7 +142,7 @@ async fn containers_whose_configuration_is_wrong_are_given_up() -> Result<()> {
 #[tokio::test]
 async fn containers_end_when_their_run_is_over() -> Result<()> {
     let mut project = Project::new("over", &["compose.yaml"]);
-    project.tell("--set budget.updates=20");
+    project.tell("--set budget.updates=200");
     project.up(2)?;
     let containers = [project.containers("actor")?, vec![project.container("learner")?]].concat();
     ensure!(containers.len() == 3, "{containers:?}");

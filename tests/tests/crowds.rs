@@ -6,7 +6,7 @@ use std::time::Duration;
 use anyhow::{Context as _, Result, ensure};
 use comic_proto::v1::Status;
 use comic_tests::steps::{
-    LIMIT, books, kill_and_restart_the_learner, newest_checkpoint, the_books_balance_at_the_end, trains_on,
+    LIMIT, books, kill_and_restart_the_learner, newest_checkpoint, now, the_books_balance_at_the_end, trains_on,
 };
 use comic_tests::system::{SMALL, System, program};
 use serde_json::Value;
@@ -47,7 +47,7 @@ async fn fifty_actors_come_back_to_a_learner_that_was_killed() -> Result<()> {
     trains_on(&mut system, "fifty actors' unrolls are trained on").await?;
     newest_checkpoint(&mut system).await?;
     trains_on(&mut system, "and some after a checkpoint").await?;
-    let before = books(&system.status().await?).trained;
+    let before = books(&now(&mut system).await?).trained;
     let resumed = books(&kill_and_restart_the_learner(&mut system).await?).trained;
     actors(&mut system, 50).await?;
     trains_on(&mut system, "fifty actors' unrolls are trained on again").await?;

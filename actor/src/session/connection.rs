@@ -119,11 +119,8 @@ impl Connector {
     }
 
     async fn client(&self) -> Result<Client, Failure> {
-        // In the middle of a renewal the files may not fit together: who was let in once tries again.
-        let renewed = |error: AccessError| match self.actor {
-            Some(_) => Failure::Lost(chain(&error)),
-            None => Failure::Fatal(error.into()),
-        };
+        // They fitted together when this actor started: in the middle of a renewal they may not, and do a moment later.
+        let renewed = |error: AccessError| Failure::Lost(chain(&error));
         let (endpoint, bearer) = (self.endpoint().map_err(renewed)?, self.access.bearer().map_err(renewed)?);
         let channel = endpoint.connect().await.map_err(|error| match self.is_barred(&error) {
             true => Failure::Fatal(self.unwelcome(chain(&error))),

@@ -157,7 +157,7 @@ impl World {
 
     /// What [`serve`] returned after the signal.
     pub(crate) async fn ended(self) -> Result<()> {
-        within(Duration::from_secs(5), self.server).await.unwrap()
+        within(Duration::from_secs(20), self.server).await.unwrap()
     }
 }
 
