@@ -2,6 +2,10 @@
 //! libraries' directories into the run path, so a binary runs without LD_LIBRARY_PATH.
 
 fn main() {
+    write_run_path();
+}
+
+pub(crate) fn write_run_path() {
     println!("cargo:rerun-if-env-changed=LIBTORCH");
     println!("cargo:rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
     let directories =

@@ -351,7 +351,7 @@ fn together(experiment: &Experiment) -> Result<(), Fault> {
 }
 
 fn learner(learner: &Learner) -> Result<(), Fault> {
-    let Learner { threads, checkpoint_seconds, checkpoints_kept, metrics_seconds, restore_after } = learner;
+    let Learner { threads, checkpoint_seconds, checkpoints_kept, metrics_seconds, restore_after, .. } = learner;
     ensure("learner.threads", threads, (1..=1024).contains(threads), "must be 1 to 1024")?;
     ensure("learner.checkpoint_seconds", checkpoint_seconds, *checkpoint_seconds > 0.0, POSITIVE)?;
     ensure("learner.checkpoints_kept", checkpoints_kept, *checkpoints_kept > 0, AT_LEAST_ONE)?;

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{BallCatch, Gaps, GetUp, GoToTarget, Network, TaskName, Tracking, Walls};
+use crate::{BallCatch, DeviceName, Gaps, GetUp, GoToTarget, MatmulPrecision, Network, TaskName, Tracking, Walls};
 
 /// A whole experiment, resolved: what is learnt, from which motion, how, and for how long.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -286,6 +286,10 @@ impl Default for WarmStart {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Learner {
+    /// Where the update runs.
+    pub device: DeviceName,
+    /// On XLA, how precisely matrices are multiplied; the losses are float32 everywhere.
+    pub matmul_precision: MatmulPrecision,
     /// Threads of libtorch in the update.
     pub threads: usize,
     /// Seconds between checkpoints.
@@ -301,7 +305,15 @@ pub struct Learner {
 
 impl Default for Learner {
     fn default() -> Self {
-        Self { threads: 1, checkpoint_seconds: 60.0, checkpoints_kept: 3, metrics_seconds: 5.0, restore_after: 10 }
+        Self {
+            device: DeviceName::Cpu,
+            matmul_precision: MatmulPrecision::Highest,
+            threads: 1,
+            checkpoint_seconds: 60.0,
+            checkpoints_kept: 3,
+            metrics_seconds: 5.0,
+            restore_after: 10,
+        }
     }
 }
 

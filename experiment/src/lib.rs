@@ -13,6 +13,7 @@
 //! silent. A preset that deviates says so in its own file.
 
 mod check;
+mod device;
 mod document;
 mod fields;
 mod lines;
@@ -22,6 +23,7 @@ mod resolve;
 mod spec;
 mod tasks;
 
+pub use device::*;
 pub use document::*;
 pub use fields::{Difference, find_field, nearest};
 pub use network::*;

@@ -3,11 +3,13 @@
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
-use comic_experiment::{Experiment, LowLevelName, TaskSpec};
+use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
+use comic_networks::to_safetensors;
 use comic_proto::UnrollShape;
 use serde_json::json;
 use tch::{Device, Kind, Tensor};
 
+use crate::device::Backend;
 use crate::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
 
 /// One linear layer's products: rows × inputs → outputs, and whether the gradient flows on to its input.
@@ -19,18 +21,19 @@ struct Product {
 }
 
 impl Product {
-    fn new(rows: i64, inputs: i64, outputs: i64, flows_on: bool) -> Self {
-        let random = |size: [i64; 2]| Tensor::randn(size, (Kind::Float, Device::Cpu));
+    fn new(rows: i64, inputs: i64, outputs: i64, flows_on: bool, device: Device) -> Self {
+        let random = |size: [i64; 2]| Tensor::randn(size, (Kind::Float, device));
         let (input, weight, gradient) = (random([rows, inputs]), random([outputs, inputs]), random([rows, outputs]));
         Self { input, weight, gradient, flows_on }
     }
 
-    fn run(&self) {
-        let _ = self.input.matmul(&self.weight.tr());
-        let _ = self.gradient.tr().matmul(&self.input);
+    /// What is made has to be kept until the step's end, or XLA would see that nobody wants it.
+    fn run(&self) -> Vec<Tensor> {
+        let mut made = vec![self.input.matmul(&self.weight.tr()), self.gradient.tr().matmul(&self.input)];
         if self.flows_on {
-            let _ = self.gradient.matmul(&self.weight);
+            made.push(self.gradient.matmul(&self.weight));
         }
+        made
     }
 }
 
@@ -45,8 +48,8 @@ struct FusedLstm {
 }
 
 impl FusedLstm {
-    fn new(steps: i64, unrolls: i64, inputs: i64, units: i64) -> Self {
-        let random = |size: &[i64]| Tensor::randn(size, (Kind::Float, Device::Cpu));
+    fn new(steps: i64, unrolls: i64, inputs: i64, units: i64, device: Device) -> Self {
+        let random = |size: &[i64]| Tensor::randn(size, (Kind::Float, device));
         let weights = [vec![4 * units, inputs], vec![4 * units, units], vec![4 * units], vec![4 * units]];
         Self {
             input: random(&[steps, unrolls, inputs]).set_requires_grad(true),
@@ -55,16 +58,16 @@ impl FusedLstm {
         }
     }
 
-    fn run(&self) {
+    fn run(&self) -> Vec<Tensor> {
         let (output, ..) = self.input.lstm(&self.state, &self.weights, true, 1, 0.0, true, false, false);
         let inputs: Vec<&Tensor> = self.weights.iter().chain([&self.input]).collect();
-        let _ = Tensor::run_backward(&[output.sum(Kind::Float)], &inputs, false, false);
+        Tensor::run_backward(&[output.sum(Kind::Float)], &inputs, false, false)
     }
 }
 
 /// The least an update can cost: its products, and the LSTM layers of a library.
-#[derive(Default)]
 struct Floor {
+    device: Device,
     products: Vec<Product>,
     lstms: Vec<FusedLstm>,
 }
@@ -74,29 +77,33 @@ impl Floor {
     fn layers(&mut self, rows: i64, input: i64, hidden: &[usize], output: i64, flows_on: bool) {
         let mut width = input;
         for (index, size) in hidden.iter().enumerate() {
-            self.products.push(Product::new(rows, width, *size as i64, flows_on || index > 0));
+            self.products.push(Product::new(rows, width, *size as i64, flows_on || index > 0, self.device));
             width = *size as i64;
         }
         if output > 0 {
-            self.products.push(Product::new(rows, width, output, flows_on || !hidden.is_empty()));
+            self.products.push(Product::new(rows, width, output, flows_on || !hidden.is_empty(), self.device));
         }
     }
 
     /// Stacked LSTM layers over `rows` of `unrolls`; gives the width of the last.
     fn lstm(&mut self, rows: i64, unrolls: i64, input: i64, units: &[usize]) -> i64 {
         units.iter().fold(input, |width, units| {
-            self.lstms.push(FusedLstm::new(rows / unrolls, unrolls, width, *units as i64));
+            self.lstms.push(FusedLstm::new(rows / unrolls, unrolls, width, *units as i64, self.device));
             *units as i64
         })
     }
 
-    fn run(&self) {
-        self.products.iter().for_each(Product::run);
-        self.lstms.iter().for_each(FusedLstm::run);
+    fn run(&self, backend: &Backend) -> Result<()> {
+        let products = self.products.iter().flat_map(Product::run);
+        let made: Vec<Tensor> = products.chain(self.lstms.iter().flat_map(FusedLstm::run)).collect();
+        backend.end_step()?;
+        drop(made);
+        backend.wait()
     }
 }
 
-/// Prints `learner.update` as one JSON line: milliseconds for a gradient step of paper size (128 unrolls of 32), floor
+/// Prints `learner.update` as one JSON line: milliseconds for a gradient step of paper size (128 unrolls of 32) with its
+/// batch on the device, and those for bringing the batch there and the parameters back; floor
 /// the matrix products of the same shapes, forward and backward, on the same threads, and libtorch's own LSTM where there
 /// is one; medians of interleaved runs. Another low level than the MLP is the preset's of its name, and joint training is
 /// `joint-get-up`'s; the figure's name says it. Joint training stands beside the update of its first task alone, in the
@@ -104,7 +111,7 @@ impl Floor {
 ///
 /// # Errors
 /// When libtorch refuses.
-pub fn run(threads: usize, repeats: usize, subject: Subject) -> Result<()> {
+pub fn run(threads: usize, repeats: usize, subject: Subject, device: DeviceName) -> Result<()> {
     tch::set_num_threads(threads as i32);
     tch::manual_seed(1);
     let (preset, figure) = match subject {
@@ -113,21 +120,25 @@ pub fn run(threads: usize, repeats: usize, subject: Subject) -> Result<()> {
         Subject::Joint => ("joint-get-up".to_string(), "learner.update.joint".to_string()),
     };
     let experiment = comic_experiment::resolve(&preset, &[])?;
-    let mut update = Update::new(&experiment)?;
+    let compiled = std::env::current_dir()?.join("target/compiled");
+    let backend = Backend::open(&Learner { device, ..experiment.learner.clone() }, &compiled)?;
+    let mut update = Update::new(&experiment, &backend)?;
     let alone = Experiment { joint: Vec::new(), ..experiment.clone() };
-    let mut one_task = matches!(subject, Subject::Joint).then(|| Update::new(&alone)).transpose()?;
-    let least = floor(&update.spec, &experiment);
+    let mut one_task = matches!(subject, Subject::Joint).then(|| Update::new(&alone, &backend)).transpose()?;
+    let least = floor(&update.spec, &experiment, backend.device());
     let (mut updates, mut one_tasks, mut floors) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut copies, mut reads) = (Vec::new(), Vec::new());
     for repeat in 0..repeats + 2 {
-        let value = update.run()?;
-        let one_task = one_task.as_mut().map(Update::run).transpose()?;
-        let floor = milliseconds(|| -> Result<(), crate::vmpo::Error> {
-            least.run();
-            Ok(())
-        })?;
+        let copy = milliseconds(|| update.refill(&backend))?;
+        let value = update.run(&backend)?;
+        let read = milliseconds(|| to_safetensors(update.learner.policy_store()))?;
+        let one_task = one_task.as_mut().map(|update| update.run(&backend)).transpose()?;
+        let floor = milliseconds(|| least.run(&backend))?;
         // The first two warm up.
         if repeat >= 2 {
             updates.push(value);
+            copies.push(copy);
+            reads.push(read);
             one_tasks.extend(one_task);
             floors.push(floor);
         }
@@ -135,7 +146,8 @@ pub fn run(threads: usize, repeats: usize, subject: Subject) -> Result<()> {
     let (value, floor) = (median(updates), median(floors));
     let mut line = json!({
         "figure": figure, "value": value, "unit": "ms", "floor": floor, "ratio": value / floor,
-        "threads": threads, "repeats": repeats,
+        "threads": threads, "repeats": repeats, "device": device.to_string(), "copy": median(copies),
+        "read_back": median(reads), "compilations": backend.compilations()?,
     });
     if !one_tasks.is_empty() {
         let one_task = median(one_tasks);
@@ -159,33 +171,46 @@ pub enum Subject {
 struct Update {
     spec: TaskSpec,
     learner: VmpoLearner,
+    recorded: Recorded,
     minibatch: MinibatchTensors,
 }
 
 impl Update {
-    fn new(experiment: &Experiment) -> Result<Self> {
+    fn new(experiment: &Experiment, backend: &Backend) -> Result<Self> {
         let spec = TaskSpec::new(experiment, vec!["clip".into()])
             .map_err(|name| anyhow::anyhow!("no observation `{name}`"))?;
-        let learner = VmpoLearner::new(&spec, experiment, &vec![0.0; spec.action], Device::Cpu)?;
-        let minibatch = random_minibatch(&spec, experiment)?;
-        Ok(Self { spec, learner, minibatch })
+        let learner = VmpoLearner::new(&spec, experiment, &vec![0.0; spec.action], backend.device())?;
+        let recorded = Recorded::new(&spec, experiment)?;
+        let minibatch = recorded.to_tensors(backend.device())?;
+        Ok(Self { spec, learner, recorded, minibatch })
+    }
+
+    /// Brings the batch to the device once more.
+    fn refill(&mut self, backend: &Backend) -> Result<()> {
+        self.minibatch = self.recorded.to_tensors(backend.device())?;
+        backend.end_step()?;
+        backend.wait()
     }
 
     /// Milliseconds of a gradient step.
-    fn run(&mut self) -> Result<f64> {
+    fn run(&mut self, backend: &Backend) -> Result<f64> {
         let Self { learner, minibatch, .. } = self;
-        Ok(milliseconds(|| learner.step(minibatch).map(|losses| losses.to_metrics()))?)
+        milliseconds(|| {
+            let losses = learner.step(minibatch)?;
+            backend.end_step()?;
+            Ok::<_, anyhow::Error>(losses.to_metrics())
+        })
     }
 }
 
-fn floor(spec: &TaskSpec, experiment: &Experiment) -> Floor {
+fn floor(spec: &TaskSpec, experiment: &Experiment, device: Device) -> Floor {
     let network = &experiment.network;
     let (unrolls, length) = (experiment.unroll.batch as i64, experiment.unroll.length as i64);
     let (steps, observations) = (unrolls * length, unrolls * (length + 1));
     let (latent, actions) = (network.latent.size as i64, 2 * spec.action as i64);
     let (proprioception, sensed) = (spec.proprioception as i64, (spec.task + spec.proprioception) as i64);
     let primitives = &network.primitives;
-    let mut floor = Floor::default();
+    let mut floor = Floor { device, products: Vec::new(), lstms: Vec::new() };
     let encoded = if latent > 0 { 2 * latent } else { primitives.count as i64 };
     floor.layers(steps, sensed + latent, &network.encoder, encoded, false);
     if network.encoder_linear_path && latent > 0 {
@@ -222,42 +247,88 @@ fn floor(spec: &TaskSpec, experiment: &Experiment) -> Floor {
     floor
 }
 
-fn random_minibatch(spec: &TaskSpec, experiment: &Experiment) -> Result<MinibatchTensors> {
-    let shape = UnrollShape::new(spec, experiment);
-    let unrolls = experiment.unroll.batch;
-    let (rows, observations) = (unrolls * shape.length, unrolls * (shape.length + 1));
-    let (components, weights) = (shape.components, if shape.components > 1 { shape.components } else { 0 });
-    let random = |count: usize| {
-        Vec::<f32>::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu))).context("random numbers")
-    };
-    // Unrolls of all tasks in turn; in the bench every task has one clip.
-    let tasks: Vec<usize> = (0..unrolls).map(|unroll| unroll % spec.tasks.len()).collect();
-    let clips: Vec<u32> = tasks.iter().flat_map(|task| vec![*task as u32; shape.length + 1]).collect();
-    let source = MinibatchSource {
-        proprioception: &random(observations * shape.proprioception)?,
-        task: &random(observations * shape.task)?,
-        previous_latent: &random(rows * shape.latent)?,
-        latent_noise: &random(rows * shape.latent)?,
-        action: &random(rows * shape.action)?,
-        mean: &random(rows * components * shape.action)?,
-        std: &vec![0.7; rows * components * shape.action],
-        log_weights: &vec![-(components as f32).ln(); rows * weights],
-        reward: &random(rows * shape.reward_terms)?,
-        discount: &vec![1.0; rows],
-        valid: &vec![1.0; rows],
-        first: &vec![0.0; observations],
-        state: &vec![0.0; unrolls * shape.state],
-        clip: &clips,
-        image: &[],
-        tasks: &tasks,
-    };
-    let shape = MinibatchShape { unrolls, tasks: spec.tasks.len(), unroll: shape };
-    Ok(MinibatchTensors::new(&source, &shape, Device::Cpu)?)
+/// A batch of made-up unrolls, as it lies in memory when it has come over the wire.
+struct Recorded {
+    shape: MinibatchShape,
+    floats: [Vec<f32>; 13],
+    clips: Vec<u32>,
+    tasks: Vec<usize>,
 }
 
-fn milliseconds<T, E>(work: impl FnOnce() -> Result<T, E>) -> Result<f64, E> {
+impl Recorded {
+    fn new(spec: &TaskSpec, experiment: &Experiment) -> Result<Self> {
+        let shape = UnrollShape::new(spec, experiment);
+        let unrolls = experiment.unroll.batch;
+        let (rows, observations) = (unrolls * shape.length, unrolls * (shape.length + 1));
+        let (components, weights) = (shape.components, if shape.components > 1 { shape.components } else { 0 });
+        let random = |count: usize| {
+            Vec::<f32>::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu))).context("random numbers")
+        };
+        // Unrolls of all tasks in turn; in the bench every task has one clip.
+        let tasks: Vec<usize> = (0..unrolls).map(|unroll| unroll % spec.tasks.len()).collect();
+        Ok(Self {
+            floats: [
+                random(observations * shape.proprioception)?,
+                random(observations * shape.task)?,
+                random(rows * shape.latent)?,
+                random(rows * shape.latent)?,
+                random(rows * shape.action)?,
+                random(rows * components * shape.action)?,
+                vec![0.7; rows * components * shape.action],
+                vec![-(components as f32).ln(); rows * weights],
+                random(rows * shape.reward_terms)?,
+                vec![1.0; rows],
+                vec![1.0; rows],
+                vec![0.0; observations],
+                vec![0.0; unrolls * shape.state],
+            ],
+            clips: tasks.iter().flat_map(|task| vec![*task as u32; shape.length + 1]).collect(),
+            tasks,
+            shape: MinibatchShape { unrolls, tasks: spec.tasks.len(), unroll: shape },
+        })
+    }
+
+    fn to_tensors(&self, device: Device) -> Result<MinibatchTensors> {
+        let [
+            proprioception,
+            task,
+            previous_latent,
+            latent_noise,
+            action,
+            mean,
+            std,
+            log_weights,
+            reward,
+            discount,
+            valid,
+            first,
+            state,
+        ] = &self.floats;
+        let source = MinibatchSource {
+            proprioception,
+            task,
+            previous_latent,
+            latent_noise,
+            action,
+            mean,
+            std,
+            log_weights,
+            reward,
+            discount,
+            valid,
+            first,
+            state,
+            clip: &self.clips,
+            image: &[],
+            tasks: &self.tasks,
+        };
+        Ok(MinibatchTensors::new(&source, &self.shape, device)?)
+    }
+}
+
+fn milliseconds<T, E: Into<anyhow::Error>>(work: impl FnOnce() -> Result<T, E>) -> Result<f64> {
     let start = Instant::now();
-    work()?;
+    work().map_err(Into::into)?;
     Ok(start.elapsed().as_secs_f64() * 1e3)
 }
 

@@ -3,8 +3,9 @@
 //! # Layout
 //! - [`run`] puts the parts together and takes them apart again.
 //! - [`service`] is gRPC on tokio; [`publish`] is parameters on their way down.
-//! - [`trainer`] is the OS thread that owns the device: batches in, gradient steps, parameters out. [`warm_start`] is what
-//!   it does before.
+//! - [`trainer`] is the OS thread that owns the device: batches in, gradient steps, parameters out; `minibatches` is what
+//!   it makes of a batch. [`warm_start`] is what it does before.
+//! - [`device`] is where it computes: CPU, CUDA, XLA.
 //! - [`vmpo`] is the algorithm: losses, and the gradient step. [`adam`] is its optimiser.
 //! - `setbacks` counts gradient steps that were skipped, and leads back to the last good state.
 //! - `state` turns the trainer into a snapshot and back. [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
@@ -22,11 +23,13 @@ pub mod adam;
 pub mod bench;
 pub mod certs;
 pub mod checkpoint;
+pub mod device;
 pub mod export;
 pub mod health;
 pub mod load;
 pub mod memory;
 pub mod metrics;
+mod minibatches;
 pub mod options;
 pub mod probes;
 pub mod publish;

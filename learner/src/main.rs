@@ -25,7 +25,8 @@ fn main() -> ExitCode {
     let ended = match &options.command {
         Some(Command::Bench { threads, repeats, low_level, joint }) => {
             let subject = if *joint { Subject::Joint } else { Subject::LowLevel(*low_level) };
-            comic_learner::bench::run(*threads, *repeats, subject)
+            let device = options.document.device.unwrap_or_default();
+            comic_learner::bench::run(*threads, *repeats, subject, device)
         }
         Some(Command::Export { checkpoint, part, out }) => comic_learner::export::run(checkpoint, *part, out),
         Some(Command::Sizes) => comic_learner::sizes::table()

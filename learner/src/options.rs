@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context as _, Result};
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use comic_experiment::{Experiment, LowLevelName};
+use comic_experiment::{DeviceName, Experiment, LowLevelName};
 use comic_networks::export::Part;
 
 use crate::certs::Certs;
@@ -69,6 +69,9 @@ pub struct Document {
     /// Override any field, for instance --set vmpo.epsilon_eta=0.2.
     #[arg(long = "set", value_name = "FIELD=VALUE", global = true)]
     pub overrides: Vec<String>,
+    /// Where the update runs: cpu, cuda[:N] or xla[:N]; short for --set learner.device=D.
+    #[arg(long, value_name = "DEVICE", global = true)]
+    pub device: Option<DeviceName>,
     /// Learn reproducibly, whatever actors there are, for debugging; short for --set unroll.lockstep=true and --set
     /// unroll.ahead=0.
     #[arg(long, global = true)]
@@ -85,7 +88,8 @@ impl Document {
     /// Names the file, field and remedy.
     pub fn resolve(&self) -> Result<Experiment> {
         let lockstep = self.lockstep.then_some(LOCKSTEP).into_iter().flatten().map(String::from);
-        let overrides: Vec<String> = lockstep.chain(self.overrides.iter().cloned()).collect();
+        let device = self.device.map(|device| format!("learner.device=\"{device}\""));
+        let overrides: Vec<String> = lockstep.chain(device).chain(self.overrides.iter().cloned()).collect();
         let experiment = comic_experiment::resolve(&self.preset, &overrides)
             .with_context(|| format!("the experiment `{}` is not usable", self.preset))?;
         Ok(experiment.with_clips(&self.clips))

@@ -20,6 +20,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
 
 use crate::checkpoint::{Snapshot, Store};
+use crate::device::Backend;
 use crate::options::{Misuse, Options};
 use crate::probes;
 use crate::publish::Publisher;
@@ -32,7 +33,7 @@ const OTHER_FILES: u64 = 256;
 /// How long actors are given to hear that the run is over.
 const FAREWELL: Duration = Duration::from_millis(1500);
 /// The same where it was over already: actors are on their way, and wait for up to five seconds between two attempts.
-const LATE_FAREWELL: Duration = Duration::from_secs(10);
+const LATE_FAREWELL: Duration = Duration::from_secs(20);
 
 /// Serves and trains until the budget is used up or a signal comes. Prints one JSON line to stdout once it listens.
 ///
@@ -70,7 +71,9 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
         None => None,
     };
     let _lock = Store::open(&options.run, experiment.learner.checkpoints_kept)?.lock()?;
-    let (setup, shared) = prepare(options, experiment, security)?;
+    // Nothing else runs yet that this could hold up, and a device is taken by whoever has the run.
+    let backend = Backend::open(&experiment.learner, &options.run.join("compiled"))?;
+    let (setup, shared) = prepare(options, experiment, backend, security)?;
     let (batcher, publisher, epoch) = (setup.batcher.clone(), setup.publisher.clone(), setup.epoch);
     let began = batcher.books().trained;
     let mut training = start_trainer(setup)?;
@@ -159,7 +162,12 @@ fn start_trainer(setup: Setup) -> Result<Training> {
     Ok(training)
 }
 
-fn prepare(options: &Options, experiment: Experiment, security: Security) -> Result<(Setup, Arc<Shared>)> {
+fn prepare(
+    options: &Options,
+    experiment: Experiment,
+    backend: Backend,
+    security: Security,
+) -> Result<(Setup, Arc<Shared>)> {
     let catalogue = Catalogue::open(&experiment.clips)?;
     let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
     let spec = TaskSpec::new(&experiment, names)
@@ -199,7 +207,8 @@ fn prepare(options: &Options, experiment: Experiment, security: Security) -> Res
         quarantine: options.quarantine.clone(),
     })?;
     let run = options.run.clone();
-    let setup = Setup { experiment, spec, pose, run, epoch, resume, batcher, publisher, shared: shared.clone() };
+    let setup =
+        Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, shared: shared.clone() };
     Ok((setup, shared))
 }
 

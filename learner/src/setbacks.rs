@@ -60,8 +60,7 @@ impl Trainer {
     pub(crate) fn report(&mut self, losses: &vmpo::Metrics) -> Result<bool> {
         let vmpo::Metrics { steps, skipped, skipped_last, .. } = *losses;
         let update = self.progress.updates;
-        self.metrics.count_skipped(skipped);
-        self.shared.telemetry.updates_skipped.inc_by(skipped);
+        self.count_skipped(skipped);
         if skipped > 0 && self.setbacks.complaints.due(()).is_some() {
             tracing::warn!(update, skipped, of = steps, "gradient steps skipped: a loss or gradient is not finite");
         }
@@ -79,6 +78,11 @@ impl Trainer {
             self.losses = self.shown(losses);
         }
         Ok(way == Way::Back)
+    }
+
+    pub(crate) fn count_skipped(&mut self, skipped: u64) {
+        self.metrics.count_skipped(skipped);
+        self.shared.telemetry.updates_skipped.inc_by(skipped);
     }
 
     /// Goes on with the parameters, moments and statistics of the last good state; what counts goes on counting. Unrolls of the versions before are superseded: whatever made them is what went wrong.

@@ -110,6 +110,7 @@ pub struct Telemetry {
     pub(crate) updates: Counter,
     pub(crate) updates_skipped: Counter,
     pub(crate) restores: Counter,
+    compilations: Counter,
     pub(crate) update_seconds: Histogram,
     pub(crate) unroll_age: Histogram,
     pub(crate) unroll_bytes: Histogram,
@@ -197,6 +198,10 @@ impl Default for Telemetry {
                 "comic_restores",
                 "Returns to the last good state, after learner.restore_after skipped gradient steps in a row",
             ),
+            compilations: all.counter(
+                "comic_compilations",
+                "Programs that XLA compiled; it grows no more once every shape was seen. 0 on other devices",
+            ),
             update_seconds: all.histogram(
                 "comic_update_seconds",
                 "Seconds of an update: tensors, gradient steps, publication",
@@ -268,6 +273,11 @@ impl Telemetry {
         ages.sort_unstable();
         let at = |share: usize| ages.get(ages.len().saturating_sub(1) * share / 100).copied().unwrap_or_default();
         *self.ages.lock().unwrap_or_else(PoisonError::into_inner) = Ages { median: at(50), p99: at(99), max: at(100) };
+    }
+
+    /// So many in all.
+    pub(crate) fn count_compilations(&self, compiled: u64) {
+        self.compilations.inc_by(compiled.saturating_sub(self.compilations.get()));
     }
 
     /// Of the newest update.

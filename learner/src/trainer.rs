@@ -8,23 +8,22 @@ use anyhow::Result;
 use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_networks::to_safetensors;
-use comic_proto::Field;
 use comic_proto::v1::{Behaviour, EpisodeEnd, UnrollHeader};
 use comic_replay::{Batch, Batcher, Next, Phase, Reason};
 use rand::SeedableRng as _;
-use rand::seq::SliceRandom as _;
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
-use tch::Device;
 
 use crate::checkpoint::{Name, Snapshot, Store};
+use crate::device::Backend;
 use crate::metrics::{Metrics, Position};
+use crate::minibatches::tasks_of_unrolls;
 use crate::publish::Publisher;
 use crate::service::Shared;
 use crate::setbacks::Setbacks;
 use crate::statistics::ObservationStatistics;
-use crate::vmpo::{Losses, MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
+use crate::vmpo::{Losses, VmpoLearner};
 use crate::writer::Writer;
 
 /// How often a trainer without batches looks at the clock.
@@ -39,6 +38,8 @@ pub struct Setup {
     pub spec: TaskSpec,
     /// Where the policy's mean starts, `[A]`.
     pub pose: Vec<f32>,
+    /// Where it computes.
+    pub backend: Backend,
     /// The run's directory.
     pub run: PathBuf,
     /// This life of the learner.
@@ -83,7 +84,10 @@ pub struct Trainer {
     pub(crate) experiment: Experiment,
     pub(crate) spec: TaskSpec,
     pub(crate) epoch: u64,
+    pub(crate) backend: Backend,
     pub(crate) learner: VmpoLearner,
+    /// The last update's losses, where asking for them at once would mean to wait for the device.
+    late: Option<Losses>,
     /// Of the observations, for the normaliser.
     pub(crate) statistics: ObservationStatistics,
     /// The parameters actors act with, as published.
@@ -111,9 +115,9 @@ impl Trainer {
     /// # Errors
     /// A checkpoint that does not fit the experiment; a disk that refuses.
     pub fn new(setup: Setup) -> Result<Self> {
-        let Setup { experiment, spec, pose, run, epoch, resume, batcher, publisher, shared } = setup;
+        let Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, shared } = setup;
         tch::manual_seed(experiment.seed as i64);
-        let learner = VmpoLearner::new(&spec, &experiment, &pose, Device::Cpu)?;
+        let learner = VmpoLearner::new(&spec, &experiment, &pose, backend.device())?;
         let store = Store::open(&run, experiment.learner.checkpoints_kept)?;
         let mut trainer = Self {
             statistics: ObservationStatistics::new(&spec),
@@ -138,7 +142,9 @@ impl Trainer {
             experiment,
             spec,
             epoch,
+            backend,
             learner,
+            late: None,
             batcher,
             publisher,
             shared,
@@ -159,7 +165,7 @@ impl Trainer {
     /// # Errors
     /// When gradient steps go on being skipped after a return to the last good state, or the disk refuses.
     pub fn run(mut self) -> Result<Ending> {
-        let ending = match self.train() {
+        let ending = match self.train().and_then(|ending| self.report_late().map(|_| ending)) {
             Ok(ending) => ending,
             Err(error) => {
                 // What was handed to the writer is still good.
@@ -213,18 +219,22 @@ impl Trainer {
         self.schedule_learning_rate();
         let mut losses = Vec::new();
         for minibatch in self.minibatches(&tensors) {
+            if !losses.is_empty() {
+                self.backend.end_step()?;
+            }
             losses.push(tracing::debug_span!("gradient_step").in_scope(|| self.learner.step(&minibatch))?);
         }
-        let turned_back = match Losses::mean(&losses) {
-            Some(losses) => self.report(&losses.to_metrics())?,
-            None => false,
-        };
+        let losses = Losses::mean(&losses);
+        drop(tensors);
+        self.backend.end_step()?;
+        let publishes = (self.progress.updates + 1).is_multiple_of(self.experiment.vmpo.target_period);
+        let turned_back = self.report_when_there(losses, publishes || self.checkpoint_is_due())?;
         self.progress.updates += 1;
         self.metrics.count_update();
         self.metrics.absorb(batch.headers(), self.progress.version);
         let ages = batch.headers().iter().map(|header| self.progress.version.saturating_sub(header.version)).collect();
         // Published before the batch goes back: whoever waits for its room goes on with these parameters.
-        if turned_back || self.progress.updates.is_multiple_of(self.experiment.vmpo.target_period) {
+        if turned_back || publishes {
             self.publish(Behaviour::Policy)?;
         } else {
             self.keep_step(Behaviour::Policy);
@@ -233,12 +243,28 @@ impl Trainer {
         self.shared.telemetry.count_update(began.elapsed(), ages);
         self.after_update()
     }
-}
 
-/// The task of each unroll: that of its clips.
-fn tasks_of_unrolls(batch: &Batch, spec: &TaskSpec) -> Vec<usize> {
-    let rows = batch.layout.rows(Field::Clip).max(1);
-    batch.clip().iter().step_by(rows).map(|clip| spec.task_of(*clip as usize)).collect()
+    /// Reports the losses of an update; those of a device that works by itself when the next update is on its way, so that
+    /// it never waits for somebody to read, or `at_once` where it is waited for anyway. Says whether they led back to the last
+    /// good state.
+    fn report_when_there(&mut self, losses: Option<Losses>, at_once: bool) -> Result<bool> {
+        self.shared.telemetry.count_compilations(self.backend.compilations()?);
+        let turned_back = self.report_late()?;
+        match losses {
+            // Of the state that was left.
+            Some(losses) if turned_back => self.count_skipped(losses.to_metrics().skipped),
+            Some(losses) if at_once || !self.backend.is_asynchronous() => return self.report(&losses.to_metrics()),
+            losses => self.late = losses,
+        }
+        Ok(turned_back)
+    }
+
+    fn report_late(&mut self) -> Result<bool> {
+        match self.late.take() {
+            Some(losses) => self.report(&losses.to_metrics()),
+            None => Ok(false),
+        }
+    }
 }
 
 /// What waiting for a batch led to.
@@ -261,49 +287,6 @@ impl Trainer {
             Next::Elapsed => Wait::Nothing,
             Next::Closed => Wait::Closed,
         })
-    }
-
-    /// The batch on the device, `[B, T(+1), …]`.
-    pub(crate) fn tensors(&self, batch: &Batch) -> Result<MinibatchTensors> {
-        let tasks = tasks_of_unrolls(batch, &self.spec);
-        let shape =
-            MinibatchShape { unrolls: batch.unrolls, tasks: self.spec.tasks.len(), unroll: *batch.layout.shape() };
-        let source = MinibatchSource {
-            proprioception: batch.f32(Field::Proprioception),
-            task: batch.f32(Field::Task),
-            previous_latent: batch.f32(Field::PreviousLatent),
-            latent_noise: batch.f32(Field::LatentNoise),
-            action: batch.f32(Field::Action),
-            mean: batch.f32(Field::Mean),
-            std: batch.f32(Field::Std),
-            log_weights: batch.f32(Field::LogWeights),
-            reward: batch.f32(Field::Reward),
-            discount: batch.f32(Field::Discount),
-            valid: batch.f32(Field::Valid),
-            first: batch.f32(Field::First),
-            state: batch.f32(Field::State),
-            clip: batch.clip(),
-            image: batch.image(),
-            tasks: &tasks,
-        };
-        Ok(MinibatchTensors::new(&source, &shape, self.learner.device())?)
-    }
-
-    /// The gradient steps' minibatches: every unroll once before any comes again.
-    fn minibatches<'a>(&mut self, tensors: &'a MinibatchTensors) -> impl Iterator<Item = MinibatchTensors> + use<'a> {
-        let unrolls = self.experiment.unroll.batch;
-        let size = self.experiment.vmpo.minibatch_unrolls;
-        let steps = self.experiment.vmpo.gradient_steps;
-        let mut order: Vec<usize> = Vec::new();
-        while order.len() < steps * size {
-            let mut pass: Vec<usize> = (0..unrolls).collect();
-            // With the whole batch in each step, order means nothing; keep it, so that sums are those of the batch.
-            if size < unrolls {
-                pass.shuffle(&mut self.progress.random);
-            }
-            order.extend(pass);
-        }
-        (0..steps).map(move |step| tensors.select(&order[step * size..(step + 1) * size]))
     }
 
     /// Counts a batch's steps and diverged episodes, and gives its memory back.
@@ -399,10 +382,11 @@ impl Trainer {
 
     pub(crate) fn after_update(&mut self) -> Result<()> {
         self.write_metrics_when_due()?;
-        if self.checkpointed.elapsed().as_secs_f64() >= self.experiment.learner.checkpoint_seconds {
-            self.checkpoint(false)?;
-        }
-        Ok(())
+        if self.checkpoint_is_due() { self.checkpoint(false) } else { Ok(()) }
+    }
+
+    fn checkpoint_is_due(&self) -> bool {
+        self.checkpointed.elapsed().as_secs_f64() >= self.experiment.learner.checkpoint_seconds
     }
 
     pub(crate) fn write_metrics_when_due(&mut self) -> Result<()> {

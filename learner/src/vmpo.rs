@@ -11,6 +11,7 @@
 //! Everything is float32 and of static shape: masks instead of selections, so that a compiler of tensor programs
 //! meets one shape only.
 
+mod error;
 mod improvement;
 mod learner;
 mod metrics;
@@ -19,8 +20,9 @@ mod multipliers;
 mod returns;
 mod stores;
 
+pub use error::Error;
 pub use improvement::{Evidence, Improvement, Limits, masked_mean, policy_improvement};
-pub use learner::{Error, VmpoLearner};
+pub use learner::VmpoLearner;
 pub use metrics::{Losses, Metrics};
 pub use minibatch::{MinibatchShape, MinibatchSource, MinibatchTensors};
 pub use multipliers::{MULTIPLIER_FLOOR, Multipliers};

@@ -30,6 +30,7 @@ impl Trainer {
         while step < config.steps || !self.is_sound() {
             self.learner.set_learning_rates(config.learning_rate, self.experiment.optimiser.multiplier_learning_rate);
             unreported.push(self.regress(&mut demonstrations, config.minibatch_unrolls)?);
+            self.backend.end_step()?;
             if (step % 50 == 0 || step + 1 >= config.steps)
                 && let Some(losses) = Losses::mean(&std::mem::take(&mut unreported))
             {

@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex};
 use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec, resolve};
 use comic_learner::checkpoint::{Snapshot, Store, find, read};
+use comic_learner::device::Backend;
 use comic_learner::publish::{Published, Publisher};
 use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
@@ -166,6 +167,7 @@ fn live_evaluated(
         experiment,
         spec,
         pose,
+        backend: Backend::cpu(),
         run,
         epoch,
         resume,

@@ -4,30 +4,17 @@
 
 mod vmpo_support;
 
-use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives};
+use comic_experiment::Experiment;
 use comic_learner::vmpo::{MinibatchTensors, VmpoLearner};
 use comic_networks::{Memory, NormaliserStatistics, Routing};
 use tch::Tensor;
-use vmpo_support::{LENGTH, Numbers, Unrolls, difference, joint_spec, learner_of, state};
+use vmpo_support::{LENGTH, Numbers, Unrolls, difference, every_low_level, joint_spec, learner_of, state};
 
 const COUNT: usize = 5;
 /// The tasks of the unrolls: tracking's clips are 0 to 2, getting up's is 3.
 const TASKS: [usize; COUNT] = [0, 1, 0, 1, 0];
 /// Width of a task observation, and of getting up's own.
 const WIDTHS: (usize, usize) = (4, 2);
-
-fn every_low_level() -> Vec<Experiment> {
-    LowLevelName::ALL
-        .map(|name| {
-            let mut experiment = vmpo_support::experiment();
-            experiment.network.low_level = name;
-            experiment.network.lstm = Lstm { units: vec![6, 5] };
-            experiment.network.primitives =
-                Primitives { count: 3, torso: vec![8], hidden: 6, gate: vec![7], biases: true };
-            experiment
-        })
-        .to_vec()
-}
 
 fn learner(experiment: &Experiment) -> VmpoLearner {
     learner_of(&joint_spec(), experiment, 1)

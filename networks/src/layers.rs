@@ -105,6 +105,44 @@ impl Mlp {
     }
 }
 
+/// Of several networks of the same sizes but for their inputs, the one at `chosen`, int64 `[G]`, for each group of rows:
+/// `[G, N, input]` to `[G, N, output]`, where a network reads the last entries of the input, as many as it is wide.
+///
+/// Which network runs is data here, so a program compiled for one choice serves them all; the price is a copy of the
+/// parameters for every group.
+pub(crate) fn forward_chosen(networks: &[Mlp], chosen: &Tensor, input: &Tensor) -> Tensor {
+    let choose = |of: &dyn Fn(&Mlp) -> Tensor| {
+        let all: Vec<Tensor> = networks.iter().map(of).collect();
+        Tensor::stack(&all, 0).index_select(0, chosen)
+    };
+    // Input that a network does not read meets weights of 0.
+    let widened = |weights: &Tensor, width: i64| weights.constant_pad_nd([width - weights.size()[1], 0]);
+    let linear = |input: &Tensor, of: &dyn Fn(&Mlp) -> &nn::Linear| {
+        let weights = choose(&|network| widened(&of(network).ws, input.size()[2]));
+        let biases = choose(&|network| match &of(network).bs {
+            Some(bias) => bias.shallow_clone(),
+            None => of(network).ws.select(1, 0).zeros_like(),
+        });
+        input.matmul(&weights.transpose(1, 2)) + biases.unsqueeze(1)
+    };
+    let hidden = linear(input, &|network| &network.torso.layers[0]);
+    let [weight, bias] = [0, 1].map(|part| choose(&|network| network.torso.norm[part].shallow_clone()).unsqueeze(1));
+    let normalised = hidden.layer_norm([hidden.size()[2]], None::<Tensor>, None::<Tensor>, LAYER_NORM_EPSILON, true);
+    // In place, as everywhere: torch_xla 2.9 differentiates ELU by its output, which is right of `elu_` alone.
+    let mut hidden = (normalised * weight + bias).tanh_();
+    for layer in 1..networks.first().map_or(0, |network| network.torso.layers.len()) {
+        hidden = linear(&hidden, &|network| &network.torso.layers[layer]).elu_();
+    }
+    let output = linear(&hidden, &|network| &network.head);
+    match networks.iter().map(|network| network.linear_path.as_ref()).collect::<Option<Vec<_>>>() {
+        Some(paths) => {
+            let weights: Vec<Tensor> = paths.iter().map(|weights| widened(weights, input.size()[2])).collect();
+            output + input.matmul(&Tensor::stack(&weights, 0).index_select(0, chosen).transpose(1, 2))
+        }
+        None => output,
+    }
+}
+
 /// What a Gaussian head starts as.
 pub(crate) struct GaussianHeadConfig<'a> {
     /// Where the mean's bias starts, one entry a dimension.

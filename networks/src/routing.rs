@@ -11,7 +11,7 @@
 
 use tch::{Device, Tensor};
 
-use crate::layers::Mlp;
+use crate::layers::{Mlp, forward_chosen};
 
 /// Which task each unroll, or each environment, is of.
 #[derive(Debug)]
@@ -39,9 +39,18 @@ struct Blocks {
     /// The slot of each unroll, `[B]` int64.
     places: Tensor,
     /// The task of each block.
-    tasks: Vec<usize>,
+    tasks: BlockTasks,
     /// Unrolls a block.
     size: i64,
+}
+
+/// Where it is known which network a block goes through.
+#[derive(Debug)]
+enum BlockTasks {
+    /// Here: each block runs through its own network, and no parameter is copied.
+    Host(Vec<usize>),
+    /// On the device, int64: no program depends on the mix, so none has to be compiled for another one.
+    Device(Tensor),
 }
 
 /// A batch is cut into so many blocks, and one more for each further task.
@@ -63,7 +72,7 @@ impl Routing {
     }
 
     /// For a learner: `tasks` holds each unroll's task, below `count`. Every shape is decided by how many unrolls and how
-    /// many tasks there are.
+    /// many tasks there are; beyond the CPU every operation is, too.
     pub fn blocked(tasks: &[usize], count: usize, device: Device) -> Self {
         if count < 2 {
             return Self::single();
@@ -85,7 +94,10 @@ impl Routing {
         let blocks = Blocks {
             slots: indices(slots, device),
             places: indices(places, device),
-            tasks: of_block,
+            tasks: match device {
+                Device::Cpu => BlockTasks::Host(of_block),
+                _ => BlockTasks::Device(indices(of_block, device)),
+            },
             size: size as i64,
         };
         Self(Some(Routed { tasks: indices(tasks.iter().copied(), device), way: Way::Blocks(blocks) }))
@@ -99,7 +111,10 @@ impl Routing {
                 Way::Blocks(Blocks { slots, places, tasks, size }) => Way::Blocks(Blocks {
                     slots: slots.shallow_clone(),
                     places: places.shallow_clone(),
-                    tasks: tasks.clone(),
+                    tasks: match tasks {
+                        BlockTasks::Host(tasks) => BlockTasks::Host(tasks.clone()),
+                        BlockTasks::Device(tasks) => BlockTasks::Device(tasks.shallow_clone()),
+                    },
                     size: *size,
                 }),
             };
@@ -166,11 +181,17 @@ fn by_group(networks: &[Mlp], groups: &[Tensor], input: &Tensor) -> Tensor {
 
 /// Each block through its task's network.
 fn by_block(networks: &[Mlp], blocks: &Blocks, input: &Tensor) -> Tensor {
-    let (unrolls, width, count) = (blocks.places.size()[0], input.size()[1], blocks.tasks.len() as i64);
+    let (unrolls, width) = (blocks.places.size()[0], input.size()[1]);
+    let count = blocks.slots.size()[0] / blocks.size;
     let sorted = input.reshape([unrolls, -1]).index_select(0, &blocks.slots).reshape([count, -1, width]);
-    let of_block = |(task, rows): (&usize, Tensor)| networks[*task].forward(&own(&networks[*task], &rows));
-    let outputs: Vec<Tensor> = blocks.tasks.iter().zip(sorted.unbind(0)).map(of_block).collect();
-    let output = Tensor::cat(&outputs, 0);
+    let output = match &blocks.tasks {
+        BlockTasks::Host(tasks) => {
+            let of_block = |(task, rows): (&usize, Tensor)| networks[*task].forward(&own(&networks[*task], &rows));
+            let outputs: Vec<Tensor> = tasks.iter().zip(sorted.unbind(0)).map(of_block).collect();
+            Tensor::cat(&outputs, 0)
+        }
+        BlockTasks::Device(tasks) => forward_chosen(networks, tasks, &sorted).flatten(0, 1),
+    };
     let width = output.size()[1];
     output.reshape([count * blocks.size, -1]).index_select(0, &blocks.places).reshape([-1, width])
 }
@@ -200,7 +221,12 @@ mod tests {
         ) {
             let Blocks { slots, places, tasks: of_blocks, size } = blocks(&tasks, count);
             let even = blocks(&vec![0; tasks.len()], count);
-            prop_assert_eq!((slots.size(), of_blocks.len(), size), (even.slots.size(), even.tasks.len(), even.size));
+            prop_assert_eq!((slots.size(), size), (even.slots.size(), even.size));
+            let of_blocks = match of_blocks {
+                BlockTasks::Host(tasks) => tasks,
+                BlockTasks::Device(tasks) => numbers(&tasks),
+            };
+            prop_assert_eq!(of_blocks.len() * size as usize, slots.size()[0] as usize);
             let (slots, places) = (numbers(&slots), numbers(&places));
             for (unroll, task) in tasks.iter().enumerate() {
                 prop_assert_eq!(slots[places[unroll]], unroll);
@@ -214,6 +240,9 @@ mod tests {
         let tasks: Vec<usize> = (0..128).map(|unroll| unroll % 2).collect();
         assert_eq!(blocks(&tasks, 2).slots.size(), [144]);
     }
+
+    /// libtorch's generator is the process's: tests that seed it take turns.
+    static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
     /// Networks of different inputs, and what each makes of all rows.
     fn networks(store: &tch::nn::VarStore) -> PerTask {
@@ -229,6 +258,8 @@ mod tests {
 
     #[test]
     fn grouped_or_blocked_every_unroll_goes_through_its_own_tasks_network() {
+        let _guard = GENERATOR.lock().unwrap();
+        tch::manual_seed(1);
         let store = tch::nn::VarStore::new(Device::Cpu);
         let per_task = networks(&store);
         let (tasks, steps) = ([0, 1, 1, 0, 1, 0, 0, 1, 1, 1, 0], 3);
@@ -244,17 +275,35 @@ mod tests {
             let own = |tensor: &Tensor| tensor.narrow(0, unroll as i64 * steps, steps);
             let network = &per_task.networks[*task];
             let expected = network.forward(&super::own(network, &own(&input)));
-            assert!((own(&blocked) - &expected).abs().max().double_value(&[]) < 1e-6, "unroll {unroll}");
+            assert!((own(&blocked) - &expected).abs().max().double_value(&[]) < 1e-5, "unroll {unroll}");
+        }
+        // As beyond the CPU.
+        let mut there = blocks(&tasks, 2);
+        if let BlockTasks::Host(tasks) = &there.tasks {
+            there.tasks = BlockTasks::Device(indices(tasks.iter().copied(), Device::Cpu));
+        }
+        let chosen = by_block(&per_task.networks, &there, &input);
+        assert!((&chosen - &blocked).abs().max().double_value(&[]) < 1e-5);
+        let parameters = store.trainable_variables();
+        let gradients =
+            |output: &Tensor| Tensor::run_backward(&[output.square().sum(Kind::Float)], &parameters, true, false);
+        for (chosen, blocked) in gradients(&chosen).iter().zip(gradients(&blocked)) {
+            assert!(
+                (chosen - &blocked).abs().max().double_value(&[])
+                    < 1e-4 * (1.0 + blocked.abs().max().double_value(&[]))
+            );
         }
         // Whoever acts has a row for each environment.
         let rows = input.reshape([11, steps, 5]).select(1, 0);
         let grouped = per_task.forward(&rows, &Routing::grouped(&tasks, 2));
         let same = blocked.reshape([11, steps, 4]).select(1, 0);
-        assert!((grouped - same).abs().max().double_value(&[]) < 1e-6);
+        assert!((grouped - same).abs().max().double_value(&[]) < 1e-5);
     }
 
     #[test]
     fn tasks_that_are_not_there_are_left_out() {
+        let _guard = GENERATOR.lock().unwrap();
+        tch::manual_seed(1);
         let store = tch::nn::VarStore::new(Device::Cpu);
         let per_task = networks(&store);
         let input = Tensor::randn([4, 5], (Kind::Float, Device::Cpu));

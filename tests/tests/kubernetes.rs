@@ -213,22 +213,54 @@ fn default_of(option: &str, help: &str) -> Result<i32> {
 
 #[test]
 fn images_are_pinned_to_this_version_everywhere() -> Result<()> {
-    let expected = ["comic-learner", "comic-actor"].map(|name| format!("{name}:{}", env!("CARGO_PKG_VERSION")));
+    let programs = ["comic-learner", "comic-learner-cuda", "comic-learner-xla", "comic-actor"];
+    let expected = programs.map(|name| format!("{name}:{}", env!("CARGO_PKG_VERSION")));
     each(|cluster| {
-        for (pod, image) in both(cluster)?.into_iter().zip(&expected) {
-            ensure!(container(pod)?.image.as_ref() == Some(image), "{:?}", container(pod)?.image);
-        }
+        let learner = container(cluster.learner_pod()?)?;
+        let device = option(learner, "--device").ok();
+        let image = programs.iter().position(|name| *name == suffixed("comic-learner", device));
+        ensure!(
+            image.is_some_and(|at| learner.image.as_ref() == Some(&expected[at])),
+            "{device:?}: {:?}",
+            learner.image
+        );
+        let actor = &container(cluster.actor_pod()?)?.image;
+        ensure!(actor.as_ref() == Some(&expected[3]), "{actor:?}");
         Ok(())
     })?;
     for file in ["compose.yaml", "compose.tls.yaml", "Dockerfile", "README.md"] {
         let text = fs::read_to_string(root().join("deploy").join(file))?;
         let named = text.split([' ', '\n', '=', '`', '/']).filter(|word| word.contains(':'));
         let ours: Vec<_> =
-            named.filter(|word| ["comic-learner:", "comic-actor:"].iter().any(|name| word.starts_with(name))).collect();
+            named.filter(|word| programs.iter().any(|name| word.starts_with(&format!("{name}:")))).collect();
         ensure!(!ours.is_empty(), "{file} names no image");
         ensure!(ours.iter().all(|image| expected.iter().any(|expected| expected == image)), "{file}: {ours:?}");
     }
     Ok(())
+}
+
+fn suffixed(name: &str, device: Option<&str>) -> String {
+    device.map_or_else(|| name.to_owned(), |device| format!("{name}-{device}"))
+}
+
+#[test]
+fn who_computes_on_an_accelerator_asks_for_one_and_tolerates_its_nodes() -> Result<()> {
+    each(|cluster| {
+        let pod = cluster.learner_pod()?;
+        let learner = container(pod)?;
+        let limits = learner.resources.as_ref().and_then(|resources| resources.limits.as_ref()).context("no limits")?;
+        let taken: Vec<_> = limits.iter().filter(|(name, _)| name.contains('/')).collect();
+        let tolerated: Vec<_> = pod.tolerations.iter().flatten().filter_map(|node| node.key.as_deref()).collect();
+        match option(learner, "--device").ok() {
+            None => ensure!(taken.is_empty() && tolerated.is_empty(), "{taken:?} for nothing"),
+            Some(device) => {
+                let resource = BTreeMap::from([("cuda", "nvidia.com/gpu"), ("xla", "google.com/tpu")])[device];
+                let [(name, Quantity(count))] = taken[..] else { bail!("{taken:?}") };
+                ensure!(name == resource && count == "1" && tolerated == [resource], "{taken:?} {tolerated:?}");
+            }
+        }
+        Ok(())
+    })
 }
 
 #[test]
@@ -396,6 +428,15 @@ async fn the_programs_take_what_the_manifests_tell_them() -> Result<()> {
         "0".clone_into(&mut told[port + 1]);
         let token = environment(learner).get("COMIC_TOKEN_FILE").map(|file| place(file)).context("no token")?;
         told.extend(["--token-file".to_owned(), token]);
+        // This learner was built for a CPU: it takes the word, names it, and is none the worse without.
+        if let Some(device) = told.iter().position(|word| word == "--device") {
+            let words: Vec<String> = told.drain(device..device + 2).collect();
+            let run = tempfile::tempdir()?;
+            let mut refused = std::process::Command::new(program("comic-learner")?);
+            let output = refused.args(&words).arg("--run").arg(run.path()).output()?;
+            let said = String::from_utf8_lossy(&output.stderr);
+            ensure!(output.status.code() == Some(2) && said.contains(&words[1]), "{words:?}: {said}");
+        }
         let mut system = System::new(&told.iter().map(String::as_str).collect::<Vec<_>>())?;
         system.host = "localhost".into();
         let variables = environment(actor);

@@ -12,7 +12,8 @@ use crate::progress::Progress;
 use crate::wheels::Wheel;
 
 /// What the pinned wheels are built for, whatever the user's own Python is.
-const PLATFORM: [&str; 8] = [
+const PLATFORM: [&str; 9] = [
+    "--platform=manylinux_2_31_x86_64",
     "--platform=manylinux_2_28_x86_64",
     "--platform=manylinux_2_27_x86_64",
     "--platform=manylinux_2_17_x86_64",
@@ -37,6 +38,23 @@ pub(crate) fn require_pip() -> Result<()> {
              and run `cargo xtask setup` again"
         ),
     }
+}
+
+/// Fails with the remedy unless the Python that the learner embeds is the one torch_xla was built for.
+pub(crate) fn require_embeddable() -> Result<()> {
+    let python = std::env::var("PYO3_PYTHON").unwrap_or_else(|_| "python3".into());
+    let question = "import os, sys, sysconfig; print(*sys.version_info[:2], \
+                    os.path.exists(os.path.join(sysconfig.get_config_var('LIBDIR'), 'libpython3.11.so')))";
+    let answer = Command::new(&python).args(["-c", question]).output();
+    let answer = answer.with_context(|| format!("cannot run {python}"))?;
+    let answer = String::from_utf8_lossy(&answer.stdout).trim().to_owned();
+    if answer == "3 11 True" {
+        return Ok(());
+    }
+    bail!(
+        "XLA takes Python 3.11 with its shared library, and {python} is not that (version, and whether libpython3.11.so is \
+         there: {answer}); install one (Debian 12: apt install python3 libpython3.11-dev) and name it by PYO3_PYTHON"
+    )
 }
 
 /// Fetches `wheel` into `directory` under the user's own pip configuration; pip verifies the hash.
@@ -105,7 +123,7 @@ fn explain(wheel: &Wheel, output: &str, log: &Path) -> String {
     let remedy = if output.contains("DO NOT MATCH THE HASHES") {
         "the index serves another file than the pinned one: check which index pip is configured to use (python3 -m pip config list)"
     } else if output.contains("No space left on device") {
-        "the disk is full: set-up needs about 1.5 GB while it runs and 0.5 GB after it"
+        "the disk is full: set-up needs about 1.5 GB while it runs and 0.5 GB after it, 8 GB and 7 GB with --cuda or --xla"
     } else if ["NewConnectionError", "ConnectTimeout", "NameResolution", "ProxyError", "Max retries", "ReadTimeout"]
         .iter()
         .any(|sign| output.contains(sign))

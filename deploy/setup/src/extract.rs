@@ -10,7 +10,7 @@ use zip::ZipArchive;
 
 use crate::interrupt::Interrupt;
 use crate::progress::Progress;
-use crate::wheels::Wheel;
+use crate::wheels::{Extent, Wheel};
 
 /// Takes what is wanted of `wheel`, lying at `archive`, into `dependencies`; returns the files with their sizes.
 ///
@@ -19,12 +19,12 @@ pub(crate) fn extract(
     wheel: &Wheel,
     archive: &Path,
     dependencies: &Path,
-    cuda: bool,
+    extent: Extent,
     interrupt: &Interrupt,
 ) -> Result<BTreeMap<PathBuf, u64>> {
     let unfinished = dependencies.join("unfinished");
     let _ = fs::remove_dir_all(&unfinished);
-    let mut files = unpack(wheel, archive, &unfinished, cuda, interrupt)?;
+    let mut files = unpack(wheel, archive, &unfinished, extent, interrupt)?;
     for &(link, target) in wheel.links {
         make_link(&unfinished.join(link), target)?;
         let size = fs::metadata(unfinished.join(link)).with_context(|| format!("{link} points nowhere"))?.len();
@@ -43,7 +43,7 @@ fn unpack(
     wheel: &Wheel,
     archive: &Path,
     unfinished: &Path,
-    cuda: bool,
+    extent: Extent,
     interrupt: &Interrupt,
 ) -> Result<BTreeMap<PathBuf, u64>> {
     let file = File::open(archive).with_context(|| format!("cannot open {}", archive.display()))?;
@@ -56,7 +56,7 @@ fn unpack(
         if entry.is_dir() || entry.enclosed_name().is_none() {
             continue;
         }
-        if let Some(place) = (wheel.place)(entry.name(), cuda) {
+        if let Some(place) = (wheel.place)(entry.name(), extent) {
             total += entry.size();
             wanted.push((index, place, entry.size()));
         }

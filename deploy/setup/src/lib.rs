@@ -6,6 +6,7 @@
 //! It is a crate of its own, which `cargo xtask setup` calls, so that an image's layer with the libraries is made anew
 //! when a pin changes and not with every other change of this workspace.
 
+mod accelerators;
 mod download;
 mod extract;
 mod interrupt;
@@ -20,7 +21,7 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 
 use stamp::Stamp;
-use wheels::{Part, WHEELS, Wheel};
+use wheels::{Extent, Part, Wheel, wheels};
 
 pub use interrupt::Interrupt;
 pub use progress::on_terminal;
@@ -28,9 +29,27 @@ pub use progress::on_terminal;
 /// What is taken.
 #[derive(clap::Args, Debug, Default)]
 pub struct Options {
-    /// Keep all of libtorch, CUDA included (3.4 GB), instead of what a CPU needs (0.5 GB)
+    /// All of libtorch and NVIDIA's libraries (3.7 GB to fetch, 6 GB on disk) instead of what a CPU needs (1 GB, 0.5 GB)
     #[arg(long)]
     cuda: bool,
+    /// The same and torch_xla, for TPUs (4.0 GB to fetch, 7 GB on disk); it takes Python 3.11 with its shared library
+    #[arg(long)]
+    xla: bool,
+}
+
+impl Options {
+    /// As much as the update on XLA takes.
+    pub fn xla() -> Self {
+        Self { cuda: false, xla: true }
+    }
+
+    fn extent(&self) -> Extent {
+        match self {
+            Self { xla: true, .. } => Extent::Xla,
+            Self { cuda: true, .. } => Extent::Cuda,
+            _ => Extent::Cpu,
+        }
+    }
 }
 
 /// Brings the directory `dependencies` to what the pins say; under a second when it is already.
@@ -38,13 +57,24 @@ pub struct Options {
 /// # Errors
 /// A machine without wheels, an index that does not answer, a full disk, Ctrl-C: each with its remedy.
 pub fn run(options: &Options, dependencies: &Path) -> Result<()> {
+    let extent = options.extent();
+    if extent == Extent::Xla {
+        download::require_embeddable()?;
+    }
     fs::create_dir_all(dependencies).with_context(|| format!("cannot make {}", dependencies.display()))?;
     let _lock = lock(dependencies)?;
+    if extent > Extent::Cpu {
+        let variable = |name: &str| std::env::var_os(name).map(Into::into);
+        if let (Extent::Xla, Some(own)) = (extent, provided::directory(Part::Libtorch, dependencies, variable)?) {
+            bail!("XLA takes the libtorch that set-up fetches, and LIBTORCH is {}: unset it", own.display());
+        }
+        join(dependencies)?;
+    }
     let mut missing = Vec::new();
-    for wheel in &WHEELS {
+    for wheel in wheels().filter(|wheel| wheel.from <= extent) {
         match provided::directory(wheel.part, dependencies, |name| std::env::var_os(name).map(Into::into))? {
             Some(own) => announce(wheel, &own),
-            None if !is_whole(wheel, dependencies, options.cuda) => missing.push(wheel),
+            None if !is_whole(wheel, dependencies, extent) => missing.push(wheel),
             None => {}
         }
     }
@@ -55,11 +85,33 @@ pub fn run(options: &Options, dependencies: &Path) -> Result<()> {
     download::require_pip()?;
     let interrupt = Interrupt::install()?;
     for wheel in missing {
-        take(wheel, dependencies, options.cuda, &interrupt)
+        take(wheel, dependencies, extent, &interrupt)
             .with_context(|| format!("set-up of {} {} in {}", wheel.name, wheel.version, dependencies.display()))?;
     }
     let _ = fs::remove_dir_all(dependencies.join("wheels"));
     eprintln!("set-up is complete: {}", dependencies.display());
+    Ok(())
+}
+
+/// libtorch finds NVIDIA's libraries where a wheel of torch does, beside its directory; and Python imports the libtorch that
+/// programs link.
+#[cfg(unix)]
+fn join(dependencies: &Path) -> Result<()> {
+    fs::create_dir_all(dependencies.join("python")).context("cannot make the directory of Python's packages")?;
+    for (link, target) in [("nvidia", "python/nvidia"), ("python/torch", "../libtorch")] {
+        let link = dependencies.join(link);
+        if fs::read_link(&link).is_ok_and(|found| found == Path::new(target)) {
+            continue;
+        }
+        let _ = fs::remove_file(&link);
+        std::os::unix::fs::symlink(target, &link).with_context(|| format!("cannot link {}", link.display()))?;
+    }
+    Ok(())
+}
+
+/// Without links there is no set-up for more than a CPU; there are no wheels for such a platform either.
+#[cfg(not(unix))]
+fn join(_dependencies: &Path) -> Result<()> {
     Ok(())
 }
 
@@ -75,21 +127,23 @@ fn lock(dependencies: &Path) -> Result<File> {
 }
 
 fn announce(wheel: &Wheel, own: &Path) {
-    let first = WHEELS.iter().find(|other| other.part == wheel.part);
+    let first = wheels().find(|other| other.part == wheel.part);
     if first.is_some_and(|first| first.name == wheel.name) {
         let what = match wheel.part {
             Part::Mujoco => "MuJoCo",
             Part::Libtorch => "libtorch",
             Part::DmControl => "humanoid",
+            Part::Python => "torch_xla",
         };
         eprintln!("using your own {what}: {}", own.display());
     }
 }
 
 /// A CUDA libtorch serves CPU runs too, so it is not trimmed by a later set-up without the flag.
-fn is_whole(wheel: &Wheel, dependencies: &Path, cuda: bool) -> bool {
+fn is_whole(wheel: &Wheel, dependencies: &Path, extent: Extent) -> bool {
+    let enough = |stamp: &Stamp| stamp.cuda || extent == Extent::Cpu;
     Stamp::read(dependencies, wheel.name)
-        .is_some_and(|stamp| stamp.sha256 == wheel.sha256 && (stamp.cuda || !cuda) && stamp.agrees(dependencies))
+        .is_some_and(|stamp| stamp.sha256 == wheel.sha256 && enough(&stamp) && stamp.agrees(dependencies))
 }
 
 fn require_platform(missing: &[&Wheel]) -> Result<()> {
@@ -106,14 +160,14 @@ fn require_platform(missing: &[&Wheel]) -> Result<()> {
     )
 }
 
-fn take(wheel: &Wheel, dependencies: &Path, cuda: bool, interrupt: &Interrupt) -> Result<()> {
+fn take(wheel: &Wheel, dependencies: &Path, extent: Extent, interrupt: &Interrupt) -> Result<()> {
     if let Some(old) = Stamp::read(dependencies, wheel.name) {
         old.remove(dependencies, wheel.name)?;
     }
     let directory = dependencies.join("wheels");
     let archive = download::fetch(wheel, &directory, interrupt)?;
-    let files = extract::extract(wheel, &archive, dependencies, cuda, interrupt)?;
-    let stamp = Stamp { sha256: wheel.sha256.into(), cuda, files };
+    let files = extract::extract(wheel, &archive, dependencies, extent, interrupt)?;
+    let stamp = Stamp { sha256: wheel.sha256.into(), cuda: extent > Extent::Cpu, files };
     stamp.write(dependencies, wheel.name)?;
     fs::remove_file(&archive).with_context(|| format!("cannot remove {}", archive.display()))
 }
@@ -121,6 +175,7 @@ fn take(wheel: &Wheel, dependencies: &Path, cuda: bool, interrupt: &Interrupt) -
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::wheels::WHEELS;
 
     fn stamped(cuda: bool) -> tempfile::TempDir {
         let dependencies = tempfile::tempdir().unwrap();
@@ -134,18 +189,18 @@ mod tests {
     #[test]
     fn a_wheel_is_whole_only_with_its_stamp_and_every_file_in_its_size() {
         let dependencies = stamped(false);
-        assert!(is_whole(&WHEELS[0], dependencies.path(), false));
-        assert!(!is_whole(&WHEELS[1], dependencies.path(), false), "another wheel has no stamp");
+        assert!(is_whole(&WHEELS[0], dependencies.path(), Extent::Cpu));
+        assert!(!is_whole(&WHEELS[1], dependencies.path(), Extent::Cpu), "another wheel has no stamp");
         fs::write(dependencies.path().join("mujoco/a"), "ab").unwrap();
-        assert!(!is_whole(&WHEELS[0], dependencies.path(), false), "a file was cut short");
+        assert!(!is_whole(&WHEELS[0], dependencies.path(), Extent::Cpu), "a file was cut short");
         fs::remove_file(dependencies.path().join("mujoco/a")).unwrap();
-        assert!(!is_whole(&WHEELS[0], dependencies.path(), false), "a file is gone");
+        assert!(!is_whole(&WHEELS[0], dependencies.path(), Extent::Cpu), "a file is gone");
     }
 
     #[test]
     fn asking_for_cuda_after_a_trimmed_set_up_takes_the_wheel_again_and_not_the_other_way_round() {
-        assert!(!is_whole(&WHEELS[0], stamped(false).path(), true));
-        assert!(is_whole(&WHEELS[0], stamped(true).path(), false));
+        assert!(!is_whole(&WHEELS[0], stamped(false).path(), Extent::Cuda));
+        assert!(is_whole(&WHEELS[0], stamped(true).path(), Extent::Cpu));
     }
 
     #[test]

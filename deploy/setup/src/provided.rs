@@ -20,6 +20,8 @@ pub(crate) fn directory(
         Part::Mujoco => "MUJOCO_DYNAMIC_LINK_DIR",
         Part::Libtorch => "LIBTORCH",
         Part::DmControl => "COMIC_DM_CONTROL_DIR",
+        // It has to be the torch_xla that was built for this libtorch.
+        Part::Python => return Ok(None),
     };
     let Some(directory) = variable(name).filter(|directory| !directory.as_os_str().is_empty()) else { return Ok(None) };
     if absolute(&directory).starts_with(absolute(dependencies)) {
@@ -29,6 +31,7 @@ pub(crate) fn directory(
         Part::Mujoco => check_mujoco(&directory),
         Part::Libtorch => check_libtorch(&directory),
         Part::DmControl => require(&directory, &["humanoid_CMU_V2020.xml", "humanoid_CMU_V2019.xml", "arena.xml"]),
+        Part::Python => Ok(()),
     } {
         bail!("{name}={}: {problem}; mend it, or unset {name} and set-up provides its own", directory.display());
     }

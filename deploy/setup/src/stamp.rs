@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 pub(crate) struct Stamp {
     /// SHA-256 of the wheel.
     pub(crate) sha256: String,
-    /// Whether all of it was kept (`--cuda`).
+    /// Whether all of it was kept (`--cuda`, `--xla`).
     pub(crate) cuda: bool,
     /// Every file taken, relative to `.deps`, with its size in bytes.
     pub(crate) files: BTreeMap<PathBuf, u64>,

@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use crate::accelerators::ACCELERATORS;
+
 /// A wheel, pinned by version and hash.
 pub(crate) struct Wheel {
     /// Its name on the package index.
@@ -16,10 +18,23 @@ pub(crate) struct Wheel {
     pub(crate) native: bool,
     /// What it provides.
     pub(crate) part: Part,
-    /// Where in `.deps` a file of the wheel goes; `None` leaves it out. The flag is `--cuda`.
-    pub(crate) place: fn(&str, bool) -> Option<PathBuf>,
+    /// Who needs it.
+    pub(crate) from: Extent,
+    /// Where in `.deps` a file of the wheel goes; `None` leaves it out.
+    pub(crate) place: fn(&str, Extent) -> Option<PathBuf>,
     /// Links made beside the files: (link in `.deps`, the name it points to).
     pub(crate) links: &'static [(&'static str, &'static str)],
+}
+
+/// How much is set up; each has what those before it have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Extent {
+    /// What a CPU needs.
+    Cpu,
+    /// All of libtorch, and NVIDIA's libraries.
+    Cuda,
+    /// torch_xla as well, for which libtorch must be the one that Python imports: with CUDA.
+    Xla,
 }
 
 /// What wheels provide; a part the user provides already is not fetched.
@@ -31,9 +46,16 @@ pub(crate) enum Part {
     Libtorch,
     /// The humanoid's XML and dm_control's test clips.
     DmControl,
+    /// torch_xla and what it imports.
+    Python,
 }
 
-/// All of them, the small ones first.
+/// All of them.
+pub(crate) fn wheels() -> impl Iterator<Item = &'static Wheel> {
+    WHEELS.iter().chain(&ACCELERATORS)
+}
+
+/// What everybody needs, the small ones first.
 pub(crate) const WHEELS: [Wheel; 5] = [
     Wheel {
         name: "mujoco",
@@ -42,6 +64,7 @@ pub(crate) const WHEELS: [Wheel; 5] = [
         size: 26_482_984,
         native: true,
         part: Part::Mujoco,
+        from: Extent::Cpu,
         place: |file, _| (file == "mujoco/libmujoco.so.3.17.0").then(|| "mujoco/lib/libmujoco.so.3.17.0".into()),
         links: &[("mujoco/lib/libmujoco.so", "libmujoco.so.3.17.0")],
     },
@@ -52,6 +75,7 @@ pub(crate) const WHEELS: [Wheel; 5] = [
         size: 56_452_238,
         native: false,
         part: Part::DmControl,
+        from: Extent::Cpu,
         place: dm_control,
         links: &[],
     },
@@ -62,9 +86,8 @@ pub(crate) const WHEELS: [Wheel; 5] = [
         size: 954_765,
         native: true,
         part: Part::Libtorch,
-        place: |file, _| {
-            (file == "nvidia/cuda_runtime/lib/libcudart.so.12").then(|| "libtorch/lib/libcudart.so.12".into())
-        },
+        from: Extent::Cpu,
+        place: |file, extent| nvidia(file, "nvidia/cuda_runtime/lib/libcudart.so.12", extent),
         links: &[],
     },
     Wheel {
@@ -74,7 +97,8 @@ pub(crate) const WHEELS: [Wheel; 5] = [
         size: 10_248_621,
         native: true,
         part: Part::Libtorch,
-        place: |file, _| (file == "nvidia/cuda_cupti/lib/libcupti.so.12").then(|| "libtorch/lib/libcupti.so.12".into()),
+        from: Extent::Cpu,
+        place: |file, extent| nvidia(file, "nvidia/cuda_cupti/lib/libcupti.so.12", extent),
         links: &[],
     },
     Wheel {
@@ -84,12 +108,13 @@ pub(crate) const WHEELS: [Wheel; 5] = [
         size: 899_815_990,
         native: true,
         part: Part::Libtorch,
+        from: Extent::Cpu,
         place: torch,
         links: &[],
     },
 ];
 
-fn dm_control(file: &str, _cuda: bool) -> Option<PathBuf> {
+fn dm_control(file: &str, _extent: Extent) -> Option<PathBuf> {
     let wanted = [
         "dm_control/composer/arena.xml",
         "dm_control/locomotion/walkers/assets/humanoid_CMU_V2019.xml",
@@ -103,11 +128,24 @@ fn dm_control(file: &str, _cuda: bool) -> Option<PathBuf> {
 /// Without `libtorch_cuda.so` beside them torch-sys links no CUDA, so these four and the headers are a CPU libtorch.
 const CPU_LIBRARIES: [&str; 4] = ["libc10.so", "libtorch.so", "libtorch_cpu.so", "libgomp.so.1"];
 
-fn torch(file: &str, cuda: bool) -> Option<PathBuf> {
+/// A CPU libtorch takes one file of NVIDIA's, beside its own.
+fn nvidia(file: &str, wanted: &str, extent: Extent) -> Option<PathBuf> {
+    if extent > Extent::Cpu {
+        return Some(format!("python/{file}").into());
+    }
+    let name = wanted.rsplit('/').next()?;
+    (file == wanted).then(|| format!("libtorch/lib/{name}").into())
+}
+
+fn torch(file: &str, extent: Extent) -> Option<PathBuf> {
+    // torch imports both.
+    if extent > Extent::Cpu && (file.starts_with("torchgen/") || file.starts_with("functorch/")) {
+        return Some(format!("python/{file}").into());
+    }
     let inside = file.strip_prefix("torch/")?;
     let on_cpu =
         inside.starts_with("include/") || inside.strip_prefix("lib/").is_some_and(|name| CPU_LIBRARIES.contains(&name));
-    (cuda || on_cpu).then(|| format!("libtorch/{inside}").into())
+    (extent > Extent::Cpu || on_cpu).then(|| format!("libtorch/{inside}").into())
 }
 
 #[cfg(test)]
@@ -116,16 +154,17 @@ mod tests {
 
     #[test]
     fn a_cpu_libtorch_has_no_cuda_library_and_a_cuda_one_keeps_everything() {
-        assert_eq!(torch("torch/lib/libtorch_cpu.so", false), Some("libtorch/lib/libtorch_cpu.so".into()));
-        assert_eq!(torch("torch/lib/libtorch_cuda.so", false), None);
-        assert_eq!(torch("torch/lib/libtorch_cuda.so", true), Some("libtorch/lib/libtorch_cuda.so".into()));
-        assert_eq!(torch("torch/include/ATen/ATen.h", false), Some("libtorch/include/ATen/ATen.h".into()));
-        assert_eq!(torch("functorch/dim.py", true), None);
+        assert_eq!(torch("torch/lib/libtorch_cpu.so", Extent::Cpu), Some("libtorch/lib/libtorch_cpu.so".into()));
+        assert_eq!(torch("torch/lib/libtorch_cuda.so", Extent::Cpu), None);
+        assert_eq!(torch("torch/lib/libtorch_cuda.so", Extent::Cuda), Some("libtorch/lib/libtorch_cuda.so".into()));
+        assert_eq!(torch("torch/include/ATen/ATen.h", Extent::Cpu), Some("libtorch/include/ATen/ATen.h".into()));
+        assert_eq!(torch("functorch/dim.py", Extent::Cpu), None);
+        assert_eq!(torch("torchgen/model.py", Extent::Xla), Some("python/torchgen/model.py".into()));
     }
 
     #[test]
     fn only_the_composers_arena_is_taken_from_dm_control() {
-        assert_eq!(dm_control("dm_control/composer/arena.xml", false), Some("dm_control/arena.xml".into()));
-        assert_eq!(dm_control("dm_control/mjcf/test_assets/arena.xml", false), None);
+        assert_eq!(dm_control("dm_control/composer/arena.xml", Extent::Cpu), Some("dm_control/arena.xml".into()));
+        assert_eq!(dm_control("dm_control/mjcf/test_assets/arena.xml", Extent::Cpu), None);
     }
 }

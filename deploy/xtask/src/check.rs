@@ -12,6 +12,9 @@ pub(crate) struct TestOptions {
     /// Build the images and test the containers, too; that takes a Docker engine, and on two cores a quarter of an hour the first time
     #[arg(long)]
     docker: bool,
+    /// Test the update on XLA instead, on what PJRT_DEVICE names or a CPU: torch_xla, and the learner built with it
+    #[arg(long, conflicts_with = "docker")]
+    xla: bool,
     /// Arguments for the test runner, for instance a part of a test's name
     #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
     arguments: Vec<String>,
@@ -31,6 +34,9 @@ struct Demanding {
 
 /// Sets up and runs every test: by cargo-nextest where it is installed, else by cargo itself.
 pub(crate) fn test(options: &TestOptions) -> Result<()> {
+    if options.xla {
+        return test_xla(&options.arguments);
+    }
     setup::run(&setup::Options::default())?;
     // Files written here are read by dm_control's own loader, and policies act in its own environment.
     python::prepare_tests()?;
@@ -58,6 +64,25 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
         command.args(["--filterset", &binaries.join(" and ")]);
     } else if !left_out.is_empty() {
         command.arg("--").args(left_out.iter().map(|tests| format!("--skip={}", tests.prefix)));
+    }
+    eprintln!("running `{}`", workspace::describe(&command));
+    run(&mut command)
+}
+
+/// The tests of devices, and those of the learner's program with XLA in it. Built beside everything else, which has none.
+fn test_xla(arguments: &[String]) -> Result<()> {
+    setup::run(&setup::Options::xla())?;
+    let mut command = cargo();
+    match cargo_has("nextest") {
+        true => command.args(["nextest", "run", "--no-fail-fast"]),
+        false => command.arg("test"),
+    };
+    command.args(["--release", "--package", "comic-learner", "--features", "xla", "--target-dir", "target/xla"]);
+    command.args(["--test", "devices", "--test", "xla"]).args(arguments);
+    // Where tests are threads of one process, a step's end is every test's.
+    command.env("RUST_TEST_THREADS", "1");
+    if std::env::var_os("PJRT_DEVICE").is_none() {
+        command.env("PJRT_DEVICE", "CPU");
     }
     eprintln!("running `{}`", workspace::describe(&command));
     run(&mut command)

@@ -5,57 +5,13 @@ use comic_networks::{Acting, ActionDistribution, Memory, NormaliserStatistics, P
 use comic_proto::UnrollShape;
 use tch::{Device, Kind, Tensor, nn};
 
+use super::error::Error;
 use super::stores::{named, trainable};
 use super::{
     Evidence, Improvement, Limits, Losses, MinibatchShape, MinibatchTensors, Multipliers, masked_mean,
     policy_improvement, returns,
 };
-use crate::adam::{self, Adam, StateError};
-
-/// Errors of the learner.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum Error {
-    /// A field of a batch has the wrong length.
-    #[error("batch field `{field}` has {found} elements where its shape needs {expected}")]
-    Length {
-        /// The field's name.
-        field: &'static str,
-        /// Elements needed.
-        expected: usize,
-        /// Elements found.
-        found: usize,
-    },
-    /// An unroll of a task there is not.
-    #[error("an unroll is of task {task}, and there are {tasks}")]
-    Task {
-        /// As found.
-        task: usize,
-        /// Number of tasks.
-        tasks: usize,
-    },
-    /// A batch that was made for another task or network.
-    #[error("batch is {found:?} with clips below {clips} where the networks take {expected:?} and {known} clips")]
-    Shape {
-        /// The networks' sizes; unrolls and length are the batch's own.
-        expected: Box<MinibatchShape>,
-        /// The batch's sizes.
-        found: Box<MinibatchShape>,
-        /// One more than the largest clip index of the batch.
-        clips: usize,
-        /// Clips the value function knows.
-        known: usize,
-    },
-    /// The networks refused their parameters or sizes.
-    #[error(transparent)]
-    Networks(#[from] comic_networks::Error),
-    /// The state does not fit.
-    #[error(transparent)]
-    State(#[from] StateError),
-    /// libtorch refused an operation.
-    #[error("libtorch: {0}")]
-    Torch(#[from] tch::TchError),
-}
+use crate::adam::{self, Adam};
 
 /// The online networks, the multipliers and Adam.
 ///
@@ -108,12 +64,22 @@ struct Descent {
 }
 
 impl VmpoLearner {
-    /// New networks on `device`, from libtorch's generator: call `tch::manual_seed` first. `pose` is the action at which
-    /// the policy's mean starts, A entries.
+    /// New networks on `device`, from libtorch's generator on the CPU: call `tch::manual_seed` first, and they are the same
+    /// on every device. `pose` is the action at which the policy's mean starts, A entries.
     ///
     /// # Errors
     /// [`Error::Networks`] when `pose` is no action of this task.
     pub fn new(spec: &TaskSpec, experiment: &Experiment, pose: &[f32], device: Device) -> Result<Self, Error> {
+        let host = Self::made_on(Device::Cpu, spec, experiment, pose)?;
+        if device == Device::Cpu {
+            return Ok(host);
+        }
+        let mut learner = Self::made_on(device, spec, experiment, pose)?;
+        learner.load_state(&host.state())?;
+        Ok(learner)
+    }
+
+    fn made_on(device: Device, spec: &TaskSpec, experiment: &Experiment, pose: &[f32]) -> Result<Self, Error> {
         let Experiment { network, vmpo, optimiser, .. } = experiment;
         let policy_store = nn::VarStore::new(device);
         let value_store = nn::VarStore::new(device);
@@ -346,7 +312,7 @@ impl VmpoLearner {
     fn groups(&self, routing: &Routing, length: i64, valid: &Tensor) -> Vec<Tensor> {
         match routing.tasks() {
             Some(tasks) if self.vmpo.temperature_per_task => {
-                let of_rows = tasks.repeat_interleave_self_int(length, 0, valid.size()[0]);
+                let of_rows = tasks.unsqueeze(1).expand([-1, length], false).reshape([-1]);
                 (0..self.spec.tasks.len() as i64).map(|task| of_rows.eq(task)).collect()
             }
             _ => vec![valid.ones_like().to_kind(Kind::Bool)],

@@ -1,7 +1,7 @@
 //! Small tasks and made-up unrolls for the tests of V-MPO.
 #![allow(dead_code, reason = "each test uses its part")]
 
-use comic_experiment::{Experiment, TaskPart, TaskSpec};
+use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives, TaskPart, TaskSpec};
 use comic_learner::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
 use comic_networks::{Memory, Routing};
 use comic_proto::UnrollShape;
@@ -60,6 +60,20 @@ pub(crate) fn experiment() -> Experiment {
     experiment
 }
 
+/// Small networks of every low level.
+pub(crate) fn every_low_level() -> Vec<Experiment> {
+    LowLevelName::ALL
+        .map(|name| {
+            let mut experiment = experiment();
+            experiment.network.low_level = name;
+            experiment.network.lstm = Lstm { units: vec![6, 5] };
+            experiment.network.primitives =
+                Primitives { count: 3, torso: vec![8], hidden: 6, gate: vec![7], biases: true };
+            experiment
+        })
+        .to_vec()
+}
+
 /// libtorch's generator is the process's: tests that seed it take turns.
 static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
@@ -68,11 +82,15 @@ pub(crate) fn learner(experiment: &Experiment, seed: i64) -> VmpoLearner {
 }
 
 pub(crate) fn learner_of(spec: &TaskSpec, experiment: &Experiment, seed: i64) -> VmpoLearner {
+    learner_on(Device::Cpu, spec, experiment, seed)
+}
+
+pub(crate) fn learner_on(device: Device, spec: &TaskSpec, experiment: &Experiment, seed: i64) -> VmpoLearner {
     let _guard = GENERATOR.lock().unwrap();
     // Tests run side by side, on networks too small to share among threads.
     tch::set_num_threads(1);
     tch::manual_seed(seed);
-    VmpoLearner::new(spec, experiment, &[0.1, -0.2, 0.3], Device::Cpu).unwrap()
+    VmpoLearner::new(spec, experiment, &[0.1, -0.2, 0.3], device).unwrap()
 }
 
 /// Unrolls as the wire has them; every field may be changed by a test.
@@ -142,6 +160,49 @@ impl Unrolls {
         }
     }
 
+    /// Recorded unrolls of an experiment's sizes, of one task or of [`joint_spec`]'s two, `seed` deciding the mix: some end
+    /// an episode, by a fall or a clip's end, and some are padding from a row on.
+    pub(crate) fn recorded(experiment: &Experiment, spec: &TaskSpec, seed: u64, count: usize) -> Self {
+        let mut unrolls = Self::random(seed, count);
+        let mut numbers = Numbers::new(seed + 100);
+        let (network, rows) = (&experiment.network, count * LENGTH);
+        let components = network.components();
+        unrolls.previous_latent = numbers.take(rows * network.latent.size);
+        unrolls.latent_noise = numbers.take(rows * network.latent.size);
+        unrolls.mean = numbers.take(rows * components * WIDTHS.action);
+        unrolls.std = numbers.take(unrolls.mean.len()).iter().map(|value| 0.6 + 0.3 * value).collect();
+        if components > 1 {
+            unrolls.log_weights = vec![-(components as f32).ln(); rows * components];
+        }
+        unrolls.state = numbers.take(count * network.state_size());
+        unrolls.reward = numbers.take(rows * spec.reward_terms.len());
+        unrolls.task_count = spec.tasks.len();
+        for unroll in 0..count {
+            let task = (numbers.next().abs() * spec.tasks.len() as f32) as usize;
+            unrolls.tasks[unroll] = task.min(spec.tasks.len() - 1);
+            let row = 1 + (numbers.next().abs() * (LENGTH - 1) as f32) as usize;
+            match (numbers.next() * 2.0) as i32 {
+                1 => unrolls = unrolls.end_episode(unroll, row.min(LENGTH - 1), numbers.next() > 0.0),
+                -1 => {
+                    for padding in row..LENGTH {
+                        unrolls.valid[unroll * LENGTH + padding] = 0.0;
+                        unrolls.first[unroll * (LENGTH + 1) + padding + 1] = 1.0;
+                    }
+                }
+                _ => {}
+            }
+            if unrolls.tasks[unroll] == 1 {
+                let observations = unroll * (LENGTH + 1)..(unroll + 1) * (LENGTH + 1);
+                unrolls.clip[observations.clone()].fill(3);
+                for observation in observations {
+                    // The second task's is the last two entries.
+                    unrolls.task[observation * WIDTHS.task..][..WIDTHS.task - 2].fill(0.0);
+                }
+            }
+        }
+        unrolls
+    }
+
     /// Ends the episode of `unroll` with the step into `row`, which then holds its last observation.
     pub(crate) fn end_episode(mut self, unroll: usize, row: usize, terminated: bool) -> Self {
         self.valid[unroll * LENGTH + row] = 0.0;
@@ -187,7 +248,11 @@ impl Unrolls {
     }
 
     pub(crate) fn minibatch(&self) -> MinibatchTensors {
-        MinibatchTensors::new(&self.source(), &self.shape(), Device::Cpu).unwrap()
+        self.minibatch_on(Device::Cpu)
+    }
+
+    pub(crate) fn minibatch_on(&self, device: Device) -> MinibatchTensors {
+        MinibatchTensors::new(&self.source(), &self.shape(), device).unwrap()
     }
 
     /// Replaces actions and behaviour by what `learner`'s policy does in these observations, `rows` at a time.

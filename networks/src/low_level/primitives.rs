@@ -41,7 +41,8 @@ impl Primitives {
         let head_biases = path.var("head_biases", &[count, 1, 2 * actions], nn::Init::Const(0.0));
         let raw = inverse_softplus(initial_std - network.min_std) as f32;
         let bias: Vec<f32> = config.pose.iter().copied().chain(std::iter::repeat_n(raw, config.pose.len())).collect();
-        tch::no_grad(|| head_biases.shallow_clone().copy_(&Tensor::from_slice(&bias)));
+        let bias = Tensor::from_slice(&bias).expand_as(&head_biases);
+        tch::no_grad(|| head_biases.shallow_clone().copy_(&bias));
         let fixed_biases = sizes.biases.then(|| evenly(sizes.count));
         Self { torso, hidden, heads, head_biases, fixed_biases, count, min_std: network.min_std }
     }

@@ -1,0 +1,49 @@
+//! What can go wrong with a batch or a state.
+
+use super::MinibatchShape;
+use crate::adam::StateError;
+
+/// Errors of the learner.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A field of a batch has the wrong length.
+    #[error("batch field `{field}` has {found} elements where its shape needs {expected}")]
+    Length {
+        /// The field's name.
+        field: &'static str,
+        /// Elements needed.
+        expected: usize,
+        /// Elements found.
+        found: usize,
+    },
+    /// An unroll of a task there is not.
+    #[error("an unroll is of task {task}, and there are {tasks}")]
+    Task {
+        /// As found.
+        task: usize,
+        /// Number of tasks.
+        tasks: usize,
+    },
+    /// A batch that was made for another task or network.
+    #[error("batch is {found:?} with clips below {clips} where the networks take {expected:?} and {known} clips")]
+    Shape {
+        /// The networks' sizes; unrolls and length are the batch's own.
+        expected: Box<MinibatchShape>,
+        /// The batch's sizes.
+        found: Box<MinibatchShape>,
+        /// One more than the largest clip index of the batch.
+        clips: usize,
+        /// Clips the value function knows.
+        known: usize,
+    },
+    /// The networks refused their parameters or sizes.
+    #[error(transparent)]
+    Networks(#[from] comic_networks::Error),
+    /// The state does not fit.
+    #[error(transparent)]
+    State(#[from] StateError),
+    /// libtorch refused an operation.
+    #[error("libtorch: {0}")]
+    Torch(#[from] tch::TchError),
+}

@@ -1,0 +1,140 @@
+//! The same updates on another device as on the CPU: on XLA where it was built in, as `cargo xtask test --xla` does, else on
+//! what `COMIC_TEST_DEVICE` names. Where that is the CPU itself, two learners with two lives are compared.
+
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
+mod vmpo_support;
+
+use std::sync::OnceLock;
+
+use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
+use comic_learner::device::Backend;
+use comic_learner::vmpo::{Losses, Metrics, VmpoLearner};
+use tch::Device;
+use vmpo_support::{Unrolls, every_low_level, joint_spec, learner_on, spec, state};
+
+const COUNT: usize = 12;
+const BATCHES: u64 = 30;
+
+/// One for the process: a plugin is started once.
+fn backend() -> &'static Backend {
+    static BACKEND: OnceLock<Backend> = OnceLock::new();
+    BACKEND.get_or_init(|| {
+        let built_in = if cfg!(feature = "xla") { "xla" } else { "cpu" };
+        let name = std::env::var("COMIC_TEST_DEVICE").unwrap_or_else(|_| built_in.into());
+        let device: DeviceName = name.parse().unwrap();
+        let compiled = tempfile::tempdir().unwrap().keep();
+        Backend::open(&Learner { device, ..Learner::default() }, &compiled).unwrap()
+    })
+}
+
+/// Every low level with one task, and two tasks over the first of them and over the recurrent one.
+fn experiments() -> Vec<(String, Experiment, TaskSpec)> {
+    let of = |mut experiment: Experiment, spec: TaskSpec| {
+        // Adam as it is used, so that thirty steps do not run away.
+        experiment.optimiser.epsilon = 1e-3;
+        experiment.optimiser.learning_rate = 1e-3;
+        experiment.optimiser.multiplier_learning_rate = 1e-3;
+        experiment.optimiser.max_gradient_norm = 0.5;
+        experiment.network.normaliser_steps = 1;
+        if experiment.network.low_level == LowLevelName::Lstm && spec.tasks.len() == 1 {
+            experiment.network.value_lstm = vec![6];
+            experiment.vmpo.value_burn_in = 2;
+        }
+        (format!("{} with {} tasks", experiment.network.low_level, spec.tasks.len()), experiment, spec)
+    };
+    let alone = every_low_level().into_iter().map(|experiment| of(experiment, spec()));
+    let joint = every_low_level().into_iter().take(2).map(|experiment| of(experiment, joint_spec()));
+    alone.chain(joint).collect()
+}
+
+fn step(learner: &mut VmpoLearner, unrolls: &Unrolls) -> Metrics {
+    // As of several gradient steps on a batch, whose order is another one.
+    let order: Vec<usize> = (0..COUNT).rev().collect();
+    let minibatch = unrolls.minibatch_on(learner.device()).select(&order);
+    let losses = [learner.step(&minibatch).unwrap()];
+    drop(minibatch);
+    if learner.device() != Device::Cpu {
+        backend().end_step().unwrap();
+    }
+    Losses::mean(&losses).unwrap().to_metrics()
+}
+
+/// The largest difference of what the two learners hold under names that begin so, relative to the largest number of the
+/// same tensor or to `floor`.
+fn distance(left: &VmpoLearner, right: &VmpoLearner, prefix: &str, floor: f64) -> (f64, String) {
+    let mut worst = (0.0, String::new());
+    for ((name, left), (_, right)) in state(left).into_iter().zip(state(right)) {
+        let scale = left.iter().fold(floor, |scale: f64, value| scale.max(value.abs()));
+        for (left, right) in left.iter().zip(&right).filter(|_| name.starts_with(prefix)) {
+            assert!(left.is_finite() && right.is_finite(), "{name}");
+            let difference = (left - right).abs() / scale;
+            if difference > worst.0 {
+                worst = (difference, name.clone());
+            }
+        }
+    }
+    worst
+}
+
+#[test]
+fn the_first_update_and_thirty_are_the_cpus_for_every_low_level() {
+    for (name, experiment, spec) in experiments() {
+        let mut host = learner_on(Device::Cpu, &spec, &experiment, 3);
+        let mut there = learner_on(backend().device(), &spec, &experiment, 3);
+        for seed in 0..BATCHES {
+            let unrolls = Unrolls::recorded(&experiment, &spec, seed, COUNT);
+            let (expected, found) = (step(&mut host, &unrolls), step(&mut there, &unrolls));
+            if seed > 0 {
+                continue;
+            }
+            for ((entry, expected), (_, found)) in expected.entries().into_iter().zip(found.entries()) {
+                let difference = (f64::from(expected) - f64::from(found)).abs();
+                assert!(difference <= 1e-5 * f64::from(expected.abs()).max(1.0), "{name}: {entry} {expected} {found}");
+            }
+            // The mean of one gradient is a tenth of that gradient.
+            let (worst, of) = distance(&host, &there, "adam.first.", 1e-6);
+            assert!(worst <= 1e-5, "{name}: the gradient of {of} differs by {worst:e}");
+        }
+        let (worst, of) = distance(&host, &there, "", 1e-3);
+        assert!(worst <= 1e-4, "{name}: {of} differs by {worst:e} after {BATCHES} updates");
+    }
+}
+
+#[test]
+fn what_one_device_saved_the_other_goes_on_with() {
+    for (name, experiment, spec) in experiments() {
+        let unrolls = |seed| Unrolls::recorded(&experiment, &spec, seed, COUNT);
+        let mut host = learner_on(Device::Cpu, &spec, &experiment, 4);
+        let mut there = learner_on(backend().device(), &spec, &experiment, 5);
+        step(&mut host, &unrolls(0));
+        there.load_state(&host.state()).unwrap();
+        assert_eq!(state(&host), state(&there), "{name}: taken over");
+        step(&mut there, &unrolls(1));
+        let mut back = learner_on(Device::Cpu, &spec, &experiment, 6);
+        back.load_state(&there.state()).unwrap();
+        assert_eq!(state(&back), state(&there), "{name}: and back");
+        step(&mut host, &unrolls(1));
+        let (worst, of) = distance(&host, &back, "", 1e-3);
+        assert!(worst <= 1e-4, "{name}: {of} differs by {worst:e}");
+    }
+}
+
+#[cfg(feature = "xla")]
+#[test]
+fn whatever_the_mix_of_tasks_and_ends_nothing_is_compiled_twice() {
+    for (name, experiment, spec) in experiments() {
+        let mut learner = learner_on(backend().device(), &spec, &experiment, 7);
+        let mut after_warm_up = 0;
+        for seed in 0..if spec.tasks.len() > 1 { 200 } else { 20 } {
+            if seed == 3 {
+                after_warm_up = backend().compilations().unwrap();
+            }
+            // What a schedule changes must be no constant of a program.
+            learner.set_learning_rates(1e-3 * (1.0 - f64::from(seed) / 300.0), 1e-3);
+            let metrics = step(&mut learner, &Unrolls::recorded(&experiment, &spec, 1000 + seed as u64, COUNT));
+            assert!(metrics.is_finite(), "{name}");
+        }
+        assert_eq!(backend().compilations().unwrap(), after_warm_up, "{name}: compiled after the warm-up");
+    }
+}

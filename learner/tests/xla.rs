@@ -1,0 +1,59 @@
+//! The learner's program with XLA in it: how it starts, stops and fails.
+
+#![cfg(feature = "xla")]
+
+use std::io::{BufRead as _, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use comic_learner::checkpoint::find;
+use rustix::process::{Pid, Signal, kill_process};
+
+fn learner(run: &Path, arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_comic-learner"));
+    command.args(["--preset", "quickstart", "--port", "0", "--run"]).arg(run).args(arguments);
+    command.stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+/// When it serves.
+fn started(mut command: Command) -> Child {
+    let mut child = command.spawn().unwrap();
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    if !line.contains("listening") {
+        let output = child.wait_with_output().unwrap();
+        panic!("it does not serve: {}", String::from_utf8_lossy(&output.stderr));
+    }
+    child
+}
+
+#[test]
+fn ctrl_c_leaves_a_checkpoint_that_another_device_goes_on_with() {
+    let directory = tempfile::tempdir().unwrap();
+    let run = directory.path().join("run");
+    for (device, signal) in [("xla", Signal::INT), ("cpu", Signal::TERM), ("xla:0", Signal::TERM)] {
+        let child = started(learner(&run, &["--device", device]));
+        kill_process(Pid::from_child(&child), signal).unwrap();
+        let output = child.wait_with_output().unwrap();
+        let log = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(0), "{device}: {log}");
+        assert!(log.contains("stopped; start again"), "{device}: {log}");
+        assert!(find(&run).is_ok(), "{device}: {log}");
+    }
+}
+
+#[test]
+fn a_device_that_is_not_there_is_a_configuration_that_is_wrong() {
+    let directory = tempfile::tempdir().unwrap();
+    for (device, word) in [("xla:200", "PJRT_DEVICE"), ("cuda:200", "setup --cuda")] {
+        let output = learner(&directory.path().join("run"), &["--device", device]).output().unwrap();
+        let log = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{log}");
+        assert!(log.contains(word), "{log}");
+    }
+    let mut elsewhere = learner(&directory.path().join("run"), &["--device", "xla"]);
+    let output = elsewhere.env("COMIC_PYTHON_PACKAGES", directory.path()).output().unwrap();
+    let log = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(2) && log.contains("setup --xla"), "{log}");
+}
