@@ -120,8 +120,7 @@ pub fn run(threads: usize, repeats: usize, subject: Subject, device: DeviceName)
         Subject::Joint => ("joint-get-up".to_string(), "learner.update.joint".to_string()),
     };
     let experiment = comic_experiment::resolve(&preset, &[])?;
-    let compiled = std::env::current_dir()?.join("target/compiled");
-    let backend = Backend::open(&Learner { device, ..experiment.learner.clone() }, &compiled)?;
+    let backend = Backend::open(&Learner { device, ..experiment.learner.clone() })?;
     let mut update = Update::new(&experiment, &backend)?;
     let alone = Experiment { joint: Vec::new(), ..experiment.clone() };
     let mut one_task = matches!(subject, Subject::Joint).then(|| Update::new(&alone, &backend)).transpose()?;

@@ -6,8 +6,6 @@
 #[cfg(feature = "xla")]
 mod xla;
 
-use std::path::Path;
-
 use anyhow::Result;
 use comic_experiment::{DeviceName, Learner};
 use tch::Device;
@@ -24,15 +22,15 @@ pub struct Backend {
 }
 
 impl Backend {
-    /// The device the experiment names, ready for tensors. `cache` is where a plugin may keep what it compiled.
+    /// The device the experiment names, ready for tensors.
     ///
     /// # Errors
     /// [`Misuse`] with the remedy when the device was not built in or is not there.
-    pub fn open(learner: &Learner, cache: &Path) -> Result<Self> {
+    pub fn open(learner: &Learner) -> Result<Self> {
         match learner.device {
             DeviceName::Cpu => Ok(Self::cpu()),
             DeviceName::Cuda(index) => Self::cuda(index),
-            DeviceName::Xla(index) => Self::xla(index, learner, cache),
+            DeviceName::Xla(index) => Self::xla(index, learner),
         }
     }
 
@@ -64,13 +62,13 @@ impl Backend {
     }
 
     #[cfg(feature = "xla")]
-    fn xla(index: usize, learner: &Learner, cache: &Path) -> Result<Self> {
-        let plugin = xla::Plugin::start(index, learner.matmul_precision, cache)?;
+    fn xla(index: usize, learner: &Learner) -> Result<Self> {
+        let plugin = xla::Plugin::start(index, learner.matmul_precision)?;
         Ok(Self { xla: Some(plugin), ..Self::of(DeviceName::Xla(index), xla::DEVICE) })
     }
 
     #[cfg(not(feature = "xla"))]
-    fn xla(index: usize, _learner: &Learner, _cache: &Path) -> Result<Self> {
+    fn xla(index: usize, _learner: &Learner) -> Result<Self> {
         Err(Misuse::new(format!(
             "learner.device = \"xla:{index}\": this learner was built without XLA: `cargo xtask setup --xla`, then \
              `cargo build --release --package comic-learner --features xla`"
@@ -139,7 +137,7 @@ mod tests {
     use super::*;
 
     fn open(device: DeviceName) -> anyhow::Error {
-        Backend::open(&Learner { device, ..Learner::default() }, Path::new("nowhere")).unwrap_err()
+        Backend::open(&Learner { device, ..Learner::default() }).unwrap_err()
     }
 
     #[test]

@@ -72,7 +72,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     };
     let _lock = Store::open(&options.run, experiment.learner.checkpoints_kept)?.lock()?;
     // Nothing else runs yet that this could hold up, and a device is taken by whoever has the run.
-    let backend = Backend::open(&experiment.learner, &options.run.join("compiled"))?;
+    let backend = Backend::open(&experiment.learner)?;
     let (setup, shared) = prepare(options, experiment, backend, security)?;
     let (batcher, publisher, epoch) = (setup.batcher.clone(), setup.publisher.clone(), setup.epoch);
     let began = batcher.books().trained;

@@ -23,8 +23,7 @@ fn backend() -> &'static Backend {
         let built_in = if cfg!(feature = "xla") { "xla" } else { "cpu" };
         let name = std::env::var("COMIC_TEST_DEVICE").unwrap_or_else(|_| built_in.into());
         let device: DeviceName = name.parse().unwrap();
-        let compiled = tempfile::tempdir().unwrap().keep();
-        Backend::open(&Learner { device, ..Learner::default() }, &compiled).unwrap()
+        Backend::open(&Learner { device, ..Learner::default() }).unwrap()
     })
 }
 

@@ -28,7 +28,6 @@ const PATIENCE: Duration = Duration::from_secs(15);
 const START: &str = r"
 import os, sys
 sys.path.insert(0, packages)
-os.environ['XLA_PERSISTENT_CACHE_PATH'] = os.fsdecode(cache)
 import torch
 import torch_xla
 from torch_xla import runtime
@@ -87,7 +86,7 @@ pub(super) struct Plugin {
 
 impl Plugin {
     /// Starts Python and torch_xla. A process has one of either: what else is started is the same one.
-    pub(super) fn start(index: usize, precision: MatmulPrecision, cache: &Path) -> Result<Self> {
+    pub(super) fn start(index: usize, precision: MatmulPrecision) -> Result<Self> {
         let packages = std::env::var(PACKAGES_VARIABLE).unwrap_or_else(|_| PACKAGES.to_string());
         if !Path::new(&packages).join("torch_xla").is_dir() {
             return Err(Misuse::new(format!(
@@ -96,15 +95,12 @@ impl Plugin {
             ))
             .into());
         }
-        let cache = std::path::absolute(cache).context("the directory for compiled programs")?;
-        std::fs::create_dir_all(&cache).with_context(|| format!("cannot make {}", cache.display()))?;
         let started = Instant::now();
         tracing::info!("starting torch_xla");
         Python::initialize();
         let plugin = Python::attach(|python| {
             let names = pyo3::types::PyDict::new(python);
             names.set_item("packages", &packages)?;
-            names.set_item("cache", cache.as_os_str())?;
             names.set_item("precision", precision.name())?;
             names.set_item("index", index)?;
             python.run(&CString::new(START)?, Some(&names), None)?;
