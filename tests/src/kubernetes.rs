@@ -7,9 +7,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail, ensure};
 use k8s_openapi::api::apps::v1::StatefulSet;
 use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::{Namespace, PodSpec, Service};
+use k8s_openapi::api::core::v1::{Container, Namespace, PodSpec, Service};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use k8s_openapi::api::policy::v1::PodDisruptionBudget;
+use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -199,4 +200,31 @@ fn keeps(written: &Value, read: &Value, at: &str) -> Result<()> {
         (written, read) if written == read => Ok(()),
         (written, read) => bail!("{at} is {written} and is read as {read}"),
     }
+}
+
+/// The value behind an option of a container's program.
+///
+/// # Errors
+/// When it is not given.
+pub fn option<'a>(container: &'a Container, name: &str) -> Result<&'a str> {
+    let args = container.args.as_deref().unwrap_or_default();
+    let at = args.iter().position(|arg| arg == name).with_context(|| format!("no {name} in {args:?}"))?;
+    Ok(args.get(at + 1).with_context(|| format!("nothing behind {name}"))?)
+}
+
+/// The variables of a container that are given as they are.
+pub fn environment(container: &Container) -> BTreeMap<&str, &str> {
+    let variables = container.env.iter().flatten();
+    variables.filter_map(|variable| Some((variable.name.as_str(), variable.value.as_deref()?))).collect()
+}
+
+/// What a quantity stands for, as far as ours are written.
+///
+/// # Errors
+/// Another unit.
+pub fn amount(Quantity(text): &Quantity) -> Result<f64> {
+    let units = [("m", 1e-3), ("Mi", 2f64.powi(20)), ("Gi", 2f64.powi(30))];
+    let unit = units.iter().find_map(|(unit, factor)| Some((text.strip_suffix(unit)?, *factor)));
+    let (number, factor) = unit.unwrap_or((text, 1.0));
+    Ok(number.parse::<f64>().with_context(|| format!("{text} is no quantity"))? * factor)
 }

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, bail, ensure};
 use comic_proto::Access;
-use comic_tests::kubernetes::{Cluster, applicable, render, strictly};
+use comic_tests::kubernetes::{Cluster, amount, applicable, environment, option, render, strictly};
 use comic_tests::repository::root;
 use comic_tests::system::{System, help, program};
 use k8s_openapi::api::core::v1::{Container, PodSpec, Probe};
@@ -42,18 +42,6 @@ fn both(cluster: &Cluster) -> Result<[&PodSpec; 2]> {
     Ok([cluster.learner_pod()?, cluster.actor_pod()?])
 }
 
-/// The value behind an option.
-fn option<'a>(container: &'a Container, name: &str) -> Result<&'a str> {
-    let args = container.args.as_deref().unwrap_or_default();
-    let at = args.iter().position(|arg| arg == name).with_context(|| format!("no {name} in {args:?}"))?;
-    Ok(args.get(at + 1).with_context(|| format!("nothing behind {name}"))?)
-}
-
-fn environment(container: &Container) -> BTreeMap<&str, &str> {
-    let variables = container.env.iter().flatten();
-    variables.filter_map(|variable| Some((variable.name.as_str(), variable.value.as_deref()?))).collect()
-}
-
 #[test]
 fn what_kubernetes_does_not_know_is_refused() -> Result<()> {
     let manifest = |field: &str| {
@@ -83,14 +71,6 @@ fn what_is_taken_is_asked_for_and_limited() -> Result<()> {
         }
         Ok(())
     })
-}
-
-/// What a quantity stands for, as far as ours are written.
-fn amount(Quantity(text): &Quantity) -> Result<f64> {
-    let units = [("m", 1e-3), ("Mi", 2f64.powi(20)), ("Gi", 2f64.powi(30))];
-    let unit = units.iter().find_map(|(unit, factor)| Some((text.strip_suffix(unit)?, *factor)));
-    let (number, factor) = unit.unwrap_or((text, 1.0));
-    Ok(number.parse::<f64>().with_context(|| format!("{text} is no quantity"))? * factor)
 }
 
 /// https://kubernetes.io/docs/concepts/security/pod-security-standards, the standard `restricted`, and more.

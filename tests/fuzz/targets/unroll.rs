@@ -1,0 +1,51 @@
+//! A message of an unroll, as it comes off the wire: decoded, validated, and, where it is sound, laid into a batch.
+
+#![no_main]
+
+use std::sync::{Arc, LazyLock};
+
+use comic_fuzz::{experiment, layout, seed, spec};
+use comic_proto::v1::{UnrollHeader, UnrollMessage};
+use comic_proto::{Expected, Field, UnrollBuffer, UnrollLayout, validate};
+use comic_replay::{Batcher, Config, Ledger, Order, Phase};
+use futures::executor::block_on;
+use libfuzzer_sys::fuzz_target;
+use prost::Message as _;
+
+struct Service {
+    layout: Arc<UnrollLayout>,
+    /// Of each task.
+    clips: Vec<usize>,
+}
+
+static SERVICE: LazyLock<Service> = LazyLock::new(|| {
+    let experiment = experiment();
+    let spec = spec(&experiment);
+    let layout = Arc::new(layout(&spec, &experiment));
+    let mut unroll = UnrollBuffer::new(&layout);
+    for t in 0..layout.shape().length {
+        for field in [Field::Valid, Field::Discount, Field::Std] {
+            unroll.row_mut(field, t).fill(1.0);
+        }
+    }
+    let header = UnrollHeader { layout_hash: layout.hash().to_vec(), ..UnrollHeader::default() };
+    seed("sound", &UnrollMessage { header: Some(header), payload: unroll.into_bytes() }.encode_to_vec());
+    Service { layout, clips: spec.tasks.iter().map(|task| task.clips).collect() }
+});
+
+fuzz_target!(init: {
+    LazyLock::force(&SERVICE);
+}, |bytes: &[u8]| {
+    let Service { layout, clips } = &*SERVICE;
+    let Ok(UnrollMessage { header: Some(header), payload }) = UnrollMessage::decode(bytes) else { return };
+    let expected = Expected { clips, epoch: 0, newest_version: 3 };
+    if validate(layout, &header, &payload, &expected).is_ok() {
+        let config = Config { unrolls: 2, max_staleness: 2, ahead: 0, order: Order::Arrival };
+        let mut ledger = Ledger::new();
+        let _ = ledger.join(header.incarnation, None);
+        let batcher = Batcher::new(layout.clone(), config, Phase::default(), ledger);
+        // The first of two: there is room.
+        block_on(batcher.insert(&header, payload));
+        assert!(batcher.books().balance());
+    }
+});
