@@ -58,7 +58,7 @@ fn unrolls_pass_the_learners_validation() {
                 ..UnrollHeader::default()
             };
             let expected = Expected { clips: &[setup.task.spec().clips.len()], epoch: 2, newest_version: 4 };
-            validate(&setup.layout, &header, &unroll.payload, &expected).unwrap();
+            validate(&setup.layout, &header, &unroll.payload.clone().into(), &expected).unwrap();
             assert_eq!(unroll.demonstration, conduct == Conduct::Demonstrate);
         }
     }

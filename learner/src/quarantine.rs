@@ -11,10 +11,9 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
 use anyhow::{Context as _, Result};
-use bytes::Bytes;
 use clap::Args;
-use comic_proto::Invalid;
 use comic_proto::v1::UnrollHeader;
+use comic_proto::{Invalid, Pieces};
 use serde_json::json;
 
 use crate::service::complaints::Complaints;
@@ -40,7 +39,7 @@ pub struct QuarantineOptions {
 #[derive(Debug)]
 struct Refused {
     header: UnrollHeader,
-    payload: Bytes,
+    payload: Pieces,
     reason: String,
 }
 
@@ -78,7 +77,7 @@ impl Quarantine {
     }
 
     /// Has an unroll kept; never waits.
-    pub(crate) fn offer(&self, header: &UnrollHeader, payload: &Bytes, reason: &Invalid) {
+    pub(crate) fn offer(&self, header: &UnrollHeader, payload: &Pieces, reason: &Invalid) {
         let refused = Refused { header: header.clone(), payload: payload.clone(), reason: reason.to_string() };
         if self.queue.as_ref().is_none_or(|queue| queue.try_send(refused).is_err()) {
             self.telemetry.quarantined.of("busy").inc();
@@ -143,7 +142,8 @@ impl Cell {
         let Some(room) = self.room.checked_sub(bytes) else { return Ok(false) };
         let UnrollHeader { learner_epoch, actor, sequence, .. } = header;
         let path = self.directory.join(format!("{learner_epoch}-{actor}-{sequence}.unroll"));
-        let written = write(&path, &[&length, label.as_bytes(), payload]);
+        let parts = [&length, label.as_bytes()].into_iter().chain(payload.range(0..payload.len()));
+        let written = write(&path, parts);
         if written.is_err() {
             // Half of it helps nobody.
             let _ = fs::remove_file(&path);
@@ -154,9 +154,9 @@ impl Cell {
     }
 }
 
-fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
+fn write<'a>(path: &Path, mut parts: impl Iterator<Item = &'a [u8]>) -> std::io::Result<()> {
     let mut file = File::create_new(path)?;
-    parts.iter().try_for_each(|part| file.write_all(part))
+    parts.try_for_each(|part| file.write_all(part))
 }
 
 /// Bytes of the unrolls that are there.
@@ -189,7 +189,11 @@ mod tests {
         for sequence in sequences {
             // Each on its own, so that none finds the thread busy.
             let quarantine = Quarantine::start(&options(directory, bytes), &telemetry).unwrap().unwrap();
-            quarantine.offer(&header(sequence), &Bytes::from(vec![sequence as u8; 1000]), &Invalid::Header);
+            quarantine.offer(
+                &header(sequence),
+                &bytes::Bytes::from(vec![sequence as u8; 1000]).into(),
+                &Invalid::Header,
+            );
         }
         telemetry.quarantined.of("kept").get()
     }
@@ -232,7 +236,7 @@ mod tests {
         let (queue, _waiting) = sync_channel(QUEUE);
         let quarantine = Quarantine { queue: Some(queue), thread: None, telemetry: telemetry.clone() };
         for sequence in 0..QUEUE as u64 + 3 {
-            quarantine.offer(&header(sequence), &Bytes::new(), &Invalid::Header);
+            quarantine.offer(&header(sequence), &Pieces::default(), &Invalid::Header);
         }
         assert_eq!(telemetry.quarantined.of("busy").get(), 3);
     }

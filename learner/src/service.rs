@@ -4,8 +4,8 @@
 //! - [`Shared`] is what all calls have in common: the experiment, the batcher, the publisher.
 //! - [`serve`] is the server, up to its graceful end.
 //! - `incoming` lets connections in, `admission` calls: TLS, tokens and limits are theirs, and nobody else's.
-//! - `calls` answers each call; `unrolls` and `assets` are the two streams with a life of their own, and `broadcast` of
-//!   what is [published](crate::publish) the third. `status` tells how things are, `roster` how the actors are.
+//! - `calls` answers each call; `unrolls`, `assets`, and `broadcast` of what is [published](crate::publish) are the streams
+//!   with a life of their own. `streams` leads the two that carry bytes past tonic's codec. `status` tells how things are, `roster` how the actors are.
 //!   `shares` says which actor simulates what of a run in lockstep. `complaints` keeps the log readable when a peer misbehaves.
 //!
 //! Streams are pulled: nothing is read from an actor until the unroll before it has a slot in a batch, so HTTP/2 flow
@@ -20,6 +20,7 @@ mod incoming;
 mod roster;
 mod shares;
 mod status;
+mod streams;
 mod unrolls;
 
 use std::collections::VecDeque;
@@ -47,12 +48,12 @@ use crate::quarantine::{Quarantine, QuarantineOptions};
 use crate::security::{Limits, Security, Tls, Tokens};
 use crate::telemetry::Telemetry;
 use admission::Admission;
-use broadcast::Broadcast;
 use calls::Calls;
 use complaints::Complaints;
 use incoming::Door;
 use roster::Roster;
 use shares::Shares;
+use streams::Streams;
 
 /// A peer that answers no ping for [`KEEPALIVE_TIMEOUT`] is gone; without pings a half-open one is never noticed.
 const KEEPALIVE: Duration = Duration::from_secs(15);
@@ -295,7 +296,7 @@ pub async fn serve(listener: TcpListener, shared: Arc<Shared>, shutdown: impl Fu
     let mut closing = shared.closing();
     let server = server()
         .layer(admission)
-        .add_service(Broadcast::new(calls, shared.clone()))
+        .add_service(Streams::new(calls, shared.clone()))
         .add_service(health)
         .add_service(reflection)
         .serve_with_incoming_shutdown(door.open(listener), async move {

@@ -5,6 +5,7 @@
 //! - [`UnrollLayout`] says where each [`Field`] of an unroll lies in the payload, and hashes that into what both sides
 //!   compare. It follows from an [`UnrollShape`], and that from the experiment and the task's spec alone.
 //! - [`UnrollBuffer`] is an unroll that an actor writes.
+//! - [`ReceivedUnroll`] is one that a learner receives, in the [`Pieces`] in which it came.
 //! - [`Access`] is a client's way to a learner: URL, TLS, and the [`Token`] it shows.
 //! - [`validate`] is what a payload has to pass before it touches a batch.
 //!
@@ -21,6 +22,7 @@ mod access;
 mod buffer;
 mod frame;
 mod layout;
+mod pieces;
 mod token;
 mod validate;
 
@@ -34,6 +36,7 @@ pub use access::{Access, AccessError, Authorised, Bearer, Client, chain, distrus
 pub use buffer::UnrollBuffer;
 pub use frame::frame;
 pub use layout::{Field, UnrollLayout, UnrollShape};
+pub use pieces::{Malformed, Pieces, ReceivedUnroll};
 pub use token::{TOKEN_VARIABLE, Token};
 pub use validate::{Expected, Invalid, MAX_SEQUENCE, validate};
 

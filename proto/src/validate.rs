@@ -3,7 +3,7 @@
 use thiserror::Error;
 
 use crate::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
-use crate::{Field, UnrollLayout};
+use crate::{Field, Pieces, UnrollLayout};
 
 /// Sequence numbers lie below this. At a thousand unrolls a second an actor reaches it after thirty years; a larger
 /// one is a broken header, and one such number taken seriously would spoil the books.
@@ -144,7 +144,7 @@ const SMALLEST_STD: f32 = 1e-6;
 pub fn validate(
     layout: &UnrollLayout,
     header: &UnrollHeader,
-    payload: &[u8],
+    payload: &Pieces,
     expected: &Expected<'_>,
 ) -> Result<(), Invalid> {
     check_header(layout, header, expected)?;
@@ -211,30 +211,32 @@ fn check_episode(layout: &UnrollLayout, episode: &EpisodeStatistics, clips: usiz
     Err(Invalid::Episode { problem })
 }
 
-/// The payload's words; the network's buffer is not aligned.
-fn words(payload: &[u8]) -> impl Iterator<Item = u32> {
-    payload.as_chunks::<4>().0.iter().map(|bytes| u32::from_le_bytes(*bytes))
+/// The words of a field that has a few in a row.
+fn words(layout: &UnrollLayout, payload: &Pieces, field: Field) -> Vec<u32> {
+    let mut words = Vec::with_capacity(layout.elements(field));
+    payload.for_each_word(layout.range(field), |word| words.push(word));
+    words
 }
 
-fn field(layout: &UnrollLayout, payload: &[u8], field: Field) -> impl Iterator<Item = u32> {
-    words(&payload[layout.range(field)])
+fn floats(layout: &UnrollLayout, payload: &Pieces, field: Field) -> Vec<f32> {
+    words(layout, payload, field).into_iter().map(f32::from_bits).collect()
 }
 
 /// One pass finds whether all is as it should be; only when it is not does a second one look for the place.
 fn check_range(
     layout: &UnrollLayout,
-    payload: &[u8],
+    payload: &Pieces,
     name: Field,
     expected: &'static str,
     allowed: impl Fn(f32) -> bool,
 ) -> Result<(), Invalid> {
-    let values = || field(layout, payload, name).map(f32::from_bits);
     // No early exit: without one this is a handful of vector instructions per cache line. No NaN is in any range.
-    let broken = values().fold(false, |broken, value| broken | !allowed(value));
+    let mut broken = false;
+    payload.for_each_word(layout.range(name), |word| broken |= !allowed(f32::from_bits(word)));
     if !broken {
         return Ok(());
     }
-    let place = values().enumerate().find(|(_, value)| !allowed(*value));
+    let place = floats(layout, payload, name).into_iter().enumerate().find(|(_, value)| !allowed(*value));
     place.map_or(Ok(()), |(place, value)| {
         let row = place / layout.width(name).max(1);
         Err(match value.is_finite() {
@@ -244,9 +246,9 @@ fn check_range(
     })
 }
 
-fn check_weights(layout: &UnrollLayout, payload: &[u8]) -> Result<(), Invalid> {
+fn check_weights(layout: &UnrollLayout, payload: &Pieces) -> Result<(), Invalid> {
     let components = layout.width(Field::LogWeights);
-    let logarithms: Vec<f32> = field(layout, payload, Field::LogWeights).map(f32::from_bits).collect();
+    let logarithms = floats(layout, payload, Field::LogWeights);
     for (row, weights) in logarithms.chunks_exact(components.max(1)).enumerate() {
         let sum: f32 = weights.iter().map(|weight| weight.exp()).sum();
         if (sum - 1.0).abs() > WEIGHTS_TOLERANCE {
@@ -256,17 +258,18 @@ fn check_weights(layout: &UnrollLayout, payload: &[u8]) -> Result<(), Invalid> {
     Ok(())
 }
 
-fn check_boundaries(layout: &UnrollLayout, payload: &[u8]) -> Result<(), Invalid> {
-    let valid = field(layout, payload, Field::Valid).map(f32::from_bits);
-    let next_first = field(layout, payload, Field::First).skip(1).map(f32::from_bits);
-    match valid.zip(next_first).position(|(valid, first)| (valid == 0.0) != (first == 1.0)) {
+fn check_boundaries(layout: &UnrollLayout, payload: &Pieces) -> Result<(), Invalid> {
+    let (valid, first) = (floats(layout, payload, Field::Valid), floats(layout, payload, Field::First));
+    let next_first = first.iter().skip(1);
+    match valid.iter().zip(next_first).position(|(valid, first)| (*valid == 0.0) != (*first == 1.0)) {
         Some(row) => Err(Invalid::Boundary { row }),
         None => Ok(()),
     }
 }
 
-fn check_clips(layout: &UnrollLayout, header: &UnrollHeader, payload: &[u8], clips: &[usize]) -> Result<(), Invalid> {
-    let rows = || field(layout, payload, Field::Clip).enumerate();
+fn check_clips(layout: &UnrollLayout, header: &UnrollHeader, payload: &Pieces, clips: &[usize]) -> Result<(), Invalid> {
+    let found = words(layout, payload, Field::Clip);
+    let rows = || found.iter().copied().enumerate();
     let total: usize = clips.iter().sum();
     if let Some((row, clip)) = rows().find(|(_, clip)| *clip as usize >= total) {
         return Err(Invalid::Clip { clip, row, clips: total });

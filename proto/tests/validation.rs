@@ -2,8 +2,9 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
+use bytes::Bytes;
 use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader, UnrollMessage};
-use comic_proto::{Expected, Field, Invalid, MAX_SEQUENCE, UnrollBuffer, UnrollLayout, UnrollShape, validate};
+use comic_proto::{Expected, Field, Invalid, MAX_SEQUENCE, Pieces, UnrollBuffer, UnrollLayout, UnrollShape, validate};
 use proptest::prelude::*;
 use prost::Message as _;
 
@@ -59,7 +60,7 @@ fn unroll() -> UnrollBuffer {
 }
 
 fn refusal(header: &UnrollHeader, unroll: &UnrollBuffer) -> Option<Invalid> {
-    validate(&layout(), header, &unroll.to_bytes(), &EXPECTED).err()
+    validate(&layout(), header, &unroll.to_bytes().into(), &EXPECTED).err()
 }
 
 fn header_refusal(change: impl FnOnce(&mut UnrollHeader)) -> Option<Invalid> {
@@ -220,11 +221,12 @@ proptest! {
         message in prop::collection::vec(any::<u8>(), 0..300),
     ) {
         let mut header = header();
+        let payload = Pieces::from(Bytes::from(payload));
         let _ = validate(&layout(), &header, &payload, &EXPECTED);
         header.layout_hash = hash;
         let _ = validate(&layout(), &header, &payload, &EXPECTED);
         if let Ok(UnrollMessage { header: Some(header), payload }) = UnrollMessage::decode(&message[..]) {
-            let _ = validate(&layout(), &header, &payload, &EXPECTED);
+            let _ = validate(&layout(), &header, &payload.into(), &EXPECTED);
         }
     }
 
@@ -235,7 +237,7 @@ proptest! {
     ) {
         let mut payload = unroll().to_bytes().to_vec();
         payload[place] ^= 1 << bit;
-        if validate(&layout(), &header(), &payload, &EXPECTED).is_ok() {
+        if validate(&layout(), &header(), &Bytes::from(payload.clone()).into(), &EXPECTED).is_ok() {
             let unroll = UnrollBuffer::from_payload(&layout(), &payload).unwrap();
             for field in Field::ALL.into_iter().filter(|field| !matches!(field, Field::Clip | Field::Image)) {
                 for t in 0..layout().rows(field) {
@@ -250,7 +252,7 @@ proptest! {
     #[test]
     fn any_length_but_the_layout_s_is_refused(length in 0usize..2000) {
         prop_assume!(length != layout().size());
-        let refused = validate(&layout(), &header(), &vec![0; length], &EXPECTED).err();
+        let refused = validate(&layout(), &header(), &Bytes::from(vec![0; length]).into(), &EXPECTED).err();
         prop_assert_eq!(refused, Some(Invalid::Length { found: length, expected: layout().size() }));
     }
 }

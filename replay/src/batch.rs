@@ -5,7 +5,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use comic_proto::v1::UnrollHeader;
-use comic_proto::{Field, Invalid, UnrollLayout};
+use comic_proto::{Field, Invalid, Pieces, UnrollLayout};
 
 use crate::Batcher;
 use crate::ledger::Reason;
@@ -68,7 +68,7 @@ impl Buffer {
 
     /// Copies an unroll into a free slot: each field once, from where the network put it to where it is trained on.
     /// The payload's size is the layout's.
-    pub(crate) fn put(&mut self, layout: &UnrollLayout, slot: usize, header: UnrollHeader, payload: &[u8]) {
+    pub(crate) fn put(&mut self, layout: &UnrollLayout, slot: usize, header: UnrollHeader, payload: &Pieces) {
         for field in Field::ALL {
             let place = place(layout, field, slot);
             let bytes: &mut [u8] = match field {
@@ -76,7 +76,7 @@ impl Buffer {
                 Field::Image => &mut self.images[place],
                 _ => bytemuck::cast_slice_mut(&mut self.floats[field as usize][place]),
             };
-            bytes.copy_from_slice(&payload[layout.range(field)]);
+            payload.copy_to(layout.range(field).start, bytes);
         }
         self.headers[slot] = header;
         self.filled[slot] = true;
@@ -151,16 +151,16 @@ impl Batch {
     /// [`Invalid::Length`] when a payload is no unroll of this layout.
     pub fn assemble(
         layout: Arc<UnrollLayout>,
-        unrolls: impl IntoIterator<Item = (UnrollHeader, impl AsRef<[u8]>), IntoIter: ExactSizeIterator>,
+        unrolls: impl IntoIterator<Item = (UnrollHeader, impl Into<Pieces>), IntoIter: ExactSizeIterator>,
     ) -> Result<Self, Invalid> {
         let unrolls = unrolls.into_iter();
         let mut buffer = Buffer::new(&layout, unrolls.len());
         for (slot, (header, payload)) in unrolls.enumerate() {
-            let payload = payload.as_ref();
+            let payload = payload.into();
             if payload.len() != layout.size() {
                 return Err(Invalid::Length { found: payload.len(), expected: layout.size() });
             }
-            buffer.put(&layout, slot, header, payload);
+            buffer.put(&layout, slot, header, &payload);
         }
         Ok(Self { layout, unrolls: buffer.len(), buffer: Some(Box::new(buffer)), owner: None })
     }

@@ -4,9 +4,8 @@ use std::fmt;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use bytes::Bytes;
-use comic_proto::UnrollLayout;
 use comic_proto::v1::UnrollHeader;
+use comic_proto::{Pieces, UnrollLayout};
 use tokio::sync::Semaphore;
 
 use crate::batch::{Batch, Buffer};
@@ -134,7 +133,8 @@ impl Batcher {
     /// Puts a validated unroll into a batch, waiting for a slot as long as it takes, or says why not.
     ///
     /// Cancel-safe: until it returns, nothing has happened.
-    pub async fn insert(&self, header: &UnrollHeader, payload: Bytes) -> Outcome {
+    pub async fn insert(&self, header: &UnrollHeader, payload: impl Into<Pieces>) -> Outcome {
+        let payload = payload.into();
         // What is refused anyway does not queue for a slot.
         if let Some(outcome) = self.refuse(&mut self.lock(), header, &payload) {
             return outcome;
@@ -289,7 +289,7 @@ impl Batcher {
     }
 
     /// Applies every rule that keeps an unroll out of a batch. `None`, and nothing recorded, if there is none.
-    fn refuse(&self, state: &mut State, header: &UnrollHeader, payload: &[u8]) -> Option<Outcome> {
+    fn refuse(&self, state: &mut State, header: &UnrollHeader, payload: &Pieces) -> Option<Outcome> {
         if state.closed {
             return Some(Outcome::Closed);
         }

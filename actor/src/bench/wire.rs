@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
 use comic_proto::v1::*;
-use comic_proto::{Access, Expected, Field, UnrollBuffer, UnrollLayout, UnrollShape, validate};
+use comic_proto::{Access, Expected, Field, Pieces, UnrollBuffer, UnrollLayout, UnrollShape, validate};
 use comic_replay::{Batcher, Config, Ledger, Order, Outcome, Phase};
 use futures::{Stream, StreamExt as _};
 use tokio::net::TcpListener;
@@ -169,9 +169,10 @@ type Messages<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 async fn take(batcher: &Batcher, message: UnrollMessage) -> Result<UnrollAck, Status> {
     let header = message.header.ok_or_else(|| Status::invalid_argument("no header"))?;
     let expected = Expected { clips: &[1], epoch: 1, newest_version: 1 };
-    validate(batcher.layout(), &header, &message.payload, &expected)
+    let payload = Pieces::from(message.payload);
+    validate(batcher.layout(), &header, &payload, &expected)
         .map_err(|invalid| Status::invalid_argument(invalid.to_string()))?;
-    let verdict = match batcher.insert(&header, message.payload).await {
+    let verdict = match batcher.insert(&header, payload).await {
         Outcome::Taken => Verdict::Taken,
         _ => Verdict::Invalid,
     };

@@ -317,7 +317,7 @@ proptest! {
                 ..Default::default()
             };
             let checked = comic_proto::Expected { clips: &[1, 1, 1], epoch: 0, newest_version: 0 };
-            prop_assert_eq!(comic_proto::validate(&layout, &header, &unroll.payload, &checked), Ok(()));
+            prop_assert_eq!(comic_proto::validate(&layout, &header, &unroll.payload.clone().into(), &checked), Ok(()));
         }
     }
 

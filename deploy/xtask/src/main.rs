@@ -3,6 +3,7 @@
 //! # Layout
 //! - [`setup`] fills `.deps` with the native libraries; everything else calls it first.
 //! - [`check`] runs the tests and the linters; [`images`] builds what some of them run.
+//! - [`fuzz`] feeds hostile bytes to whatever reads bytes from outside.
 //! - [`train`] runs one learner and its actors on this machine and shows what they do.
 //! - [`sweep`] does so with some of an experiment's fields varied, and compares.
 //! - [`bench`] and [`python`] make the figures of the README, [`plot`] its curves.
@@ -11,6 +12,7 @@
 
 mod bench;
 mod check;
+mod fuzz;
 mod images;
 mod plot;
 mod python;
@@ -39,6 +41,8 @@ enum Command {
     Test(check::TestOptions),
     /// Check formatting and run clippy, warnings being errors
     Lint,
+    /// Feed hostile bytes to everything that reads some, guided by the code that they reach
+    Fuzz(fuzz::Options),
     /// Set up, build, and train with one learner and its actors on this machine
     Train(train::Options),
     /// Train an experiment with some of its fields varied, with several seeds, and compare
@@ -67,6 +71,7 @@ fn main() -> ExitCode {
         Command::Setup(options) => setup::run(&options),
         Command::Test(options) => check::test(&options),
         Command::Lint => check::lint(),
+        Command::Fuzz(options) => fuzz::fuzz(&options),
         Command::Train(options) => train::run(options),
         Command::Sweep(options) => sweep::run(options),
         Command::Bench(options) => bench::run(&options),

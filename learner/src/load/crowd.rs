@@ -244,7 +244,9 @@ impl Crowd {
     }
 
     async fn read_socket(&self) -> Result<()> {
-        let mut socket = TcpStream::connect(&self.options.host).await?;
+        let mut socket = self.connect().await?;
+        // The host's greeting: a connection that the system made may still wait to be accepted, or have been lost there.
+        socket.read_u8().await?;
         let _present = Present::new(&self.connected);
         let (mut buffer, mut read) = (vec![0; 64 * 1024], 0);
         loop {
@@ -254,10 +256,16 @@ impl Crowd {
         }
     }
 
+    async fn connect(&self) -> Result<TcpStream> {
+        let _door = self.doors.acquire().await?;
+        Ok(TcpStream::connect(&self.options.host).await?)
+    }
+
     async fn read_frames(&self) -> Result<()> {
+        let socket = self.connect().await?;
         let _present = Present::new(&self.connected);
         let mut read = 0;
-        reader::read(&self.options.host, |more| self.count(&mut read, more)).await
+        reader::read(socket, |more| self.count(&mut read, more)).await
     }
 
     /// Counts bytes, and the versions they make.

@@ -269,6 +269,10 @@ async fn write_to_all(listener: TcpListener, versions: watch::Receiver<u64>, pay
         let (mut versions, payload) = (versions.clone(), payload.clone());
         tokio::spawn(async move {
             let _ = socket.set_nodelay(true);
+            // A greeting: who reads it was accepted.
+            if socket.write_u8(0).await.is_err() {
+                return;
+            }
             while versions.changed().await.is_ok() && socket.write_all(&payload).await.is_ok() {}
         });
     }

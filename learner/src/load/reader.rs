@@ -23,8 +23,7 @@ const LARGEST_WINDOW: u32 = 0x7fff_ffff;
 const FIRST_WINDOW: u32 = 65_535;
 
 /// Reads what the learner broadcasts and gives `count` the bytes of parameters, until the connection ends.
-pub(super) async fn read(host: &str, mut count: impl FnMut(u64)) -> Result<()> {
-    let mut socket = TcpStream::connect(host).await?;
+pub(super) async fn read(mut socket: TcpStream, mut count: impl FnMut(u64)) -> Result<()> {
     socket.set_nodelay(true)?;
     socket.write_all(&opening()).await?;
     let (mut buffer, mut filled) = (vec![0; BUFFER], 0);

@@ -9,12 +9,11 @@ use comic_proto::v1::{
     self, AssetChunk, AssetRequest, Environments, EvaluationAck, EvaluationReport, JoinReply, JoinRequest,
     ParametersChunk, StatusRequest, UnrollAck, UnrollMessage, WatchRequest,
 };
-use futures::stream::{self, BoxStream, StreamExt as _};
+use futures::stream::{BoxStream, StreamExt as _};
 use serde::de::IgnoredAny;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::shares::{Denied, Share};
-use super::unrolls::UnrollStream;
 use super::{Evaluation, Shared, assets, status};
 
 /// The service, as tonic wants it: one per server, shared by every connection.
@@ -79,15 +78,14 @@ impl Learner for Calls {
         Ok(Response::new(assets::open(&self.shared, &sha256).await?.boxed()))
     }
 
+    /// [`streams`](super::streams) answers this call, and the next, before they come here.
     async fn send_unrolls(
         &self,
-        request: Request<Streaming<UnrollMessage>>,
+        _: Request<Streaming<UnrollMessage>>,
     ) -> Result<Response<Self::SendUnrollsStream>, Status> {
-        let unrolls = UnrollStream::new(self.shared.clone(), request.into_inner());
-        Ok(Response::new(stream::unfold(unrolls, UnrollStream::next).boxed()))
+        Err(Status::internal("SendUnrolls has missed its way"))
     }
 
-    /// [`broadcast`](super::broadcast) answers this call before it comes here.
     async fn watch_parameters(
         &self,
         _: Request<WatchRequest>,

@@ -1,42 +1,39 @@
 //! Unrolls up, acknowledgements down.
 
-use std::error::Error as _;
 use std::sync::Arc;
 use std::time::Instant;
 
-use comic_proto::v1::{UnrollAck, UnrollHeader, UnrollMessage, Verdict};
-use comic_proto::{Expected, Invalid, validate};
+use bytes::Bytes;
+use comic_proto::v1::{UnrollAck, UnrollHeader, Verdict};
+use comic_proto::{Expected, Invalid, ReceivedUnroll, frame, validate};
 use comic_replay::Outcome;
-use tonic::{Code, Status, Streaming};
+use tonic::Status;
+use tonic::body::Body;
 use tracing::{Instrument as _, Span};
 
+use super::streams::{Broken, Messages};
 use super::{Closing, Shared};
 
 /// One actor's stream. The next unroll is read when the acknowledgement of the last one has been taken, and that
 /// comes when the unroll has a slot in a batch.
 pub(super) struct UnrollStream {
     shared: Arc<Shared>,
-    incoming: Streaming<UnrollMessage>,
+    incoming: Messages,
     closing: Closing,
-    answered: bool,
     over: bool,
 }
 
 impl UnrollStream {
-    pub(super) fn new(shared: Arc<Shared>, incoming: Streaming<UnrollMessage>) -> Self {
-        Self { closing: shared.closing(), shared, incoming, answered: false, over: false }
+    pub(super) fn new(shared: Arc<Shared>, request: Body) -> Self {
+        let incoming = Messages::new(request, shared.message_limit);
+        Self { closing: shared.closing(), shared, incoming, over: false }
     }
 
     /// Takes one unroll and answers it. `None` when the actor has no more, or the server closes; an unroll that was
     /// not answered then is the actor's to send again.
-    pub(super) async fn next(mut self) -> Option<(Result<UnrollAck, Status>, Self)> {
+    pub(super) async fn next(mut self) -> Option<(Result<Bytes, Status>, Self)> {
         if self.over {
             return None;
-        }
-        // tonic asks for the next answer while it still holds the last one, and nobody may be there to take that. Who waits
-        // for a place in a batch meanwhile would get one and never fill it, and training would stand.
-        if std::mem::replace(&mut self.answered, true) {
-            tokio::task::yield_now().await;
         }
         let answer = tokio::select! {
             biased;
@@ -45,24 +42,29 @@ impl UnrollStream {
             answer = answer(&self.shared, &mut self.incoming) => answer,
         }?;
         self.over = answer.is_err();
-        Some((answer, self))
+        Some((answer.map(|ack| frame(&ack)), self))
     }
 }
 
-async fn answer(shared: &Shared, incoming: &mut Streaming<UnrollMessage>) -> Option<Result<UnrollAck, Status>> {
-    match incoming.message().await {
+async fn answer(shared: &Shared, incoming: &mut Messages) -> Option<Result<UnrollAck, Status>> {
+    let received = match incoming.next().await {
         Ok(Some(message)) => {
-            let span = span(message.header.as_ref());
-            take(shared, message).instrument(span).await.transpose()
+            ReceivedUnroll::decode(message).map_err(|malformed| Status::internal(malformed.to_string()))
         }
-        Ok(None) => None,
-        Err(broken) => {
-            // Undecodable or too large; what has a source is a connection that broke, and costs nothing.
-            if broken.source().is_none() && matches!(broken.code(), Code::Internal | Code::OutOfRange) {
-                shared.batcher.refuse_unattributed();
-                tracing::warn!(reason = broken.message(), "unroll stream ended: not a message of this protocol");
-            }
-            Some(Err(broken))
+        Ok(None) => return None,
+        // A connection that broke costs nothing.
+        Err(Broken::Connection(error)) => return Some(Err(Status::from_error(error))),
+        Err(Broken::Protocol(status)) => Err(status),
+    };
+    match received {
+        Ok(unroll) => {
+            let span = span(unroll.header.as_ref());
+            take(shared, unroll).instrument(span).await.transpose()
+        }
+        Err(status) => {
+            shared.batcher.refuse_unattributed();
+            tracing::warn!(reason = status.message(), "unroll stream ended: not a message of this protocol");
+            Some(Err(status))
         }
     }
 }
@@ -74,8 +76,8 @@ fn span(header: Option<&UnrollHeader>) -> Span {
 }
 
 /// Checks an unroll and puts it into a batch. `None` when the batcher is closed.
-async fn take(shared: &Shared, message: UnrollMessage) -> Result<Option<UnrollAck>, Status> {
-    let UnrollMessage { header, payload } = message;
+async fn take(shared: &Shared, unroll: ReceivedUnroll) -> Result<Option<UnrollAck>, Status> {
+    let ReceivedUnroll { header, payload } = unroll;
     let Some(header) = header else {
         shared.batcher.refuse_unattributed();
         return Ok(Some(ack(shared, 0, Verdict::Invalid, Invalid::Header.to_string())));

@@ -5,6 +5,7 @@
 mod assets;
 mod back_pressure;
 mod checkpoints;
+mod frames;
 mod health;
 mod join;
 mod limits;

@@ -4,9 +4,10 @@
 
 use std::sync::{Arc, LazyLock};
 
+use bytes::Bytes;
 use comic_fuzz::{experiment, layout, seed, spec};
 use comic_proto::v1::{UnrollHeader, UnrollMessage};
-use comic_proto::{Expected, Field, UnrollBuffer, UnrollLayout, validate};
+use comic_proto::{Expected, Field, Pieces, ReceivedUnroll, UnrollBuffer, UnrollLayout, validate};
 use comic_replay::{Batcher, Config, Ledger, Order, Phase};
 use futures::executor::block_on;
 use libfuzzer_sys::fuzz_target;
@@ -29,7 +30,8 @@ static SERVICE: LazyLock<Service> = LazyLock::new(|| {
         }
     }
     let header = UnrollHeader { layout_hash: layout.hash().to_vec(), ..UnrollHeader::default() };
-    seed("sound", &UnrollMessage { header: Some(header), payload: unroll.into_bytes() }.encode_to_vec());
+    let message = UnrollMessage { header: Some(header), payload: unroll.into_bytes() }.encode_to_vec();
+    seed("sound", &[&[128], &message[..]].concat());
     Service { layout, clips: spec.tasks.iter().map(|task| task.clips).collect() }
 });
 
@@ -37,7 +39,12 @@ fuzz_target!(init: {
     LazyLock::force(&SERVICE);
 }, |bytes: &[u8]| {
     let Service { layout, clips } = &*SERVICE;
-    let Ok(UnrollMessage { header: Some(header), payload }) = UnrollMessage::decode(bytes) else { return };
+    // Cut somewhere, which the first byte decides.
+    let Some((cut, bytes)) = bytes.split_first() else { return };
+    let (front, back) = bytes.split_at(bytes.len() * usize::from(*cut) / 256);
+    let mut message = Pieces::from(Bytes::copy_from_slice(front));
+    message.push(Bytes::copy_from_slice(back));
+    let Ok(ReceivedUnroll { header: Some(header), payload }) = ReceivedUnroll::decode(message) else { return };
     let expected = Expected { clips, epoch: 0, newest_version: 3 };
     if validate(layout, &header, &payload, &expected).is_ok() {
         let config = Config { unrolls: 2, max_staleness: 2, ahead: 0, order: Order::Arrival };

@@ -1,0 +1,93 @@
+//! `cargo xtask fuzz`: hostile bytes for everything that reads some, guided by the code they reach.
+//!
+//! libFuzzer does the guiding. Its counters are compiled in by rustc's own options, so the toolchain at hand is enough;
+//! crates are built anew for that, in a directory of their own. Seeds are what each target writes of the present
+//! formats; what a run finds out about them is kept in `target/fuzz/corpus`, and the next run begins there.
+
+use std::fs;
+use std::path::PathBuf;
+use std::process::Command;
+
+use anyhow::{Context, Result, bail};
+use clap::ValueEnum as _;
+
+use crate::setup;
+use crate::workspace::{cargo, root, run};
+
+#[derive(clap::Args)]
+pub(crate) struct Options {
+    /// What reads the bytes; everything by default
+    #[arg(value_enum)]
+    targets: Vec<Target>,
+    /// Minutes for each
+    #[arg(long, default_value_t = 10.0)]
+    minutes: f64,
+}
+
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum Target {
+    /// Messages of unrolls
+    Unroll,
+    /// Pieces of parameters, and what they make
+    Parameters,
+    /// Experiments and overrides
+    Experiment,
+    /// Checkpoints with one part of any bytes
+    Checkpoint,
+    /// Motion capture: HDF5, ASF and AMC
+    Clips,
+}
+
+/// Coverage as libFuzzer reads it: what `-fsanitize=fuzzer-no-link` means to clang.
+const COUNTERS: [&str; 7] = [
+    "-Cpasses=sancov-module",
+    "-Cllvm-args=-sanitizer-coverage-level=4",
+    "-Cllvm-args=-sanitizer-coverage-inline-8bit-counters",
+    "-Cllvm-args=-sanitizer-coverage-pc-table",
+    "-Cllvm-args=-sanitizer-coverage-trace-compares",
+    "-Ccodegen-units=1",
+    "--cfg=fuzzing",
+];
+const HOST: &str = "x86_64-unknown-linux-gnu";
+/// Above libtorch's own few hundred.
+const MEGABYTES: usize = 2048;
+/// A second is plenty for any input; a machine may be busy.
+const SECONDS_OF_AN_INPUT: usize = 20;
+
+/// Builds the targets and runs each for its time; the first finding ends it.
+pub(crate) fn fuzz(options: &Options) -> Result<()> {
+    setup::run(&setup::Options::default())?;
+    let directory = root().join("target/fuzz");
+    let mut build = cargo();
+    // Named, the target keeps the counters out of build scripts and macros.
+    build.args(["build", "--release", "--manifest-path", "tests/fuzz/Cargo.toml", "--target", HOST, "--target-dir"]);
+    run(build.arg(&directory).env("RUSTFLAGS", COUNTERS.join(" ")))?;
+    let all = Target::value_variants();
+    let chosen = if options.targets.is_empty() { all } else { &options.targets };
+    for target in chosen {
+        let name = target.to_possible_value().context("a target without a name")?.get_name().to_owned();
+        let program = directory.join(HOST).join("release").join(&name);
+        let made = |kind: &str| -> Result<PathBuf> {
+            let path = directory.join(kind).join(&name);
+            fs::create_dir_all(&path).with_context(|| format!("cannot make {}", path.display()))?;
+            Ok(path)
+        };
+        let (seeds, corpus, findings) = (made("seeds")?, made("corpus")?, made("findings")?);
+        run(Command::new(&program).arg("-runs=0").env("COMIC_FUZZ_SEEDS", &seeds))?;
+        eprintln!("fuzzing {name} for {} minutes", options.minutes);
+        let mut fuzzer = Command::new(&program);
+        fuzzer.args([&corpus, &seeds]).args([
+            format!("-max_total_time={}", (60.0 * options.minutes) as u64),
+            format!("-rss_limit_mb={MEGABYTES}"),
+            format!("-timeout={SECONDS_OF_AN_INPUT}"),
+            format!("-artifact_prefix={}/", findings.display()),
+            "-print_final_stats=1".into(),
+        ]);
+        // One thread: an input's effect must not hang on what another core does.
+        if run(fuzzer.env("OMP_NUM_THREADS", "1").current_dir(root())).is_err() {
+            let (program, findings) = (program.display(), findings.display());
+            bail!("{name}: see {findings}, and `{program} {findings}/FILE` for one of them alone");
+        }
+    }
+    Ok(())
+}

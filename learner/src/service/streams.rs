@@ -1,0 +1,159 @@
+//! The two calls that carry bytes, beneath tonic's codec; all others are tonic's.
+//!
+//! A message that tonic decodes was copied into a buffer of its stream before, one that it encodes is copied out of one.
+//! What comes in here stays where the socket was read to until it is copied into a batch, and what goes out was encoded
+//! once for everybody.
+
+use std::convert::Infallible;
+use std::error::Error;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use bytes::{Buf as _, Bytes};
+use comic_proto::Pieces;
+use comic_proto::v1::learner_server::LearnerServer;
+use futures::future::{BoxFuture, FutureExt as _};
+use futures::stream::{self, Stream, StreamExt as _};
+use http::header::CONTENT_TYPE;
+use http::{HeaderMap, HeaderValue, Request, Response};
+use http_body::Frame;
+use http_body_util::{BodyExt as _, StreamBody};
+use tonic::Status;
+use tonic::body::Body;
+use tonic::server::NamedService;
+use tower::Service;
+
+use super::calls::Calls;
+use super::unrolls::UnrollStream;
+use super::{Shared, broadcast};
+
+const SEND_UNROLLS: &str = "/comic.v1.Learner/SendUnrolls";
+const WATCH_PARAMETERS: &str = "/comic.v1.Learner/WatchParameters";
+/// "gRPC over HTTP2", Length-Prefixed-Message: whether it is compressed, and its length in four bytes, big end first.
+const PREFIX: usize = 5;
+
+/// The learner's calls, those two among them.
+#[derive(Clone, Debug)]
+pub(super) struct Streams {
+    calls: LearnerServer<Calls>,
+    shared: Arc<Shared>,
+}
+
+impl Streams {
+    pub(super) fn new(calls: LearnerServer<Calls>, shared: Arc<Shared>) -> Self {
+        Self { calls, shared }
+    }
+}
+
+impl NamedService for Streams {
+    const NAME: &'static str = <LearnerServer<Calls> as NamedService>::NAME;
+}
+
+impl Service<Request<Body>> for Streams {
+    type Response = Response<Body>;
+    type Error = Infallible;
+    type Future = BoxFuture<'static, Result<Self::Response, Infallible>>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+        Service::<Request<Body>>::poll_ready(&mut self.calls, context)
+    }
+
+    fn call(&mut self, request: Request<Body>) -> Self::Future {
+        let shared = self.shared.clone();
+        match request.uri().path() {
+            SEND_UNROLLS => {
+                let unrolls = UnrollStream::new(shared, request.into_body());
+                async move { Ok(respond(stream::unfold(unrolls, UnrollStream::next))) }.boxed()
+            }
+            WATCH_PARAMETERS => {
+                let watch = async move { broadcast::watch(&shared, request.into_body()).await };
+                watch.map(|response| Ok(response.unwrap_or_else(Status::into_http))).boxed()
+            }
+            _ => self.calls.call(request),
+        }
+    }
+}
+
+/// A response of these frames, which ends with the status that comes instead of one, or else well.
+pub(super) fn respond(frames: impl Stream<Item = Result<Bytes, Status>> + Send + 'static) -> Response<Body> {
+    let body = stream::unfold(Some(Box::pin(frames)), async |frames| {
+        let mut frames = frames?;
+        Some(match frames.next().await {
+            Some(Ok(frame)) => (Ok::<_, Infallible>(Frame::data(frame)), Some(frames)),
+            Some(Err(status)) => (Ok(Frame::trailers(trailers(&status))), None),
+            None => (Ok(Frame::trailers(trailers(&Status::ok("")))), None),
+        })
+    });
+    let mut response = Response::new(Body::new(StreamBody::new(body)));
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/grpc"));
+    response
+}
+
+fn trailers(status: &Status) -> HeaderMap {
+    let mut trailers = HeaderMap::new();
+    // Its text is percent-encoded, and no status of ours has details: there is nothing a header could not hold.
+    let _ = status.add_header(&mut trailers);
+    trailers
+}
+
+/// Why no more messages come.
+#[derive(Debug)]
+pub(super) enum Broken {
+    /// The connection, or the call, ended in the middle.
+    Connection(Box<dyn Error + Send + Sync>),
+    /// What came is no gRPC, or too large.
+    Protocol(Status),
+}
+
+/// The messages of a request.
+#[derive(Debug)]
+pub(super) struct Messages {
+    body: Body,
+    arrived: Pieces,
+    /// Bytes of the message that is arriving, once its prefix has.
+    length: Option<usize>,
+    limit: usize,
+}
+
+impl Messages {
+    pub(super) fn new(body: Body, limit: usize) -> Self {
+        Self { body, arrived: Pieces::default(), length: None, limit }
+    }
+
+    /// The next message; `None` after the last. Cancel-safe: what has arrived is kept.
+    pub(super) async fn next(&mut self) -> Result<Option<Pieces>, Broken> {
+        loop {
+            if let Some(message) = self.whole().map_err(Broken::Protocol)? {
+                return Ok(Some(message));
+            }
+            match self.body.frame().await {
+                Some(Ok(frame)) => frame.into_data().into_iter().for_each(|data| self.arrived.push(data)),
+                Some(Err(error)) => return Err(Broken::Connection(error.into())),
+                None if self.arrived.is_empty() && self.length.is_none() => return Ok(None),
+                None => return Err(Broken::Protocol(Status::internal("the stream ended inside a message"))),
+            }
+        }
+    }
+
+    fn whole(&mut self) -> Result<Option<Pieces>, Status> {
+        let length = match self.length {
+            Some(length) => length,
+            None => {
+                let Some(mut prefix) = self.arrived.split_to(PREFIX) else { return Ok(None) };
+                if prefix.get_u8() != 0 {
+                    return Err(Status::unimplemented("a compressed message: this learner takes none"));
+                }
+                let (length, limit) = (prefix.get_u32() as usize, self.limit);
+                if length > limit {
+                    return Err(Status::out_of_range(format!("a message of {length} bytes, the limit is {limit}")));
+                }
+                *self.length.insert(length)
+            }
+        };
+        let message = self.arrived.split_to(length);
+        if message.is_some() {
+            self.length = None;
+        }
+        Ok(message)
+    }
+}

@@ -1,0 +1,88 @@
+//! An unroll is what its bytes say, however HTTP/2 cuts them; bytes that say nothing end their stream and nothing else.
+
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use std::convert::Infallible;
+use std::future::poll_fn;
+use std::time::Duration;
+
+use bytes::{Buf as _, Bytes};
+use comic_proto::frame;
+use comic_proto::v1::{UnrollAck, Verdict};
+use futures::stream;
+use http::{HeaderMap, Request};
+use http_body::Frame;
+use http_body_util::{BodyExt as _, StreamBody};
+use tonic::body::Body;
+use tonic::{Code, Status};
+use tonic_prost::prost::Message as _;
+use tower::Service as _;
+
+use crate::support::{World, within};
+
+/// The acknowledgements of what these frames carry, and the status after them.
+async fn send(world: &World, frames: Vec<Bytes>) -> (Vec<UnrollAck>, Code) {
+    let body = stream::iter(frames.into_iter().map(|data| Ok::<_, Infallible>(Frame::data(data))));
+    let request = Request::post(format!("{}/comic.v1.Learner/SendUnrolls", world.address))
+        .header("content-type", "application/grpc")
+        .header("te", "trailers")
+        .body(Body::new(StreamBody::new(body)))
+        .unwrap();
+    let mut channel = world.channel().await;
+    poll_fn(|context| channel.poll_ready(context)).await.unwrap();
+    let answer = within(Duration::from_secs(10), async {
+        channel.call(request).await.unwrap().into_body().collect().await.unwrap()
+    })
+    .await;
+    let status = answer.trailers().map(HeaderMap::clone).unwrap_or_default();
+    let (mut bytes, mut acks) = (answer.to_bytes(), Vec::new());
+    while bytes.has_remaining() {
+        assert_eq!(bytes.get_u8(), 0, "compressed");
+        let length = bytes.get_u32() as usize;
+        acks.push(UnrollAck::decode(bytes.split_to(length)).unwrap());
+    }
+    (acks, Status::from_header_map(&status).expect("a status").code())
+}
+
+fn cut(bytes: &[u8], length: usize) -> Vec<Bytes> {
+    bytes.chunks(length).map(Bytes::copy_from_slice).collect()
+}
+
+#[tokio::test]
+async fn unrolls_are_taken_whatever_frames_they_come_in() {
+    for length in [1, 3, 100, usize::MAX] {
+        let world = World::start().await;
+        let actor = world.actor(70).await;
+        let both = [frame(&actor.unroll(0)), frame(&actor.unroll(1))].concat();
+        let (acks, status) = send(&world, cut(&both, length.min(both.len()))).await;
+        let found: Vec<_> = acks.iter().map(|ack| (ack.sequence, ack.verdict())).collect();
+        assert_eq!((found, status), (vec![(0, Verdict::Taken), (1, Verdict::Taken)], Code::Ok), "frames of {length}");
+    }
+}
+
+#[tokio::test]
+async fn a_message_without_its_end_is_no_unroll() {
+    let world = World::start().await;
+    let mut actor = world.actor(70).await;
+    let (first, second) = (frame(&actor.unroll(0)), frame(&actor.unroll(1)));
+    for half in [2, second.len() / 2, second.len() - 1] {
+        let (acks, status) = send(&world, vec![first.clone(), second.slice(..half)]).await;
+        assert_eq!((acks.len(), status), (1, Code::Internal), "the first {half} bytes");
+    }
+    let books = actor.books().await;
+    assert_eq!((books.in_flight, books.duplicates, books.unattributed), (1, 2, 3));
+}
+
+#[tokio::test]
+async fn what_is_compressed_or_no_message_at_all_is_refused_by_a_status() {
+    let world = World::start().await;
+    let mut actor = world.actor(70).await;
+    let mut compressed = frame(&actor.unroll(0)).to_vec();
+    compressed[0] = 1;
+    assert_eq!(send(&world, vec![compressed.into()]).await, (vec![], Code::Unimplemented));
+    let nonsense = Bytes::from_static(b"\x00\x00\x00\x00\x02\x0b\x0b");
+    assert_eq!(send(&world, vec![nonsense]).await, (vec![], Code::Internal));
+    let endless = Bytes::from_static(b"\x00\xff\xff\xff\xff");
+    assert_eq!(send(&world, vec![endless]).await, (vec![], Code::OutOfRange));
+    assert_eq!(actor.books().await.unattributed, 3);
+}

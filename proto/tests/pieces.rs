@@ -1,0 +1,130 @@
+//! What comes in pieces means what it would mean in one, wherever it was cut.
+
+use bytes::{Buf, Bytes};
+use comic_proto::v1::{EpisodeStatistics, UnrollHeader, UnrollMessage};
+use comic_proto::{Pieces, ReceivedUnroll};
+use proptest::prelude::*;
+use prost::Message as _;
+
+/// Cut again and again after each of these lengths in turn.
+fn cut(bytes: &[u8], lengths: &[usize]) -> Pieces {
+    let (mut pieces, mut rest, mut lengths) = (Pieces::default(), bytes, lengths.iter().cycle());
+    while !rest.is_empty() {
+        let length = lengths.next().map_or(rest.len(), |length| rest.len().min(*length));
+        pieces.push(Bytes::copy_from_slice(&rest[..length]));
+        rest = &rest[length..];
+    }
+    pieces
+}
+
+fn whole(mut pieces: Pieces) -> Vec<u8> {
+    pieces.copy_to_bytes(pieces.len()).to_vec()
+}
+
+fn lengths() -> impl Strategy<Value = Vec<usize>> {
+    prop::collection::vec(prop_oneof![1usize..8, 1usize..5000], 1..6)
+}
+
+fn header() -> impl Strategy<Value = Option<UnrollHeader>> {
+    let numbers = (any::<u64>(), any::<u64>(), any::<u64>(), any::<bool>());
+    let returns = prop::collection::vec(any::<f32>().prop_filter("compared", |value| !value.is_nan()), 0..6);
+    prop::option::of((numbers, prop::collection::vec(returns, 0..4)).prop_map(|(numbers, returns)| {
+        let (actor, incarnation, sequence, demonstration) = numbers;
+        let episodes =
+            returns.into_iter().map(|returns| EpisodeStatistics { returns, steps: 3, ..Default::default() }).collect();
+        UnrollHeader {
+            actor,
+            incarnation,
+            sequence,
+            demonstration,
+            episodes,
+            layout_hash: vec![7; 32],
+            ..UnrollHeader::default()
+        }
+    }))
+}
+
+#[test]
+fn single_bytes_are_joined_and_large_pieces_are_not() {
+    let mut pieces = Pieces::default();
+    let large = Bytes::from(vec![1; 100_000]);
+    pieces.push(large.clone());
+    for byte in 0..10_000 {
+        pieces.push(Bytes::from(vec![byte as u8]));
+    }
+    let found: Vec<_> = pieces.range(0..pieces.len()).collect();
+    assert_eq!(found[0].as_ptr(), large.as_ptr(), "the large piece was copied");
+    assert!(found.len() < 20, "ten thousand bytes lie in {} pieces", found.len());
+}
+
+#[test]
+fn a_field_of_the_wrong_type_or_without_an_end_is_no_unroll() {
+    for bytes in [
+        &b"\x08\x01"[..],
+        b"\x11",
+        b"\x12\x05abcd",
+        b"\x00",
+        b"\x1b\x1c",
+        b"\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff",
+    ] {
+        assert!(ReceivedUnroll::decode(cut(bytes, &[1])).is_err(), "{bytes:?}");
+        assert!(UnrollMessage::decode(bytes).is_err() || bytes == b"\x1b\x1c", "{bytes:?}");
+    }
+}
+
+proptest! {
+    #[test]
+    fn an_unroll_in_pieces_is_the_one_that_was_sent(
+        header in header(),
+        payload in prop::collection::vec(any::<u8>(), 0..20_000),
+        lengths in lengths(),
+    ) {
+        let message = UnrollMessage { header, payload: payload.clone().into() };
+        let received = ReceivedUnroll::decode(cut(&message.encode_to_vec(), &lengths)).unwrap();
+        prop_assert_eq!(received.header, message.header);
+        prop_assert_eq!(whole(received.payload), payload);
+    }
+
+    #[test]
+    fn of_any_bytes_the_generated_type_says_the_same(
+        bytes in prop::collection::vec(prop_oneof![any::<u8>(), 0u8..32], 0..60),
+        lengths in lengths(),
+    ) {
+        let theirs = UnrollMessage::decode(&bytes[..]);
+        match ReceivedUnroll::decode(cut(&bytes, &lengths)) {
+            Ok(ours) => {
+                let theirs = theirs.unwrap();
+                // NaN differs from itself.
+                prop_assert_eq!(format!("{:?}", ours.header), format!("{:?}", theirs.header));
+                prop_assert_eq!(whole(ours.payload), theirs.payload.to_vec());
+            }
+            // Groups, which nobody sends, are all that only the generated type takes.
+            Err(error) => prop_assert!(theirs.is_err() || error.to_string().contains("no type"), "{}", error),
+        }
+    }
+
+    #[test]
+    fn pieces_are_split_copied_and_read_like_the_whole(
+        bytes in prop::collection::vec(any::<u8>(), 0..20_000),
+        lengths in lengths(),
+        (from, to) in (0usize..25_000, 0usize..25_000),
+    ) {
+        let mut pieces = cut(&bytes, &lengths);
+        let within = from.min(bytes.len())..to.clamp(from.min(bytes.len()), bytes.len());
+        let found: Vec<&[u8]> = pieces.range(from..to).collect();
+        prop_assert_eq!(&found.concat(), &bytes[within.clone()]);
+        let mut copy = vec![0; within.len()];
+        pieces.copy_to(within.start, &mut copy);
+        prop_assert_eq!(&copy, &bytes[within.clone()]);
+        match pieces.split_to(from) {
+            Some(front) => {
+                prop_assert_eq!(whole(front), &bytes[..from]);
+                prop_assert_eq!(whole(pieces), &bytes[from..]);
+            }
+            None => {
+                prop_assert!(from > bytes.len());
+                prop_assert_eq!(whole(pieces), bytes);
+            }
+        }
+    }
+}
