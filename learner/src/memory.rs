@@ -2,11 +2,17 @@
 
 use std::fmt;
 
+use comic_proto::Pieces;
+
 use crate::publish::VERSIONS;
-use crate::service::CONNECTION_WINDOW;
+use crate::service::{CONNECTION_WINDOW, FRAME_SIZE};
 
 /// Bytes of a call's answers that its peer does not take: hyper's send buffer, and the largest piece beside it, an asset's.
 const ANSWER: usize = (400 + 256) * 1024;
+
+/// A message is not copied out of the buffers that the socket was read to. One has at most twice the bytes of a frame, which
+/// is how it grows, and at least [`Pieces::KEPT`] of them are the message's.
+const BUFFERS: usize = 2 * FRAME_SIZE as usize / Pieces::KEPT;
 
 /// What decides how large the buffers get.
 #[derive(Clone, Copy, Debug)]
@@ -38,7 +44,8 @@ pub struct Bounds {
     pub batches: u64,
     /// Bytes on their way in that nobody read yet: a window for each connection.
     pub windows: u64,
-    /// Messages that are read and wait for a place in a batch: one for each call.
+    /// Messages that are read and wait for a place in a batch: one for each call, with what a peer can make of its buffers
+    /// by frames of no use.
     pub messages: u64,
     /// Versions of the parameters that are held for readers.
     pub parameters: u64,
@@ -58,7 +65,7 @@ impl Bounds {
         Self {
             batches: product(&[ahead + 1, batch, unroll]),
             windows: product(&[connections, CONNECTION_WINDOW as usize]),
-            messages: product(&[requests, message]),
+            messages: product(&[requests, message, BUFFERS]),
             parameters: product(&[VERSIONS, parameters]),
             answers: product(&[requests, ANSWER]),
             quarantine: product(&[quarantined, message]),
@@ -119,17 +126,17 @@ mod tests {
         let expected = Bounds {
             batches: 2 * 128 * 200_000,
             windows: 100 * 1024 * 1024,
-            messages: 300 * 1024 * 1024,
+            messages: 4 * 300 * 1024 * 1024,
             parameters: 9 * 5_000_000,
             answers: 300 * 656 * 1024,
             quarantine: 9 * 1024 * 1024,
             snapshots: 3 * 40_000_000,
         };
         assert_eq!(bounds, expected);
-        assert_eq!(bounds.sum(), 51_200_000 + 409 * 1_048_576 + 45_000_000 + 201_523_200 + 120_000_000);
+        assert_eq!(bounds.sum(), 51_200_000 + 1309 * 1_048_576 + 45_000_000 + 201_523_200 + 120_000_000);
         assert_eq!(
             bounds.to_string(),
-            "at most 808 MiB: batches 49, connection windows 100, messages 300, parameters 43, answers 193, quarantine 9, checkpoints 115"
+            "at most 1708 MiB: batches 49, connection windows 100, messages 1200, parameters 43, answers 193, quarantine 9, checkpoints 115"
         );
     }
 

@@ -39,7 +39,7 @@ pub struct QuarantineOptions {
 #[derive(Debug)]
 struct Refused {
     header: UnrollHeader,
-    payload: Pieces,
+    payload: Vec<u8>,
     reason: String,
 }
 
@@ -78,7 +78,10 @@ impl Quarantine {
 
     /// Has an unroll kept; never waits.
     pub(crate) fn offer(&self, header: &UnrollHeader, payload: &Pieces, reason: &Invalid) {
-        let refused = Refused { header: header.clone(), payload: payload.clone(), reason: reason.to_string() };
+        // A copy: the pieces keep larger buffers, for as long as the disk takes.
+        let mut bytes = vec![0; payload.len()];
+        payload.copy_to(0, &mut bytes);
+        let refused = Refused { header: header.clone(), payload: bytes, reason: reason.to_string() };
         if self.queue.as_ref().is_none_or(|queue| queue.try_send(refused).is_err()) {
             self.telemetry.quarantined.of("busy").inc();
         }
@@ -142,8 +145,7 @@ impl Cell {
         let Some(room) = self.room.checked_sub(bytes) else { return Ok(false) };
         let UnrollHeader { learner_epoch, actor, sequence, .. } = header;
         let path = self.directory.join(format!("{learner_epoch}-{actor}-{sequence}.unroll"));
-        let parts = [&length, label.as_bytes()].into_iter().chain(payload.range(0..payload.len()));
-        let written = write(&path, parts);
+        let written = write(&path, &[&length, label.as_bytes(), payload]);
         if written.is_err() {
             // Half of it helps nobody.
             let _ = fs::remove_file(&path);
@@ -154,9 +156,9 @@ impl Cell {
     }
 }
 
-fn write<'a>(path: &Path, mut parts: impl Iterator<Item = &'a [u8]>) -> std::io::Result<()> {
+fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
     let mut file = File::create_new(path)?;
-    parts.try_for_each(|part| file.write_all(part))
+    parts.iter().try_for_each(|part| file.write_all(part))
 }
 
 /// Bytes of the unrolls that are there.

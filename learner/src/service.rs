@@ -5,8 +5,9 @@
 //! - [`serve`] is the server, up to its graceful end.
 //! - `incoming` lets connections in, `admission` calls: TLS, tokens and limits are theirs, and nobody else's.
 //! - `calls` answers each call; `unrolls`, `assets`, and `broadcast` of what is [published](crate::publish) are the streams
-//!   with a life of their own. `streams` leads the two that carry bytes past tonic's codec. `status` tells how things are, `roster` how the actors are.
-//!   `shares` says which actor simulates what of a run in lockstep. `complaints` keeps the log readable when a peer misbehaves.
+//!   with a life of their own. `streams` leads the two that carry bytes past tonic's codec. `status` tells how things are,
+//!   `roster` how the actors are. `shares` says which actor simulates what of a run in lockstep. `complaints` keeps the log
+//!   readable when a peer misbehaves.
 //!
 //! Streams are pulled: nothing is read from an actor until the unroll before it has a slot in a batch, so HTTP/2 flow
 //! control carries the batcher's back-pressure to the actor, and no queue lies in between.
@@ -64,7 +65,7 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 /// Bytes an unread stream may have under way: the memory a waiting actor costs the learner, with one unroll.
 const STREAM_WINDOW: u32 = 512 * 1024;
 /// An unroll of 200 KB in frames of HTTP/2's default 16 KiB costs five times the processor time.
-const FRAME_SIZE: u32 = 256 * 1024;
+pub(crate) const FRAME_SIZE: u32 = 256 * 1024;
 /// Bytes an unread connection may have under way. Above the stream's, or a full unroll stream would stall every other
 /// call of its actor.
 pub(crate) const CONNECTION_WINDOW: u32 = 1024 * 1024;

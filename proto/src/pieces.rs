@@ -3,23 +3,26 @@
 use std::collections::VecDeque;
 use std::ops::Range;
 
-use bytes::{Buf, Bytes};
+use bytes::{Buf, Bytes, BytesMut};
 use thiserror::Error;
 
 use crate::v1::UnrollHeader;
 
-/// Two neighbours below this are joined, or a peer that sends single bytes would have us keep a piece for each.
-const SMALL: usize = 4096;
-
-/// Bytes in the pieces in which they came: the large ones are never copied to join them.
+/// Bytes in the pieces in which they came: the large ones stay where they are, and are never copied to join them.
 #[derive(Clone, Debug, Default)]
 pub struct Pieces {
     /// None is empty.
     pieces: VecDeque<Bytes>,
+    /// After them, what came in small ones.
+    tail: BytesMut,
     length: usize,
 }
 
 impl Pieces {
+    /// A piece of so many bytes is kept where it lies, with the buffer it is a part of. Smaller ones are copied: a peer
+    /// that sends single bytes must not have us keep a buffer for each.
+    pub const KEPT: usize = 128 * 1024;
+
     /// How many bytes there are.
     pub fn len(&self) -> usize {
         self.length
@@ -31,21 +34,27 @@ impl Pieces {
     }
 
     /// More bytes, after all others.
-    pub fn push(&mut self, mut piece: Bytes) {
+    pub fn push(&mut self, piece: Bytes) {
         self.length += piece.len();
-        // Joined only with one that is no longer, a byte is copied as often as a length can double.
-        while let Some(last) = self.pieces.pop_back_if(|last| last.len() < SMALL && last.len() <= piece.len()) {
-            piece = [last, piece].concat().into();
+        if piece.len() < Self::KEPT {
+            self.tail.extend_from_slice(&piece);
+            return;
         }
-        if !piece.is_empty() {
-            self.pieces.push_back(piece);
+        self.seal();
+        self.pieces.push_back(piece);
+    }
+
+    fn seal(&mut self) {
+        if !self.tail.is_empty() {
+            self.pieces.push_back(self.tail.split().freeze());
         }
     }
 
     /// Takes so many bytes off the front; `None`, and all stays, when there are fewer.
     pub fn split_to(&mut self, length: usize) -> Option<Self> {
         let rest = self.length.checked_sub(length)?;
-        let mut front = Self { pieces: VecDeque::new(), length };
+        self.seal();
+        let mut front = Self { length, ..Self::default() };
         let mut missing = length;
         while missing > 0 {
             let mut piece = self.pieces.pop_front()?;
@@ -62,7 +71,8 @@ impl Pieces {
     /// The bytes of a range, piece by piece; of one that goes beyond the end, those that there are.
     pub fn range(&self, range: Range<usize>) -> impl Iterator<Item = &[u8]> {
         let mut begin = 0;
-        self.pieces.iter().filter_map(move |piece| {
+        let pieces = self.pieces.iter().map(|piece| &piece[..]).chain([&self.tail[..]]);
+        pieces.filter_map(move |piece| {
             let place = begin;
             begin += piece.len();
             let within = |end: usize| end.saturating_sub(place).min(piece.len());
@@ -107,11 +117,17 @@ impl Pieces {
     }
 }
 
+/// Each stays as it is, however small.
+impl FromIterator<Bytes> for Pieces {
+    fn from_iter<I: IntoIterator<Item = Bytes>>(pieces: I) -> Self {
+        let pieces: VecDeque<_> = pieces.into_iter().filter(|piece| !piece.is_empty()).collect();
+        Self { length: pieces.iter().map(Bytes::len).sum(), pieces, ..Self::default() }
+    }
+}
+
 impl From<Bytes> for Pieces {
     fn from(bytes: Bytes) -> Self {
-        let mut pieces = Self::default();
-        pieces.push(bytes);
-        pieces
+        Self::from_iter([bytes])
     }
 }
 
@@ -121,12 +137,22 @@ impl Buf for Pieces {
     }
 
     fn chunk(&self) -> &[u8] {
-        self.pieces.front().map_or(&[], |piece| piece)
+        self.pieces.front().map_or(&self.tail, |piece| piece)
     }
 
     fn advance(&mut self, count: usize) {
-        let passed = self.split_to(count);
-        assert!(passed.is_some(), "{count} bytes of {}", self.length);
+        assert!(count <= self.length, "{count} bytes of {}", self.length);
+        self.length -= count;
+        let mut left = count;
+        while left > 0 {
+            let Some(front) = self.pieces.front_mut() else { return self.tail.advance(left) };
+            let passed = left.min(front.len());
+            front.advance(passed);
+            left -= passed;
+            if front.is_empty() {
+                self.pieces.pop_front();
+            }
+        }
     }
 }
 

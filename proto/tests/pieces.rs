@@ -6,23 +6,36 @@ use comic_proto::{Pieces, ReceivedUnroll};
 use proptest::prelude::*;
 use prost::Message as _;
 
-/// Cut again and again after each of these lengths in turn.
-fn cut(bytes: &[u8], lengths: &[usize]) -> Pieces {
-    let (mut pieces, mut rest, mut lengths) = (Pieces::default(), bytes, lengths.iter().cycle());
+/// Cut again and again after each of these lengths in turn, and kept as they are or put together anew.
+fn cut(bytes: &[u8], (lengths, anew): &(Vec<usize>, bool)) -> Pieces {
+    let (mut pieces, mut rest, mut lengths) = (Vec::new(), bytes, lengths.iter().cycle());
     while !rest.is_empty() {
         let length = lengths.next().map_or(rest.len(), |length| rest.len().min(*length));
         pieces.push(Bytes::copy_from_slice(&rest[..length]));
         rest = &rest[length..];
     }
-    pieces
+    if !anew {
+        return pieces.into_iter().collect();
+    }
+    let mut arrived = Pieces::default();
+    pieces.into_iter().for_each(|piece| arrived.push(piece));
+    arrived
 }
 
 fn whole(mut pieces: Pieces) -> Vec<u8> {
     pieces.copy_to_bytes(pieces.len()).to_vec()
 }
 
-fn lengths() -> impl Strategy<Value = Vec<usize>> {
-    prop::collection::vec(prop_oneof![1usize..8, 1usize..5000], 1..6)
+fn lengths() -> impl Strategy<Value = (Vec<usize>, bool)> {
+    let lengths =
+        prop::collection::vec(prop_oneof![1usize..8, 1usize..5000, Just(Pieces::KEPT), Just(Pieces::KEPT + 3)], 1..6);
+    (lengths, any::<bool>())
+}
+
+/// Some that lie in small pieces alone, and some that do not.
+fn bytes() -> impl Strategy<Value = Vec<u8>> {
+    let length = prop_oneof![0usize..20_000, Pieces::KEPT..3 * Pieces::KEPT];
+    (length, any::<u8>()).prop_map(|(length, salt)| (0..length).map(|i| (i % 251) as u8 ^ salt).collect())
 }
 
 fn header() -> impl Strategy<Value = Option<UnrollHeader>> {
@@ -45,16 +58,32 @@ fn header() -> impl Strategy<Value = Option<UnrollHeader>> {
 }
 
 #[test]
-fn single_bytes_are_joined_and_large_pieces_are_not() {
+fn a_large_piece_is_never_copied_whatever_small_ones_lie_around_it() {
+    let large = Bytes::from(vec![1; Pieces::KEPT]);
     let mut pieces = Pieces::default();
-    let large = Bytes::from(vec![1; 100_000]);
+    for length in (1..300).rev() {
+        pieces.push(Bytes::from(vec![2; length]));
+    }
+    let before = pieces.len();
     pieces.push(large.clone());
-    for byte in 0..10_000 {
-        pieces.push(Bytes::from(vec![byte as u8]));
+    for _ in 0..10_000 {
+        pieces.push(Bytes::from_static(b"3"));
     }
     let found: Vec<_> = pieces.range(0..pieces.len()).collect();
-    assert_eq!(found[0].as_ptr(), large.as_ptr(), "the large piece was copied");
-    assert!(found.len() < 20, "ten thousand bytes lie in {} pieces", found.len());
+    let expected = [before, large.len(), 10_000];
+    assert_eq!(found.iter().map(|piece| piece.len()).collect::<Vec<_>>(), expected);
+    assert_eq!(found[1].as_ptr(), large.as_ptr(), "the large piece was copied");
+}
+
+#[test]
+fn a_small_piece_keeps_nothing_of_the_buffer_it_came_in() {
+    let buffer = Bytes::from(vec![1; 4 * Pieces::KEPT]);
+    let mut pieces = Pieces::default();
+    pieces.push(buffer.slice(..Pieces::KEPT - 1));
+    pieces.push(buffer.slice(Pieces::KEPT - 1..Pieces::KEPT));
+    assert!(buffer.is_unique());
+    pieces.push(buffer.slice(Pieces::KEPT..2 * Pieces::KEPT));
+    assert!(!buffer.is_unique());
 }
 
 #[test]
@@ -67,7 +96,7 @@ fn a_field_of_the_wrong_type_or_without_an_end_is_no_unroll() {
         b"\x1b\x1c",
         b"\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff",
     ] {
-        assert!(ReceivedUnroll::decode(cut(bytes, &[1])).is_err(), "{bytes:?}");
+        assert!(ReceivedUnroll::decode(cut(bytes, &(vec![1], false))).is_err(), "{bytes:?}");
         assert!(UnrollMessage::decode(bytes).is_err() || bytes == b"\x1b\x1c", "{bytes:?}");
     }
 }
@@ -76,7 +105,7 @@ proptest! {
     #[test]
     fn an_unroll_in_pieces_is_the_one_that_was_sent(
         header in header(),
-        payload in prop::collection::vec(any::<u8>(), 0..20_000),
+        payload in bytes(),
         lengths in lengths(),
     ) {
         let message = UnrollMessage { header, payload: payload.clone().into() };
@@ -105,9 +134,9 @@ proptest! {
 
     #[test]
     fn pieces_are_split_copied_and_read_like_the_whole(
-        bytes in prop::collection::vec(any::<u8>(), 0..20_000),
+        bytes in bytes(),
         lengths in lengths(),
-        (from, to) in (0usize..25_000, 0usize..25_000),
+        (from, to) in (0usize..400_000, 0usize..400_000),
     ) {
         let mut pieces = cut(&bytes, &lengths);
         let within = from.min(bytes.len())..to.clamp(from.min(bytes.len()), bytes.len());

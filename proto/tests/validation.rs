@@ -250,6 +250,26 @@ proptest! {
     }
 
     #[test]
+    fn a_payload_in_pieces_is_judged_like_the_whole(
+        place in 0..layout().size(),
+        bit in 0u8..8,
+        words in prop::collection::vec((0..layout().size() / 4, prop_oneof![Just(f32::NAN), Just(2.0), Just(0.0)]), 0..3),
+        cuts in prop::collection::vec(0..layout().size(), 0..4),
+    ) {
+        let mut payload = unroll().to_bytes().to_vec();
+        for (word, value) in words {
+            payload[4 * word..4 * word + 4].copy_from_slice(&value.to_le_bytes());
+        }
+        payload[place] ^= 1 << bit;
+        let whole = Bytes::from(payload);
+        let mut cuts = [cuts, vec![0, layout().size()]].concat();
+        cuts.sort_unstable();
+        let pieces: Pieces = cuts.windows(2).map(|cut| whole.slice(cut[0]..cut[1])).collect();
+        let judge = |pieces: &Pieces| format!("{:?}", validate(&layout(), &header(), pieces, &EXPECTED));
+        prop_assert_eq!(judge(&pieces), judge(&whole.into()));
+    }
+
+    #[test]
     fn any_length_but_the_layout_s_is_refused(length in 0usize..2000) {
         prop_assume!(length != layout().size());
         let refused = validate(&layout(), &header(), &Bytes::from(vec![0; length]).into(), &EXPECTED).err();

@@ -8,7 +8,7 @@ use std::fs;
 use std::path::PathBuf;
 use std::process::Command;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use clap::ValueEnum as _;
 
 use crate::setup;
@@ -20,8 +20,8 @@ pub(crate) struct Options {
     #[arg(value_enum)]
     targets: Vec<Target>,
     /// Minutes for each
-    #[arg(long, default_value_t = 10.0)]
-    minutes: f64,
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=10_000))]
+    minutes: u64,
 }
 
 #[derive(Clone, Copy, Debug, clap::ValueEnum)]
@@ -77,17 +77,17 @@ pub(crate) fn fuzz(options: &Options) -> Result<()> {
         eprintln!("fuzzing {name} for {} minutes", options.minutes);
         let mut fuzzer = Command::new(&program);
         fuzzer.args([&corpus, &seeds]).args([
-            format!("-max_total_time={}", (60.0 * options.minutes) as u64),
+            format!("-max_total_time={}", 60 * options.minutes),
             format!("-rss_limit_mb={MEGABYTES}"),
             format!("-timeout={SECONDS_OF_AN_INPUT}"),
             format!("-artifact_prefix={}/", findings.display()),
             "-print_final_stats=1".into(),
         ]);
         // One thread: an input's effect must not hang on what another core does.
-        if run(fuzzer.env("OMP_NUM_THREADS", "1").current_dir(root())).is_err() {
+        run(fuzzer.env("OMP_NUM_THREADS", "1").current_dir(root())).with_context(|| {
             let (program, findings) = (program.display(), findings.display());
-            bail!("{name}: see {findings}, and `{program} {findings}/FILE` for one of them alone");
-        }
+            format!("{name}: see {findings}, and `{program} {findings}/FILE` for one of them alone")
+        })?;
     }
     Ok(())
 }

@@ -5,7 +5,6 @@
 //! once for everybody.
 
 use std::convert::Infallible;
-use std::error::Error;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
@@ -29,6 +28,9 @@ use super::{Shared, broadcast};
 
 const SEND_UNROLLS: &str = "/comic.v1.Learner/SendUnrolls";
 const WATCH_PARAMETERS: &str = "/comic.v1.Learner/WatchParameters";
+const ENCODING: &str = "grpc-encoding";
+const ACCEPTED: &str = "grpc-accept-encoding";
+const IDENTITY: &str = "identity";
 /// "gRPC over HTTP2", Length-Prefixed-Message: whether it is compressed, and its length in four bytes, big end first.
 const PREFIX: usize = 5;
 
@@ -61,6 +63,12 @@ impl Service<Request<Body>> for Streams {
     fn call(&mut self, request: Request<Body>) -> Self::Future {
         let shared = self.shared.clone();
         match request.uri().path() {
+            // As gRPC has it: a coding that is not known is told from a broken message.
+            SEND_UNROLLS if request.headers().get(ENCODING).is_some_and(|encoding| encoding != IDENTITY) => {
+                let mut response = Status::unimplemented("this learner takes no compressed messages").into_http();
+                response.headers_mut().insert(ACCEPTED, HeaderValue::from_static(IDENTITY));
+                async { Ok(response) }.boxed()
+            }
             SEND_UNROLLS => {
                 let unrolls = UnrollStream::new(shared, request.into_body());
                 async move { Ok(respond(stream::unfold(unrolls, UnrollStream::next))) }.boxed()
@@ -75,6 +83,9 @@ impl Service<Request<Body>> for Streams {
 }
 
 /// A response of these frames, which ends with the status that comes instead of one, or else well.
+///
+/// hyper asks for a frame when it has none in hand, and goes on asking until it comes. Nothing here, and nothing in between,
+/// may ask for one ahead: a stream of unrolls waits for a place in a batch then, and who does not ask on keeps it empty.
 pub(super) fn respond(frames: impl Stream<Item = Result<Bytes, Status>> + Send + 'static) -> Response<Body> {
     let body = stream::unfold(Some(Box::pin(frames)), async |frames| {
         let mut frames = frames?;
@@ -100,7 +111,7 @@ fn trailers(status: &Status) -> HeaderMap {
 #[derive(Debug)]
 pub(super) enum Broken {
     /// The connection, or the call, ended in the middle.
-    Connection(Box<dyn Error + Send + Sync>),
+    Connection(Status),
     /// What came is no gRPC, or too large.
     Protocol(Status),
 }
@@ -128,7 +139,7 @@ impl Messages {
             }
             match self.body.frame().await {
                 Some(Ok(frame)) => frame.into_data().into_iter().for_each(|data| self.arrived.push(data)),
-                Some(Err(error)) => return Err(Broken::Connection(error.into())),
+                Some(Err(error)) => return Err(Broken::Connection(error)),
                 None if self.arrived.is_empty() && self.length.is_none() => return Ok(None),
                 None => return Err(Broken::Protocol(Status::internal("the stream ended inside a message"))),
             }
@@ -141,7 +152,7 @@ impl Messages {
             None => {
                 let Some(mut prefix) = self.arrived.split_to(PREFIX) else { return Ok(None) };
                 if prefix.get_u8() != 0 {
-                    return Err(Status::unimplemented("a compressed message: this learner takes none"));
+                    return Err(Status::internal("a compressed message, and no encoding was named"));
                 }
                 let (length, limit) = (prefix.get_u32() as usize, self.limit);
                 if length > limit {

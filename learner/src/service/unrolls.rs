@@ -14,8 +14,8 @@ use tracing::{Instrument as _, Span};
 use super::streams::{Broken, Messages};
 use super::{Closing, Shared};
 
-/// One actor's stream. The next unroll is read when the acknowledgement of the last one has been taken, and that
-/// comes when the unroll has a slot in a batch.
+/// One actor's stream. The next unroll is read when the acknowledgement of the last one is on its way, and that comes when
+/// the unroll has a slot in a batch.
 pub(super) struct UnrollStream {
     shared: Arc<Shared>,
     incoming: Messages,
@@ -53,7 +53,7 @@ async fn answer(shared: &Shared, incoming: &mut Messages) -> Option<Result<Unrol
         }
         Ok(None) => return None,
         // A connection that broke costs nothing.
-        Err(Broken::Connection(error)) => return Some(Err(Status::from_error(error))),
+        Err(Broken::Connection(status)) => return Some(Err(status)),
         Err(Broken::Protocol(status)) => Err(status),
     };
     match received {

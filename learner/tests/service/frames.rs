@@ -79,7 +79,7 @@ async fn what_is_compressed_or_no_message_at_all_is_refused_by_a_status() {
     let mut actor = world.actor(70).await;
     let mut compressed = frame(&actor.unroll(0)).to_vec();
     compressed[0] = 1;
-    assert_eq!(send(&world, vec![compressed.into()]).await, (vec![], Code::Unimplemented));
+    assert_eq!(send(&world, vec![compressed.into()]).await, (vec![], Code::Internal));
     let nonsense = Bytes::from_static(b"\x00\x00\x00\x00\x02\x0b\x0b");
     assert_eq!(send(&world, vec![nonsense]).await, (vec![], Code::Internal));
     let endless = Bytes::from_static(b"\x00\xff\xff\xff\xff");

@@ -42,9 +42,13 @@ fuzz_target!(init: {
     // Cut somewhere, which the first byte decides.
     let Some((cut, bytes)) = bytes.split_first() else { return };
     let (front, back) = bytes.split_at(bytes.len() * usize::from(*cut) / 256);
-    let mut message = Pieces::from(Bytes::copy_from_slice(front));
-    message.push(Bytes::copy_from_slice(back));
-    let Ok(ReceivedUnroll { header: Some(header), payload }) = ReceivedUnroll::decode(message) else { return };
+    let message: Pieces = [front, back].into_iter().map(Bytes::copy_from_slice).collect();
+    let received = ReceivedUnroll::decode(message);
+    if let (Ok(received), Ok(generated)) = (&received, UnrollMessage::decode(bytes)) {
+        assert_eq!(format!("{:?}", received.header), format!("{:?}", generated.header));
+        assert_eq!(received.payload.range(0..received.payload.len()).collect::<Vec<_>>().concat(), generated.payload);
+    }
+    let Ok(ReceivedUnroll { header: Some(header), payload }) = received else { return };
     let expected = Expected { clips, epoch: 0, newest_version: 3 };
     if validate(layout, &header, &payload, &expected).is_ok() {
         let config = Config { unrolls: 2, max_staleness: 2, ahead: 0, order: Order::Arrival };
