@@ -127,16 +127,16 @@ mod tests {
             batches: 2 * 128 * 200_000,
             windows: 100 * 1024 * 1024,
             messages: 4 * 300 * 1024 * 1024,
-            parameters: 9 * 5_000_000,
+            parameters: 7 * 5_000_000,
             answers: 300 * 656 * 1024,
             quarantine: 9 * 1024 * 1024,
             snapshots: 3 * 40_000_000,
         };
         assert_eq!(bounds, expected);
-        assert_eq!(bounds.sum(), 51_200_000 + 1309 * 1_048_576 + 45_000_000 + 201_523_200 + 120_000_000);
+        assert_eq!(bounds.sum(), 51_200_000 + 1309 * 1_048_576 + 35_000_000 + 201_523_200 + 120_000_000);
         assert_eq!(
             bounds.to_string(),
-            "at most 1708 MiB: batches 49, connection windows 100, messages 1200, parameters 43, answers 193, quarantine 9, checkpoints 115"
+            "at most 1698 MiB: batches 49, connection windows 100, messages 1200, parameters 34, answers 193, quarantine 9, checkpoints 115"
         );
     }
 

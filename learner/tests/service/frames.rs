@@ -10,7 +10,7 @@ use bytes::{Buf as _, Bytes};
 use comic_proto::frame;
 use comic_proto::v1::{UnrollAck, Verdict};
 use futures::stream;
-use http::{HeaderMap, Request};
+use http::Request;
 use http_body::Frame;
 use http_body_util::{BodyExt as _, StreamBody};
 use tonic::body::Body;
@@ -34,7 +34,7 @@ async fn send(world: &World, frames: Vec<Bytes>) -> (Vec<UnrollAck>, Code) {
         channel.call(request).await.unwrap().into_body().collect().await.unwrap()
     })
     .await;
-    let status = answer.trailers().map(HeaderMap::clone).unwrap_or_default();
+    let status = answer.trailers().cloned().unwrap_or_default();
     let (mut bytes, mut acks) = (answer.to_bytes(), Vec::new());
     while bytes.has_remaining() {
         assert_eq!(bytes.get_u8(), 0, "compressed");
