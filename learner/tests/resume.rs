@@ -86,6 +86,17 @@ fn recorded(layout: &UnrollLayout, spec: &TaskSpec, sequence: u64) -> UnrollBuff
             }
         }
     }
+    // Episodes end inside of some, and some are padding from there on.
+    let row = 1 + sequence as usize % (LENGTH - 2);
+    let ends = match sequence % 4 {
+        1 => row..row + 1,
+        3 => row..LENGTH,
+        _ => 0..0,
+    };
+    for t in ends {
+        unroll.row_mut(Field::Valid, t).fill(0.0);
+        unroll.row_mut(Field::First, t + 1).fill(1.0);
+    }
     unroll
 }
 

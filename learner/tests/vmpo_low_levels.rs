@@ -37,9 +37,22 @@ fn every_low_level() -> Vec<(&'static str, Experiment)> {
     ]
 }
 
+/// What a policy did, step by step.
+struct Acted {
+    unrolls: Unrolls,
+    /// z_t, unroll by unroll.
+    latents: Vec<f32>,
+    /// What is remembered after the last step, `[B, S]`.
+    state: Tensor,
+}
+
+fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls {
+    acted(learner, experiment, seed).unrolls
+}
+
 /// Unrolls as this learner's own policy makes them, acting step by step, one episode ending and another beginning inside
 /// the first, and every unroll in the middle of an episode at its start.
-fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls {
+fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
     let count = 3;
     let mut unrolls = Unrolls::random(seed, count).end_episode(0, 3, true).end_episode(1, 5, false);
     let (latent, state) = (experiment.network.latent.size, experiment.network.state_size());
@@ -54,12 +67,13 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
         tensor.select(1, t as i64)
     };
     // Per step, [count, ·]; put in unroll order at the end.
-    let (mut means, mut stds, mut weights, mut latents) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut means, mut stds, mut weights) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut previous_latents, mut latents) = (Vec::new(), Vec::new());
     for t in 0..LENGTH {
         let begins = rows(&unrolls.first, LENGTH + 1, t);
         previous = (1.0 - &begins) * previous;
         remembered = (1.0 - begins) * remembered;
-        latents.push(previous.copy());
+        previous_latents.push(previous.copy());
         let acting = tch::no_grad(|| {
             let observation = learner.policy().normalise(
                 &rows(&unrolls.proprioception, LENGTH + 1, t),
@@ -72,6 +86,7 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
         });
         let (mean, std, log_weights) = acting.action.to_rows();
         (previous, remembered) = (acting.latent, acting.state);
+        latents.push(previous.copy());
         means.push(mean);
         stds.push(std);
         weights.extend(log_weights);
@@ -81,8 +96,18 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
         steps => Vec::<f32>::try_from(Tensor::stack(steps, 1).flatten(0, -1).contiguous()).unwrap(),
     };
     (unrolls.mean, unrolls.std) = (unrolled(&means), unrolled(&stds));
-    (unrolls.log_weights, unrolls.previous_latent) = (unrolled(&weights), unrolled(&latents));
-    unrolls
+    (unrolls.log_weights, unrolls.previous_latent) = (unrolled(&weights), unrolled(&previous_latents));
+    Acted { unrolls, latents: unrolled(&latents), state: remembered }
+}
+
+/// Fails when two tensors of the same rows are further apart than 1e-5 anywhere.
+fn assert_close(what: &str, left: &Tensor, right: &Tensor) {
+    let (left, right) = (left.reshape([-1]), right.reshape([-1]));
+    assert_eq!(left.size(), right.size(), "{what}");
+    if left.numel() > 0 {
+        let apart = (left - right).abs().max().double_value(&[]);
+        assert!(apart < 1e-5, "{what}: {apart} apart");
+    }
 }
 
 fn minibatch(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> MinibatchTensors {
@@ -90,7 +115,39 @@ fn minibatch(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Minib
 }
 
 #[test]
-fn acting_step_by_step_is_learning_on_the_whole_unroll() {
+fn acting_step_by_step_is_acting_on_the_whole_unroll() {
+    for (name, experiment) in every_low_level() {
+        let learner = learner(&experiment, 1);
+        let Acted { unrolls, latents, state } = acted(&learner, &experiment, 2);
+        let count = unrolls.count as i64;
+        let steps = |values: &[f32], length: usize| {
+            let width = values.len() / (unrolls.count * length);
+            Tensor::from_slice(values).reshape([count, length as i64, width as i64]).narrow(1, 0, LENGTH as i64)
+        };
+        let begins = steps(&unrolls.first, LENGTH + 1).squeeze_dim(-1);
+        assert!(begins.sum(Kind::Float).double_value(&[]) > 0.0, "an episode begins inside");
+        let before = Tensor::from_slice(&unrolls.state).reshape([count, experiment.network.state_size() as i64]);
+        let acting = tch::no_grad(|| {
+            let (proprioception, task) = (steps(&unrolls.proprioception, LENGTH + 1), steps(&unrolls.task, LENGTH + 1));
+            let observation = learner.policy().normalise(&proprioception, &task, None, &Routing::single());
+            let (previous, noise) = (steps(&unrolls.previous_latent, LENGTH), steps(&unrolls.latent_noise, LENGTH));
+            let memory = Memory { state: &before, first: Some(&begins) };
+            learner.policy().act(&observation, &previous, &noise, memory)
+        });
+        let (mean, std, log_weights) = acting.action.to_rows();
+        assert_close(&format!("{name}: mean"), &mean, &Tensor::from_slice(&unrolls.mean));
+        assert_close(&format!("{name}: std"), &std, &Tensor::from_slice(&unrolls.std));
+        assert_eq!(log_weights.is_some(), !unrolls.log_weights.is_empty(), "{name}");
+        if let Some(log_weights) = log_weights {
+            assert_close(&format!("{name}: weights"), &log_weights, &Tensor::from_slice(&unrolls.log_weights));
+        }
+        assert_close(&format!("{name}: latent"), &acting.latent, &Tensor::from_slice(&latents));
+        assert_close(&format!("{name}: state"), &acting.state, &state);
+    }
+}
+
+#[test]
+fn what_acted_is_what_is_learnt_from() {
     for (name, experiment) in every_low_level() {
         let mut learner = learner(&experiment, 1);
         let metrics = learner.step(&minibatch(&learner, &experiment, 2)).unwrap().to_metrics();

@@ -51,19 +51,36 @@ struct Figure {
 /// Rounds in which our update and PyTorch's take turns.
 const ROUNDS: usize = 3;
 
+/// Low levels beside the MLP, which has figures for everything.
+const OTHERS: [&str; 3] = ["lstm", "mixture", "product"];
+
 /// Builds and measures.
 pub(crate) fn run(options: &Options) -> Result<()> {
     setup::run(&setup::Options::default())?;
     workspace::build()?;
     match options.side {
         Side::Actor => {
-            show(&figures(Command::new(workspace::program("comic-actor")?).arg("bench").args(&options.arguments))?)
+            let bench = |arguments: &[String]| {
+                show(&figures(Command::new(workspace::program("comic-actor")?).arg("bench").args(arguments))?)
+            };
+            bench(&options.arguments)?;
+            let others = if options.arguments.is_empty() { &OTHERS[..] } else { &[] };
+            others.iter().try_for_each(|name| bench(&["policy", "--low-level", name].map(String::from)))
         }
         Side::Vision => {
             let mut bench = Command::new(workspace::program("comic-actor")?);
             show(&figures(bench.args(["bench", "vision"]).args(&options.arguments))?)
         }
-        Side::Learner => learner(options.threads, &options.arguments),
+        Side::Learner => {
+            let arguments = &options.arguments;
+            learner(options.threads, arguments)?;
+            if arguments.iter().any(|argument| argument.starts_with("--low-level") || argument == "--joint") {
+                return Ok(());
+            }
+            let others = OTHERS.map(|name| vec!["--low-level".to_owned(), name.to_owned()]);
+            let mut ways = others.into_iter().chain([vec!["--joint".to_owned()]]);
+            ways.try_for_each(|way| learner(options.threads, &[way, arguments.clone()].concat()))
+        }
         Side::Ingest => load("ingest", &options.arguments),
         Side::Publish => load("publish", &options.arguments),
         Side::Swarm => load("swarm", &options.arguments),
