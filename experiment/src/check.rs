@@ -3,9 +3,9 @@
 use std::fmt::{Debug, Display};
 
 use crate::{
-    Actor, BallCatch, Budget, ClipSource, Corridor, Experiment, Gaps, GetUp, GoToTarget, Learner, LowLevelName,
-    Network, Optimiser, Prior, SUBSETS, TRACKING_OBSERVATIONS, TaskName, Tracking, Unroll, Vision, Vmpo, Walls,
-    WarmStart, tracking_observation_size,
+    Actor, BallCatch, Budget, ClipSource, Corridor, Experiment, Gaps, GetUp, GoToTarget, Learner, Network, Optimiser,
+    Prior, SUBSETS, TRACKING_OBSERVATIONS, TaskName, Tracking, Unroll, Vision, Vmpo, Walls, WarmStart,
+    tracking_observation_size,
 };
 
 /// A field whose value is outside its meaning.
@@ -247,8 +247,8 @@ fn network(network: &Network) -> Result<(), Fault> {
     ensure("network.initial_std", initial_std, holds, "must exceed network.min_std")?;
     ensure("network.initial_std", initial_std, *initial_std <= LARGEST_STD, AT_MOST_STD)?;
     ensure("network.policy_head_scale", policy_head_scale, not_negative(*policy_head_scale), NOT_NEGATIVE)?;
-    let gated = matches!(network.low_level, LowLevelName::Mixture | LowLevelName::Product);
-    let (least, remedy) = if gated { (0, "must be at most 4096") } else { (1, "must be 1 to 4096") };
+    let bare = network.low_level.acts_without_bottleneck();
+    let (least, remedy) = if bare { (0, "must be at most 4096") } else { (1, "must be 1 to 4096") };
     ensure("network.latent.size", latent.size, (least..=4096).contains(&latent.size), remedy)?;
     ensure("network.latent.beta", latent.beta, not_negative(latent.beta), NOT_NEGATIVE)?;
     ensure("network.latent.min_std", latent.min_std, positive(latent.min_std), POSITIVE)?;
@@ -339,9 +339,9 @@ fn together(experiment: &Experiment) -> Result<(), Fault> {
     let demonstrates = experiment.tasks().iter().any(|(task, _)| *task == TaskName::Tracking);
     let holds = warm_start.steps == 0 || demonstrates;
     ensure("warm_start.steps", warm_start.steps, holds, "must be 0 without tracking, whose reference is demonstrated")?;
-    // A product's mean hangs on its primitives' deviations, which a regression on the mean alone would ruin.
-    let holds = warm_start.steps == 0 || network.low_level != LowLevelName::Product;
-    ensure("warm_start.steps", warm_start.steps, holds, "must be 0 with network.low_level = \"product\"")?;
+    let holds = warm_start.steps == 0 || network.low_level.imitates();
+    let remedy = format!("must be 0 with network.low_level = \"{}\"", network.low_level);
+    ensure("warm_start.steps", warm_start.steps, holds, &remedy)?;
     let holds = !unroll.lockstep || unroll.ahead == 0;
     ensure("unroll.ahead", unroll.ahead, holds, "must be 0 with unroll.lockstep, in which nothing is made ahead")?;
     let holds = !unroll.lockstep || budget.minutes == 0.0;

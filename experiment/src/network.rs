@@ -91,6 +91,17 @@ impl LowLevelName {
             Self::Product => "product",
         }
     }
+
+    /// Whether an encoder can weigh its primitives without a latent between.
+    pub(crate) fn acts_without_bottleneck(self) -> bool {
+        matches!(self, Self::Mixture | Self::Product)
+    }
+
+    /// Whether demonstrations teach it: a product's mean hangs on its primitives' deviations, which a regression on the mean
+    /// alone would ruin.
+    pub(crate) fn imitates(self) -> bool {
+        self != Self::Product
+    }
 }
 
 impl std::fmt::Display for LowLevelName {

@@ -29,7 +29,7 @@ impl TaskName {
         [Self::Tracking, Self::GoToTarget, Self::Gaps, Self::Walls, Self::GetUp, Self::BallCatch];
 
     /// As experiments and command lines write it.
-    pub fn name(self) -> &'static str {
+    pub const fn name(self) -> &'static str {
         match self {
             Self::Tracking => "tracking",
             Self::GoToTarget => "go-to-target",

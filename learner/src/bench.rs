@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
-use comic_networks::to_safetensors;
+use comic_networks::{Layer, Sizes, low_level_layers, to_safetensors};
 use comic_proto::UnrollShape;
 use serde_json::json;
 use tch::{Device, Kind, Tensor};
@@ -91,6 +91,18 @@ impl Floor {
             self.lstms.push(FusedLstm::new(rows / unrolls, unrolls, width, *units as i64, self.device));
             *units as i64
         })
+    }
+
+    /// A layer over `rows` of `unrolls`.
+    fn layer(&mut self, rows: i64, unrolls: i64, layer: Layer) {
+        match layer {
+            Layer::Dense { input, output, flows_on } => {
+                self.products.push(Product::new(rows, input as i64, output as i64, flows_on, self.device));
+            }
+            Layer::Lstm { input, units } => {
+                self.lstm(rows, unrolls, input as i64, &[units]);
+            }
+        }
     }
 
     fn run(&self, backend: &Backend) -> Result<()> {
@@ -206,32 +218,16 @@ fn floor(spec: &TaskSpec, experiment: &Experiment, device: Device) -> Floor {
     let network = &experiment.network;
     let (unrolls, length) = (experiment.unroll.batch as i64, experiment.unroll.length as i64);
     let (steps, observations) = (unrolls * length, unrolls * (length + 1));
-    let (latent, actions) = (network.latent.size as i64, 2 * spec.action as i64);
-    let (proprioception, sensed) = (spec.proprioception as i64, (spec.task + spec.proprioception) as i64);
-    let primitives = &network.primitives;
+    let (latent, sensed) = (network.latent.size as i64, (spec.task + spec.proprioception) as i64);
     let mut floor = Floor { device, products: Vec::new(), lstms: Vec::new() };
-    let encoded = if latent > 0 { 2 * latent } else { primitives.count as i64 };
+    let encoded = if latent > 0 { 2 * latent } else { network.primitives.count as i64 };
     floor.layers(steps, sensed + latent, &network.encoder, encoded, false);
     if network.encoder_linear_path && latent > 0 {
         floor.layers(steps, sensed + latent, &[], 2 * latent, false);
     }
-    match network.low_level {
-        LowLevelName::Mlp => floor.layers(steps, latent + proprioception, &network.mlp.hidden, actions, true),
-        LowLevelName::Lstm => {
-            let units = floor.lstm(steps, unrolls, latent + proprioception, &network.lstm.units);
-            floor.layers(steps, units, &[], actions, true);
-        }
-        LowLevelName::Mixture | LowLevelName::Product => {
-            floor.layers(steps, proprioception, &primitives.torso, 0, false);
-            let torso = primitives.torso.last().map_or(proprioception, |size| *size as i64);
-            floor.layers(steps, torso, &[], (primitives.count * primitives.hidden) as i64, true);
-            for _ in 0..primitives.count {
-                floor.layers(steps, primitives.hidden as i64, &[], actions, true);
-            }
-            if latent > 0 {
-                floor.layers(steps, latent + proprioception, &primitives.gate, primitives.count as i64, true);
-            }
-        }
+    let sizes = Sizes { proprioception: spec.proprioception, actions: spec.action, network };
+    for layer in low_level_layers(&sizes) {
+        floor.layer(steps, unrolls, layer);
     }
     let input = sensed + network.clip_embedding as i64;
     let terms = spec.reward_terms.len() as i64;

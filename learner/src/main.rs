@@ -29,7 +29,7 @@ fn main() -> ExitCode {
             comic_learner::bench::run(*threads, *repeats, subject, device)
         }
         Some(Command::Export { checkpoint, part, out }) => comic_learner::export::run(checkpoint, *part, out),
-        Some(Command::Sizes) => comic_learner::sizes::table()
+        Some(Command::Sizes) => comic_learner::sizes::table(&options.document)
             .and_then(|table| std::io::stdout().write_all(table.as_bytes()).context("cannot write to stdout")),
         Some(Command::Status(status)) => status.run(),
         Some(Command::Health(health)) => return health.run(),

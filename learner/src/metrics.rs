@@ -2,6 +2,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::Write as _;
+use std::ops::AddAssign;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -9,7 +10,7 @@ use anyhow::{Context as _, Result};
 use comic_experiment::TaskSpec;
 use comic_proto::Field;
 use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
-use comic_replay::Batch;
+use comic_replay::{Batch, BooksByTask};
 use serde_json::{Map, Value, json};
 
 use crate::service::Evaluation;
@@ -40,6 +41,9 @@ struct Episodes {
     normalised: f64,
     /// Of the share of the clip that was survived.
     survived: f64,
+    /// Of the head's heights, m, in the steps of which they are known.
+    head_heights: f64,
+    head_steps: u64,
 }
 
 /// What was trained on of one task.
@@ -47,9 +51,26 @@ struct Episodes {
 struct TaskWindow {
     episodes: Episodes,
     unrolls: u64,
-    environment_steps: u64,
-    padding: u64,
-    rows: u64,
+    rows: Rows,
+}
+
+/// What unrolls of one task are made of.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Rows {
+    /// Rows in all.
+    pub rows: u64,
+    /// Rows with a transition.
+    pub environment_steps: u64,
+    /// Rows that repeat an observation, since the next episode is of another task.
+    pub padding: u64,
+}
+
+impl AddAssign for Rows {
+    fn add_assign(&mut self, other: Self) {
+        self.rows += other.rows;
+        self.environment_steps += other.environment_steps;
+        self.padding += other.padding;
+    }
 }
 
 impl Episodes {
@@ -63,9 +84,13 @@ impl Episodes {
         self.share += total / max_reward;
         self.normalised += total / (max_reward * possible);
         self.survived += f64::from(episode.steps) / possible;
+        if let Some(height) = episode.head_height {
+            self.head_heights += f64::from(height) * f64::from(episode.steps);
+            self.head_steps += u64::from(episode.steps);
+        }
     }
 
-    fn entries(&self) -> [(&'static str, Value); 7] {
+    fn entries(&self) -> [(&'static str, Value); 8] {
         [
             ("episodes", json!(self.count)),
             ("diverged", json!(self.diverged)),
@@ -74,6 +99,7 @@ impl Episodes {
             ("reward_per_step", per(self.share, self.steps)),
             ("normalised_reward", per(self.normalised, self.count)),
             ("fraction_survived", per(self.survived, self.count)),
+            ("head_height", per(self.head_heights, self.head_steps)),
         ]
     }
 }
@@ -92,7 +118,7 @@ pub struct Metrics {
     window: Window,
     since: Instant,
     /// The books of the last line.
-    books: Value,
+    books: BooksByTask,
     /// Whether the last line may have ended half-way.
     torn: bool,
 }
@@ -126,7 +152,7 @@ impl Metrics {
             file,
             window: Window::default(),
             since: Instant::now(),
-            books: Value::Null,
+            books: BooksByTask::default(),
             torn: false,
         })
     }
@@ -137,7 +163,7 @@ impl Metrics {
     }
 
     /// Whether a line would say anything that the last one did not: a learner that nobody feeds writes none.
-    pub fn has_news(&self, books: &Value) -> bool {
+    pub fn has_news(&self, books: &BooksByTask) -> bool {
         self.window.unrolls > 0 || self.window.tasks.iter().any(|task| task.unrolls > 0) || self.books != *books
     }
 
@@ -158,25 +184,25 @@ impl Metrics {
         writeln!(file, "{line}").with_context(|| format!("cannot write {}", path.display()))
     }
 
-    /// Counts what a batch held, whose unrolls are of these tasks; gives its environment steps.
-    pub fn count_steps(&mut self, batch: &Batch, tasks: &[usize]) -> u64 {
+    /// Counts what a batch held, whose unrolls are of these tasks, and says it by task.
+    pub fn count_rows(&mut self, batch: &Batch, tasks: &[usize]) -> Vec<Rows> {
         let length = batch.layout.shape().length.max(1);
         self.window.tasks.resize(self.spec.tasks.len(), TaskWindow::default());
-        let mut all = 0;
+        let mut counted = vec![Rows::default(); self.spec.tasks.len()];
         let firsts = batch.f32(Field::First).chunks_exact(length + 1);
         for ((valid, first), task) in batch.f32(Field::Valid).chunks_exact(length).zip(firsts).zip(tasks) {
-            let steps = valid.iter().filter(|valid| **valid > 0.5).count() as u64;
+            let environment_steps = valid.iter().filter(|valid| **valid > 0.5).count() as u64;
             // Rows that begin an episode without a step.
             let padding = valid.iter().zip(first).filter(|(valid, first)| **valid < 0.5 && **first > 0.5).count();
-            all += steps;
-            if let Some(task) = self.window.tasks.get_mut(*task) {
-                task.unrolls += 1;
-                task.environment_steps += steps;
-                task.padding += padding as u64;
-                task.rows += length as u64;
+            if let (Some(window), Some(counted)) = (self.window.tasks.get_mut(*task), counted.get_mut(*task)) {
+                window.unrolls += 1;
+                *counted += Rows { rows: length as u64, environment_steps, padding: padding as u64 };
             }
         }
-        all
+        for (window, rows) in self.window.tasks.iter_mut().zip(&counted) {
+            window.rows += *rows;
+        }
+        counted
     }
 
     /// Counts a batch that V-MPO trained on.
@@ -213,12 +239,11 @@ impl Metrics {
 
     /// Writes the line, starts a new window, and returns the line for the status. A disk that refuses is complained
     /// about, and training goes on.
-    pub fn write(&mut self, position: Position, books: Value, losses: Map<String, Value>) -> String {
+    pub fn write(&mut self, position: Position, books: BooksByTask, losses: Map<String, Value>) -> String {
         let seconds = self.since.elapsed().as_secs_f64().max(1e-9);
         let window = std::mem::take(&mut self.window);
         self.since = Instant::now();
-        self.books = books.clone();
-        let environment_steps: u64 = window.tasks.iter().map(|task| task.environment_steps).sum();
+        let environment_steps: u64 = window.tasks.iter().map(|task| task.rows.environment_steps).sum();
         let named = self.spec.reward_terms.iter().zip(&window.returns);
         let terms: Map<String, Value> =
             named.map(|(name, sum)| (name.clone(), per(*sum, window.episodes.steps))).collect();
@@ -234,7 +259,7 @@ impl Metrics {
             "unroll_age": per(window.age as f64, window.unrolls),
             "reward_terms": terms,
             "losses": losses,
-            "books": books,
+            "books": books.all,
         });
         for (name, value) in window.episodes.entries() {
             line[name] = value;
@@ -244,18 +269,23 @@ impl Metrics {
                 .spec
                 .tasks
                 .iter()
-                .zip(&window.tasks)
-                .map(|(task, window)| {
+                .enumerate()
+                .map(|(index, task)| {
+                    // Nothing was trained on since the last line: the books may have moved all the same.
+                    let window = window.tasks.get(index).cloned().unwrap_or_default();
                     let mut entries: Map<String, Value> =
                         window.episodes.entries().map(|(name, value)| (name.to_string(), value)).into_iter().collect();
                     entries.insert("unrolls".into(), json!(window.unrolls));
-                    entries.insert("environment_steps".into(), json!(window.environment_steps));
-                    entries.insert("padding_share".into(), per(window.padding as f64, window.rows));
+                    let Rows { rows, environment_steps, padding } = window.rows;
+                    entries.insert("environment_steps".into(), json!(environment_steps));
+                    entries.insert("padding_share".into(), per(padding as f64, rows));
+                    entries.insert("books".into(), json!(books.tasks.get(&task.name)));
                     (task.name.clone(), Value::Object(entries))
                 })
                 .collect::<Map<String, Value>>()
                 .into();
         }
+        self.books = books;
         let line = line.to_string();
         // What a full disk cut off keeps its own line.
         let start = if self.torn { "\n" } else { "" };
@@ -289,7 +319,7 @@ mod tests {
         let mut metrics = Metrics::open(directory.path(), &spec).unwrap();
         let position = Position { seconds: 1.0, environment_steps: 2, updates: 3, version: 4, epoch: 5 };
         for _ in 0..2 {
-            let line = metrics.write(position, Value::Null, Map::new());
+            let line = metrics.write(position, BooksByTask::default(), Map::new());
             assert!(line.contains("\"updates\":3"), "{line}");
         }
         metrics.keep_evaluation(&Evaluation { epoch: 5, version: 4, updates: 3, json: "{}".into() });

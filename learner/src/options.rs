@@ -60,9 +60,9 @@ pub struct Options {
 /// The experiment and what changes it.
 #[derive(Clone, Debug, Args)]
 pub struct Document {
-    /// A preset's name, as README lists them, or the path of an experiment file.
-    #[arg(long, value_name = "NAME|FILE", default_value = "tracking-mlp", global = true)]
-    pub preset: String,
+    /// A preset's name, as README lists them, or the path of an experiment file [default: tracking-mlp].
+    #[arg(long, value_name = "NAME|FILE", global = true)]
+    pub preset: Option<String>,
     /// Clips to track instead of the experiment's: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP.
     #[arg(long, value_name = "SOURCE", num_args = 1.., global = true)]
     pub clips: Vec<String>,
@@ -87,11 +87,19 @@ impl Document {
     /// # Errors
     /// Names the file, field and remedy.
     pub fn resolve(&self) -> Result<Experiment> {
+        self.resolve_preset(self.preset.as_deref().unwrap_or("tracking-mlp"))
+    }
+
+    /// The experiment of another name with the same changes.
+    ///
+    /// # Errors
+    /// See [`resolve`](Self::resolve).
+    pub fn resolve_preset(&self, preset: &str) -> Result<Experiment> {
         let lockstep = self.lockstep.then_some(LOCKSTEP).into_iter().flatten().map(String::from);
         let device = self.device.map(|device| format!("learner.device=\"{device}\""));
         let overrides: Vec<String> = lockstep.chain(device).chain(self.overrides.iter().cloned()).collect();
-        let experiment = comic_experiment::resolve(&self.preset, &overrides)
-            .with_context(|| format!("the experiment `{}` is not usable", self.preset))?;
+        let experiment = comic_experiment::resolve(preset, &overrides)
+            .with_context(|| format!("the experiment `{preset}` is not usable"))?;
         Ok(experiment.with_clips(&self.clips))
     }
 }
@@ -111,7 +119,7 @@ pub enum Command {
         #[arg(long, value_name = "FILE")]
         out: PathBuf,
     },
-    /// Print how many parameters the networks of the paper's presets have.
+    /// Print how many parameters the networks have: those of the paper's presets, or of --preset, with --set.
     Sizes,
     /// Print the state of a running learner.
     Status(Status),

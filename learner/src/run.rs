@@ -191,6 +191,7 @@ fn prepare(
         Some(snapshot) => Ledger::restore(&serde_json::from_slice(snapshot.part("books.json")?)?)?,
         None => Ledger::new(),
     };
+    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
     let config = batches(&experiment.unroll);
     let batcher = Batcher::new(layout, config, Phase { epoch, ..Phase::default() }, ledger);

@@ -6,6 +6,7 @@ use anyhow::{Result, anyhow};
 use comic_experiment::{Experiment, TaskSpec};
 use tch::Device;
 
+use crate::options::Document;
 use crate::vmpo::VmpoLearner;
 
 /// The paper's own, whose low levels are of similar size.
@@ -31,15 +32,16 @@ pub fn count(experiment: &Experiment) -> Result<BTreeMap<&'static str, usize>> {
     Ok(counts)
 }
 
-/// The presets' table, as Markdown.
+/// The table of an experiment, or of the presets where none is named, as Markdown.
 ///
 /// # Errors
-/// When a preset's networks cannot be built.
-pub fn table() -> Result<String> {
+/// When there is no such experiment, or its networks cannot be built.
+pub fn table(document: &Document) -> Result<String> {
     let mut table =
         String::from("| experiment | encoder | low level | value | all |\n| --- | --- | --- | --- | --- |\n");
-    for preset in PRESETS {
-        let experiment = comic_experiment::resolve(preset, &[])?;
+    let named = document.preset.as_deref();
+    for preset in named.as_ref().map_or(&PRESETS[..], std::slice::from_ref) {
+        let experiment = document.resolve_preset(preset)?;
         let counts = count(&experiment)?;
         let of = |part: &str| counts.get(part).copied().unwrap_or(0);
         let row = [of("encoder"), of("low level"), of("value"), counts.values().sum()].map(thousands).join(" | ");

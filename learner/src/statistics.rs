@@ -268,11 +268,15 @@ mod tests {
     fn the_metrics_count_every_tasks_steps_and_padding() {
         let (spec, run) = (spec(), tempfile::tempdir().unwrap());
         let mut metrics = crate::metrics::Metrics::open(run.path(), &spec).unwrap();
-        assert_eq!(metrics.count_steps(&batch(&spec), &[0, 1]), 4);
+        let rows = |environment_steps, padding| crate::metrics::Rows { rows: 3, environment_steps, padding };
+        assert_eq!(metrics.count_rows(&batch(&spec), &[0, 1]), [rows(3, 0), rows(1, 1)]);
         let position =
             crate::metrics::Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
-        let line = metrics.write(position, serde_json::Value::Null, serde_json::Map::new());
+        let mut books = comic_replay::BooksByTask::default();
+        books.tasks.insert("get-up".into(), comic_replay::TaskBooks { trained: 7, ..Default::default() });
+        let line = metrics.write(position, books, serde_json::Map::new());
         let line: serde_json::Value = serde_json::from_str(&line).unwrap();
+        assert_eq!(line["tasks"]["get-up"]["books"]["trained"], 7);
         assert_eq!(line["tasks"]["tracking"]["environment_steps"], 3);
         assert_eq!(line["tasks"]["get-up"]["environment_steps"], 1);
         // Its second row is the episode's last observation, and no padding.

@@ -9,13 +9,16 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::Context as _;
-use comic_replay::Books;
+use comic_experiment::TaskName;
+use comic_replay::BooksByTask;
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::{Metric, Registry};
+
+use crate::metrics::Rows;
 
 /// One label and its value.
 type Label = [(&'static str, &'static str); 1];
@@ -79,7 +82,30 @@ impl Catalogue {
         self.descriptions.push(Description { name, kind, label: Some(label), values, help });
         Labelled { family, label }
     }
+
+    /// One metric for each task that there is, learnt or not.
+    fn of_tasks<M: Metric + Clone + Default>(
+        &mut self,
+        kind: &'static str,
+        name: &'static str,
+        help: &'static str,
+    ) -> Labelled<M>
+    where
+        Family<Label, M>: Metric,
+    {
+        self.labelled(kind, (name, "task"), &TASKS, help)
+    }
 }
+
+/// Every task's name.
+static TASKS: [&str; TaskName::ALL.len()] = {
+    let (mut names, mut at) = ([""; TaskName::ALL.len()], 0);
+    while at < names.len() {
+        names[at] = TaskName::ALL[at].name();
+        at += 1;
+    }
+    names
+};
 
 /// A metric with one label.
 #[derive(Clone, Debug)]
@@ -114,7 +140,10 @@ pub struct Telemetry {
     pub(crate) update_seconds: Histogram,
     pub(crate) unroll_age: Histogram,
     pub(crate) unroll_bytes: Histogram,
-    pub(crate) environment_steps: Counter,
+    environment_steps: Counter,
+    task_steps: Labelled<Counter>,
+    task_rows: Labelled<Counter>,
+    task_padding: Labelled<Counter>,
     pub(crate) episodes_diverged: Counter,
     pub(crate) evaluations: Counter,
     pub(crate) checkpoints: Labelled<Counter>,
@@ -142,6 +171,16 @@ struct Sampled {
     version: Gauge,
     epoch: Gauge,
     memory: Gauge,
+    tasks: SampledTasks,
+}
+
+/// The books of each task.
+#[derive(Debug)]
+struct SampledTasks {
+    produced: Labelled<Counter>,
+    trained: Labelled<Counter>,
+    dropped: Labelled<Counter>,
+    in_flight: Labelled<Gauge>,
 }
 
 impl Sampled {
@@ -169,6 +208,12 @@ impl Sampled {
             version: catalogue.gauge("comic_parameters_version", "Newest published version of the parameters"),
             epoch: catalogue.gauge("comic_learner_epoch", "Which life of the learner this is; grows by one at every start of the run"),
             memory: catalogue.gauge("process_resident_memory_bytes", "Resident memory of the learner process in bytes"),
+            tasks: SampledTasks {
+                produced: catalogue.of_tasks("counter", "comic_task_unrolls_produced", "Unrolls of the task that were decided about, over the run's whole life"),
+                trained: catalogue.of_tasks("counter", "comic_task_unrolls_trained", "Unrolls of the task trained on, over the run's whole life"),
+                dropped: catalogue.of_tasks("counter", "comic_task_unrolls_dropped", "Unrolls of the task that will never be trained on, over the run's whole life; those of no known task are in comic_unrolls_dropped alone"),
+                in_flight: catalogue.of_tasks("gauge", "comic_task_unrolls_in_flight", "Unrolls of the task in a batch that is open, full, or being trained on"),
+            },
         }
     }
 }
@@ -176,7 +221,7 @@ impl Sampled {
 /// What [`Telemetry::page`] cannot know by itself.
 #[derive(Debug)]
 pub(crate) struct Sample {
-    pub(crate) books: Books,
+    pub(crate) books: BooksByTask,
     pub(crate) capacity: u64,
     pub(crate) waiting: u64,
     pub(crate) actors: [(&'static str, u64); 3],
@@ -218,6 +263,9 @@ impl Default for Telemetry {
                 exponential_buckets(1024.0, 4.0, 9),
             ),
             environment_steps: all.counter("comic_environment_steps", "Environment steps trained on"),
+            task_steps: all.of_tasks("counter", "comic_task_environment_steps", "Environment steps of the task trained on"),
+            task_rows: all.of_tasks("counter", "comic_task_rows", "Rows of the task's unrolls that were trained on"),
+            task_padding: all.of_tasks("counter", "comic_task_padding_rows", "Those of them that are padding, since the next episode was of another task"),
             episodes_diverged: all.counter(
                 "comic_episodes_diverged",
                 "Episodes trained on that ended since the simulation diverged; see comic-actor --dump-diverged",
@@ -275,6 +323,16 @@ impl Telemetry {
         *self.ages.lock().unwrap_or_else(PoisonError::into_inner) = Ages { median: at(50), p99: at(99), max: at(100) };
     }
 
+    /// Counts what was trained on of a task.
+    pub(crate) fn count_rows(&self, task: &str, counted: Rows) {
+        self.environment_steps.inc_by(counted.environment_steps);
+        if let Some(task) = TASKS.iter().find(|name| **name == task) {
+            self.task_steps.of(task).inc_by(counted.environment_steps);
+            self.task_rows.of(task).inc_by(counted.rows);
+            self.task_padding.of(task).inc_by(counted.padding);
+        }
+    }
+
     /// So many in all.
     pub(crate) fn count_compilations(&self, compiled: u64) {
         self.compilations.inc_by(compiled.saturating_sub(self.compilations.get()));
@@ -288,7 +346,7 @@ impl Telemetry {
     /// The page that Prometheus reads, in the OpenMetrics text format.
     pub(crate) fn page(&self, sample: &Sample) -> String {
         let Sampled { produced, trained, dropped, duplicates, unattributed, in_flight, .. } = &self.sampled;
-        let books = sample.books;
+        let books = sample.books.all;
         for (counter, value) in [
             (produced, books.produced),
             (trained, books.trained),
@@ -310,6 +368,15 @@ impl Telemetry {
             (&self.sampled.memory, resident_bytes()),
         ] {
             gauge.set(value as i64);
+        }
+        for (task, books) in TASKS.iter().filter_map(|task| Some((task, sample.books.tasks.get(*task)?))) {
+            let SampledTasks { produced, trained, dropped, in_flight } = &self.sampled.tasks;
+            for (counter, value) in
+                [(produced, books.produced), (trained, books.trained), (dropped, books.dropped.total())]
+            {
+                counter.of(task).inner().store(value, Ordering::Relaxed);
+            }
+            in_flight.of(task).set(books.in_flight as i64);
         }
         for (state, actors) in sample.actors {
             self.sampled.actors.of(state).set(actors as i64);

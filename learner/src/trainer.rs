@@ -292,9 +292,10 @@ impl Trainer {
     /// Counts a batch's steps and diverged episodes, and gives its memory back.
     pub(crate) fn book(&mut self, batch: Batch) {
         let tasks = tasks_of_unrolls(&batch, &self.spec);
-        let steps = self.metrics.count_steps(&batch, &tasks);
-        self.progress.environment_steps += steps;
-        self.shared.telemetry.environment_steps.inc_by(steps);
+        for (rows, task) in self.metrics.count_rows(&batch, &tasks).into_iter().zip(&self.spec.tasks) {
+            self.progress.environment_steps += rows.environment_steps;
+            self.shared.telemetry.count_rows(&task.name, rows);
+        }
         let episodes = batch.headers().iter().flat_map(|header| &header.episodes);
         for UnrollHeader { actor, incarnation, sequence, .. } in batch.headers() {
             tracing::trace!(actor, incarnation = format_args!("{incarnation:016x}"), sequence, "trained on");
@@ -397,7 +398,7 @@ impl Trainer {
         if !self.writer.is_busy() {
             self.take_evaluations()?;
         }
-        if self.metrics.has_news(&self.books()?) { self.write_metrics() } else { Ok(()) }
+        if self.metrics.has_news(&self.batcher.books_by_task()) { self.write_metrics() } else { Ok(()) }
     }
 
     /// Keeps what actors found out about checkpoints.
@@ -411,10 +412,6 @@ impl Trainer {
         Ok(())
     }
 
-    fn books(&self) -> Result<Value> {
-        Ok(serde_json::to_value(self.batcher.books())?)
-    }
-
     fn write_metrics(&mut self) -> Result<()> {
         let position = Position {
             seconds: self.seconds(),
@@ -423,7 +420,7 @@ impl Trainer {
             version: self.progress.version,
             epoch: self.epoch,
         };
-        let books = self.books()?;
+        let books = self.batcher.books_by_task();
         let line = self.metrics.write(position, books, self.losses.clone());
         tracing::info!(target: "metrics", "{line}");
         self.shared.set_metrics(line);

@@ -132,6 +132,7 @@ fn live_evaluated(
     let ledger = resume.as_ref().map_or_else(Ledger::new, |snapshot| {
         Ledger::restore(&serde_json::from_slice(snapshot.part("books.json").unwrap()).unwrap()).unwrap()
     });
+    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
     let config = Config { unrolls: experiment.unroll.batch, max_staleness: 1000, ahead: 1, order: Order::Arrival };
     let batcher = Batcher::new(layout.clone(), config, Phase { epoch, ..Phase::default() }, ledger);

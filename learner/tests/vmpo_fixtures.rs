@@ -198,10 +198,16 @@ fn products_equal_gaussian_distributions_made_by_hand() {
         let [logits, mean, std] = &learnt;
         let primitives = DiagonalGaussian { mean: mean.shallow_clone(), std: std.shallow_clone() };
         let product = primitives.product(&logits.sigmoid());
+        let primitives = DiagonalGaussian { mean: fixture.array("old_mean"), std: fixture.array("old_std") };
+        let behaviour = primitives.product(&fixture.array("old_logits").sigmoid());
         fixture.compare("product_mean", &product.mean);
         fixture.compare("product_std", &product.std);
         let log_prob = product.log_prob(&fixture.array("action"));
+        let (kl_mean, kl_std) = (product.kl_mean(&behaviour), product.kl_std(&behaviour));
         fixture.compare("log_prob", &log_prob);
-        compare_gradients(&mut fixture, &log_prob.sum(Kind::Float), &learnt);
+        fixture.compare("kl_mean", &kl_mean);
+        fixture.compare("kl_std", &kl_std);
+        let total = (log_prob + kl_mean + kl_std).sum(Kind::Float);
+        compare_gradients(&mut fixture, &total, &learnt);
     }
 }

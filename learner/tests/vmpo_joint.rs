@@ -7,7 +7,7 @@ mod vmpo_support;
 use comic_experiment::Experiment;
 use comic_learner::vmpo::{MinibatchTensors, VmpoLearner};
 use comic_networks::{Memory, NormaliserStatistics, Routing};
-use tch::Tensor;
+use tch::{Device, Tensor};
 use vmpo_support::{LENGTH, Numbers, Unrolls, difference, every_low_level, joint_spec, learner_of, state};
 
 const COUNT: usize = 5;
@@ -94,6 +94,17 @@ fn changed(experiment: &Experiment, unrolls: &Unrolls) -> Vec<String> {
     let moved =
         |((name, before), (_, after)): ((String, Vec<f64>), (String, Vec<f64>))| (before != after).then_some(name);
     before.into_iter().zip(state(&learner)).filter_map(moved).collect()
+}
+
+#[test]
+fn acting_step_by_step_is_acting_on_the_whole_unroll() {
+    for experiment in every_low_level() {
+        let learner = learner(&experiment);
+        let unrolls = unrolls(&learner, &experiment, 2);
+        // Who acts has a row for each environment, who learns one for each unroll, in blocks.
+        let acting = unrolls.act_at_once(&learner, &experiment, &Routing::blocked(&TASKS, 2, Device::Cpu));
+        unrolls.assert_decided(experiment.network.low_level.name(), &acting);
+    }
 }
 
 #[test]

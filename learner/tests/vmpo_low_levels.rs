@@ -9,7 +9,7 @@ use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives};
 use comic_learner::vmpo::{MinibatchTensors, VmpoLearner};
 use comic_networks::{Memory, Routing};
 use tch::{Device, Kind, Tensor};
-use vmpo_support::{LENGTH, Numbers, Unrolls, difference, experiment, learner};
+use vmpo_support::{LENGTH, Numbers, Unrolls, assert_close, difference, experiment, learner};
 
 /// Every low level, the gated ones with a bottleneck and without.
 fn every_low_level() -> Vec<(&'static str, Experiment)> {
@@ -100,16 +100,6 @@ fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
     Acted { unrolls, latents: unrolled(&latents), state: remembered }
 }
 
-/// Fails when two tensors of the same rows are further apart than 1e-5 anywhere.
-fn assert_close(what: &str, left: &Tensor, right: &Tensor) {
-    let (left, right) = (left.reshape([-1]), right.reshape([-1]));
-    assert_eq!(left.size(), right.size(), "{what}");
-    if left.numel() > 0 {
-        let apart = (left - right).abs().max().double_value(&[]);
-        assert!(apart < 1e-5, "{what}: {apart} apart");
-    }
-}
-
 fn minibatch(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> MinibatchTensors {
     unrolls(learner, experiment, seed).minibatch()
 }
@@ -119,28 +109,8 @@ fn acting_step_by_step_is_acting_on_the_whole_unroll() {
     for (name, experiment) in every_low_level() {
         let learner = learner(&experiment, 1);
         let Acted { unrolls, latents, state } = acted(&learner, &experiment, 2);
-        let count = unrolls.count as i64;
-        let steps = |values: &[f32], length: usize| {
-            let width = values.len() / (unrolls.count * length);
-            Tensor::from_slice(values).reshape([count, length as i64, width as i64]).narrow(1, 0, LENGTH as i64)
-        };
-        let begins = steps(&unrolls.first, LENGTH + 1).squeeze_dim(-1);
-        assert!(begins.sum(Kind::Float).double_value(&[]) > 0.0, "an episode begins inside");
-        let before = Tensor::from_slice(&unrolls.state).reshape([count, experiment.network.state_size() as i64]);
-        let acting = tch::no_grad(|| {
-            let (proprioception, task) = (steps(&unrolls.proprioception, LENGTH + 1), steps(&unrolls.task, LENGTH + 1));
-            let observation = learner.policy().normalise(&proprioception, &task, None, &Routing::single());
-            let (previous, noise) = (steps(&unrolls.previous_latent, LENGTH), steps(&unrolls.latent_noise, LENGTH));
-            let memory = Memory { state: &before, first: Some(&begins) };
-            learner.policy().act(&observation, &previous, &noise, memory)
-        });
-        let (mean, std, log_weights) = acting.action.to_rows();
-        assert_close(&format!("{name}: mean"), &mean, &Tensor::from_slice(&unrolls.mean));
-        assert_close(&format!("{name}: std"), &std, &Tensor::from_slice(&unrolls.std));
-        assert_eq!(log_weights.is_some(), !unrolls.log_weights.is_empty(), "{name}");
-        if let Some(log_weights) = log_weights {
-            assert_close(&format!("{name}: weights"), &log_weights, &Tensor::from_slice(&unrolls.log_weights));
-        }
+        let acting = unrolls.act_at_once(&learner, &experiment, &Routing::single());
+        unrolls.assert_decided(name, &acting);
         assert_close(&format!("{name}: latent"), &acting.latent, &Tensor::from_slice(&latents));
         assert_close(&format!("{name}: state"), &acting.state, &state);
     }

@@ -36,6 +36,7 @@ mod value;
 pub use action::ActionDistribution;
 pub use error::Error;
 pub use gaussian::DiagonalGaussian;
+pub use low_level::{Layer, Sizes, low_level_layers};
 pub use lstm::Memory;
 pub use normaliser::{NORMALISED_LIMIT, NORMALISER_MIN_STD, NormalisedObservation, NormaliserStatistics};
 pub use parameters::{from_safetensors, to_safetensors};

@@ -139,11 +139,17 @@ fn the_mean_starts_at_the_pose_and_both_deviations_at_their_initial_values() {
 
 #[test]
 fn deviations_never_fall_below_their_floor() {
-    let (store, policy) = policy(&network(), 1, &[0.0; 3]);
-    let mut bias = store.variables().remove("low_level.head.bias").unwrap();
-    let _ = tch::no_grad(|| bias.fill_(-1e4));
-    let smallest = act(&policy).action.std.min().double_value(&[]);
-    assert!((smallest - Network::default().min_std).abs() < 1e-9);
+    let mut network = network();
+    (network.min_std, network.latent.min_std) = (0.02, 0.05);
+    let (store, policy) = policy(&network, 1, &[0.0; 3]);
+    for name in ["low_level.head.bias", "encoder.tracking.head.bias"] {
+        let mut bias = store.variables().remove(name).unwrap();
+        let _ = tch::no_grad(|| bias.fill_(-1e4));
+    }
+    let acting = act(&policy);
+    for (std, floor) in [(acting.action.std, 0.02), (acting.posterior.std, 0.05)] {
+        assert!((std - floor).abs().max().double_value(&[]) < 1e-8, "the floor is {floor}");
+    }
 }
 
 #[test]

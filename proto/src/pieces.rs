@@ -92,7 +92,7 @@ impl Pieces {
             place.copy_from_slice(bytes);
             rest = after;
         }
-        assert!(rest.is_empty(), "{} bytes from {start} on, of {}", rest.len(), self.length);
+        assert!(rest.is_empty(), "{} bytes are missing from {start} on: there are {}", rest.len(), self.length);
     }
 
     /// Does something with each word, little end first, of a range of whole words.

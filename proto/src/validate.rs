@@ -203,6 +203,8 @@ fn check_episode(layout: &UnrollLayout, episode: &EpisodeStatistics, clips: usiz
         "one return for each reward term is needed"
     } else if !episode.returns.iter().all(|value| value.is_finite()) {
         "a return is not finite"
+    } else if !episode.head_height.is_none_or(f32::is_finite) {
+        "the head's height is not finite"
     } else if end == EpisodeEnd::Unspecified {
         "how the episode ended is missing"
     } else {

@@ -31,6 +31,7 @@ fn header() -> UnrollHeader {
         steps_left_at_start: 20,
         returns: vec![1.5, 0.25],
         end: EpisodeEnd::Terminated.into(),
+        head_height: Some(1.5),
     };
     UnrollHeader {
         actor: 1,
@@ -154,6 +155,8 @@ fn episode_statistics_are_limited_in_number_and_have_to_make_sense() {
         episode(|episode| episode.steps_left_at_start = 0),
         episode(|episode| episode.returns.truncate(1)),
         episode(|episode| episode.returns[1] = f32::NAN),
+        episode(|episode| episode.head_height = Some(f32::NAN)),
+        episode(|episode| episode.head_height = Some(f32::INFINITY)),
         episode(|episode| episode.end = 0),
         episode(|episode| episode.end = 99),
     ] {

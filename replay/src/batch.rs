@@ -60,6 +60,13 @@ impl Buffer {
         self.filled.get(slot) == Some(&false)
     }
 
+    /// The first row's clip of every unroll in it.
+    pub(crate) fn first_clips(&self) -> impl Iterator<Item = u32> {
+        let rows = self.clips.len() / self.filled.len().max(1);
+        let filled = self.filled.iter().enumerate().filter(|(_, filled)| **filled);
+        filled.map(move |(slot, _)| self.clips[slot * rows])
+    }
+
     /// Frees every slot.
     pub(crate) fn clear(&mut self) {
         self.filled.fill(false);
@@ -83,16 +90,18 @@ impl Buffer {
         self.unrolls += 1;
     }
 
-    /// Lets go of the unrolls that are not `kept`; their slots are free. Gives how many went.
-    pub(crate) fn retain(&mut self, kept: impl Fn(&UnrollHeader) -> bool) -> usize {
-        let before = self.unrolls;
-        for (filled, header) in self.filled.iter_mut().zip(&self.headers) {
+    /// Lets go of the unrolls that are not `kept`; their slots are free. Gives the first clips of those that went.
+    pub(crate) fn retain(&mut self, kept: impl Fn(&UnrollHeader) -> bool) -> Vec<u32> {
+        let rows = self.clips.len() / self.filled.len().max(1);
+        let mut went = Vec::new();
+        for (slot, (filled, header)) in self.filled.iter_mut().zip(&self.headers).enumerate() {
             if *filled && !kept(header) {
                 *filled = false;
                 self.unrolls -= 1;
+                went.push(self.clips[slot * rows]);
             }
         }
-        before - self.unrolls
+        went
     }
 
     /// Moves unrolls of `other` here, as far as there are free slots.

@@ -5,12 +5,13 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use comic_proto::v1::UnrollHeader;
-use comic_proto::{Pieces, UnrollLayout};
+use comic_proto::{Field, Pieces, UnrollLayout};
 use tokio::sync::Semaphore;
 
 use crate::batch::{Batch, Buffer};
 use crate::ledger::{Books, JoinError, Joined, Ledger, Reason, Sighting};
 use crate::snapshot::Snapshot;
+use crate::tasks::BooksByTask;
 
 /// What does not change while a batcher lives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -87,8 +88,6 @@ struct State {
     /// What is filled when the next one is full.
     open: Option<Buffer>,
     free: Vec<Buffer>,
-    /// Unrolls in batches the trainer holds.
-    taken: usize,
     closed: bool,
 }
 
@@ -117,7 +116,7 @@ impl Batcher {
         let config = Config { unrolls: config.unrolls.max(1), ahead, ..config };
         let mut free: Vec<_> = (0..=config.ahead).map(|_| Buffer::new(&layout, config.unrolls)).collect();
         let open = free.pop();
-        let state = Mutex::new(State { ledger, phase, next: None, open, free, taken: 0, closed: false });
+        let state = Mutex::new(State { ledger, phase, next: None, open, free, closed: false });
         let slots = Semaphore::new(config.unrolls);
         Self { inner: Arc::new(Inner { layout, config, state, slots, filled: Condvar::new() }) }
     }
@@ -151,7 +150,7 @@ impl Batcher {
             Order::Arrival => batch.first_free(),
             Order::Environment => header.environment as usize,
         };
-        if !ledger.record(header.actor, header.sequence) {
+        if !ledger.record(header.actor, header.sequence, first_clip(&self.inner.layout, &payload)) {
             ledger.sums.unattributed += 1;
             return Outcome::Invalid;
         }
@@ -171,7 +170,7 @@ impl Batcher {
         if let Some(outcome) = refuse_unaccountable(&mut state.ledger, header) {
             return outcome;
         }
-        drop_unroll(&mut state.ledger, header, Reason::Invalid)
+        drop_unroll(&mut state.ledger, header, None, Reason::Invalid)
     }
 
     /// Counts a message without so much as a header.
@@ -217,7 +216,7 @@ impl Batcher {
                 return Next::Closed;
             }
             if let Some(buffer) = self.take_next(&mut state) {
-                state.taken += buffer.len();
+                state.ledger.hand_out(buffer.first_clips());
                 self.settle(&mut state);
                 drop(state);
                 return Next::Batch(Batch::new(self.inner.layout.clone(), buffer, self.clone()));
@@ -242,14 +241,19 @@ impl Batcher {
 
     /// The books at this moment.
     pub fn books(&self) -> Books {
+        self.books_by_task().all
+    }
+
+    /// The books at this moment, and each task's.
+    pub fn books_by_task(&self) -> BooksByTask {
         let state = self.lock();
-        Books { in_flight: state.in_flight(), ..state.ledger.sums }
+        state.ledger.books(state.waiting())
     }
 
     /// Books and accounts for a checkpoint.
     pub fn snapshot(&self) -> Snapshot {
         let state = self.lock();
-        state.ledger.snapshot(state.in_flight())
+        state.ledger.snapshot(state.waiting())
     }
 
     /// The layout of its unrolls.
@@ -272,12 +276,7 @@ impl Batcher {
     /// Takes a buffer back from a [`Batch`] whose unrolls were trained on, or dropped for a reason.
     pub(crate) fn take_back(&self, mut buffer: Buffer, end: Option<Reason>) {
         let mut state = self.lock();
-        let unrolls = buffer.len();
-        state.taken -= unrolls;
-        match end {
-            None => state.ledger.sums.trained += unrolls as u64,
-            Some(reason) => state.ledger.sums.dropped.count(reason, unrolls as u64),
-        }
+        buffer.first_clips().for_each(|clip| state.ledger.take_back(clip, end));
         buffer.clear();
         state.free.push(buffer);
         self.settle(&mut state);
@@ -309,20 +308,23 @@ impl Batcher {
         } else {
             return None;
         };
-        Some(drop_unroll(&mut state.ledger, header, reason))
+        // What is invalid tells nothing, and what another epoch calls a clip is another task's perhaps.
+        let tells = header.learner_epoch == epoch && reason != Reason::Invalid;
+        let clip = first_clip(&self.inner.layout, payload).filter(|_| tells);
+        Some(drop_unroll(&mut state.ledger, header, clip, reason))
     }
 
     /// Drops unrolls that wait in the batcher. Their slots are free again; those promised to waiting inserts stay
     /// promised. What is left of the open batch makes the next one full.
     fn drop_waiting(&self, state: &mut State, reason: Reason, dropped: impl Fn(&UnrollHeader) -> bool) {
         let (layout, State { ledger, next, open, .. }) = (&self.inner.layout, state);
-        let went: usize =
-            [&mut *next, &mut *open].into_iter().flatten().map(|batch| batch.retain(|header| !dropped(header))).sum();
+        let waiting = [&mut *next, &mut *open].into_iter().flatten();
+        let went: Vec<u32> = waiting.flat_map(|batch| batch.retain(|header| !dropped(header))).collect();
         if let (Some(next), Some(open)) = (next, open) {
             next.fill_from(layout, open);
         }
-        ledger.sums.dropped.count(reason, went as u64);
-        self.inner.slots.add_permits(went);
+        self.inner.slots.add_permits(went.len());
+        went.into_iter().for_each(|clip| ledger.end(Some(clip), Some(reason)));
     }
 
     /// The next batch, if it is full without what grew too old while it waited.
@@ -364,9 +366,9 @@ impl Batcher {
 }
 
 impl State {
-    fn in_flight(&self) -> u64 {
-        let waiting: usize = [&self.next, &self.open].into_iter().flatten().map(Buffer::len).sum();
-        (waiting + self.taken) as u64
+    /// First clips of the unrolls that wait for the trainer.
+    fn waiting(&self) -> impl Iterator<Item = u32> {
+        [&self.next, &self.open].into_iter().flatten().flat_map(Buffer::first_clips)
     }
 }
 
@@ -388,12 +390,21 @@ fn refuse_unaccountable(ledger: &mut Ledger, header: &UnrollHeader) -> Option<Ou
     }
 }
 
-fn drop_unroll(ledger: &mut Ledger, header: &UnrollHeader, reason: Reason) -> Outcome {
-    if !ledger.record(header.actor, header.sequence) {
+/// The clip of an unroll's first row, which says of which task it is; none in what is no unroll of this layout.
+fn first_clip(layout: &UnrollLayout, payload: &Pieces) -> Option<u32> {
+    (payload.len() == layout.size()).then(|| {
+        let mut clip = [0];
+        payload.copy_to(layout.range(Field::Clip).start, bytemuck::cast_slice_mut(&mut clip));
+        clip[0]
+    })
+}
+
+fn drop_unroll(ledger: &mut Ledger, header: &UnrollHeader, clip: Option<u32>, reason: Reason) -> Outcome {
+    if !ledger.record(header.actor, header.sequence, clip) {
         ledger.sums.unattributed += 1;
         return Outcome::Invalid;
     }
-    ledger.sums.dropped.count(reason, 1);
+    ledger.end(clip, Some(reason));
     match reason {
         Reason::Stale => Outcome::Stale,
         Reason::Invalid => Outcome::Invalid,

@@ -1,10 +1,12 @@
 //! Who sent what, and what became of it.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 use comic_proto::MAX_SEQUENCE;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
+
+use crate::tasks::{BooksByTask, TaskBooks, Tasks};
 
 /// Sums over every unroll ever produced for this run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -27,16 +29,7 @@ pub struct Books {
 impl Books {
     /// Whether `produced = trained + dropped + in flight`.
     pub fn balance(&self) -> bool {
-        [
-            self.dropped.stale,
-            self.dropped.invalid,
-            self.dropped.superseded,
-            self.dropped.lost_at_restart,
-            self.in_flight,
-        ]
-        .iter()
-        .try_fold(self.trained, |sum, part| sum.checked_add(*part))
-            == Some(self.produced)
+        self.dropped.add_to([self.trained, self.in_flight]) == Some(self.produced)
     }
 }
 
@@ -58,6 +51,12 @@ impl Dropped {
     /// All reasons together.
     pub fn total(&self) -> u64 {
         self.stale + self.invalid + self.superseded + self.lost_at_restart
+    }
+
+    /// These and all reasons together, if a u64 can hold that.
+    pub(crate) fn add_to(&self, others: [u64; 2]) -> Option<u64> {
+        let reasons = [self.stale, self.invalid, self.superseded, self.lost_at_restart];
+        others.into_iter().chain(reasons).try_fold(0u64, u64::checked_add)
     }
 
     pub(crate) fn count(&mut self, reason: Reason, unrolls: u64) {
@@ -138,8 +137,11 @@ pub struct Ledger {
     pub(crate) next_actor: u64,
     pub(crate) clock: u64,
     capacity: usize,
-    /// All but `in_flight`, which the batcher counts in its buffers.
+    /// In flight is what the trainer holds; what waits for it is counted in the batcher's buffers.
     pub(crate) sums: Books,
+    tasks: Tasks,
+    /// The books of tasks that this life does not have, for one that does.
+    pub(crate) others: BTreeMap<String, TaskBooks>,
 }
 
 impl Default for Ledger {
@@ -166,7 +168,20 @@ impl Ledger {
             clock: 0,
             capacity: capacity.max(1),
             sums: Books::default(),
+            tasks: Tasks::default(),
+            others: BTreeMap::new(),
         }
+    }
+
+    /// Keeps books of each of these tasks too: name, and number of clips, which are counted through all tasks. A restored
+    /// ledger goes on with those of the same name.
+    #[must_use]
+    pub fn with_tasks(mut self, tasks: impl IntoIterator<Item = (String, usize)>) -> Self {
+        let mut known = std::mem::take(&mut self.others);
+        known.extend(std::mem::take(&mut self.tasks).by_name());
+        self.tasks = Tasks::new(tasks, &mut known);
+        self.others = known;
+        self
     }
 
     /// Opens an account, or finds the one this incarnation has. `claimed` is the index the actor says it had.
@@ -220,8 +235,8 @@ impl Ledger {
     }
 
     /// Accounts for a number that [`sight`](Self::sight) called new. False, and nothing changed, if it is not, or if
-    /// the sum of all numbers would leave its range (then no other sum can).
-    pub(crate) fn record(&mut self, actor: u64, sequence: u64) -> bool {
+    /// the sum of all numbers would leave its range (then no other sum can). `clip` is the unroll's first, if it is known.
+    pub(crate) fn record(&mut self, actor: u64, sequence: u64, clip: Option<u32>) -> bool {
         let Some(entry) = self.entries.get_mut(&actor) else { return false };
         let Some(skipped) = sequence.checked_sub(entry.next_sequence) else { return false };
         let Some(produced) = self.sums.produced.checked_add(skipped).and_then(|sum| sum.checked_add(1)) else {
@@ -232,6 +247,49 @@ impl Ledger {
         entry.next_sequence = sequence + 1;
         self.sums.produced = produced;
         self.sums.dropped.count(Reason::LostAtRestart, skipped);
+        if let Some(books) = clip.and_then(|clip| self.tasks.of(clip)) {
+            books.produced += 1;
+        }
         true
+    }
+
+    /// Counts unrolls of these first clips as being with the trainer.
+    pub(crate) fn hand_out(&mut self, clips: impl Iterator<Item = u32>) {
+        for clip in clips {
+            self.sums.in_flight += 1;
+            self.tasks.of(clip).into_iter().for_each(|books| books.in_flight += 1);
+        }
+    }
+
+    /// Books one that was handed out as trained on, or as dropped for a reason.
+    pub(crate) fn take_back(&mut self, clip: u32, end: Option<Reason>) {
+        self.sums.in_flight -= 1;
+        self.tasks.of(clip).into_iter().for_each(|books| books.in_flight -= 1);
+        self.end(Some(clip), end);
+    }
+
+    /// Books one unroll, of this first clip, as trained on, or as dropped for a reason.
+    pub(crate) fn end(&mut self, clip: Option<u32>, end: Option<Reason>) {
+        let books = clip.and_then(|clip| self.tasks.of(clip));
+        match end {
+            None => {
+                self.sums.trained += 1;
+                books.into_iter().for_each(|books| books.trained += 1);
+            }
+            Some(reason) => {
+                self.sums.dropped.count(reason, 1);
+                books.into_iter().for_each(|books| books.dropped.count(reason, 1));
+            }
+        }
+    }
+
+    /// The books, with unrolls of these first clips waiting for the trainer.
+    pub(crate) fn books(&self, waiting: impl Iterator<Item = u32>) -> BooksByTask {
+        let (mut all, mut tasks) = (self.sums, self.tasks.clone());
+        for clip in waiting {
+            all.in_flight += 1;
+            tasks.of(clip).into_iter().for_each(|books| books.in_flight += 1);
+        }
+        BooksByTask { all, tasks: tasks.by_name() }
     }
 }

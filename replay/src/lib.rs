@@ -4,7 +4,7 @@
 //! - [`Batcher`] is the meeting point: network tasks [`insert`](Batcher::insert) unrolls, the trainer's thread takes
 //!   [`Batch`]es and gives them back with [`trained`](Batcher::trained).
 //! - [`Ledger`] knows every actor's account: which sequence number comes next, and what became of the earlier ones.
-//! - [`Books`] are the sums; [`Snapshot`] is books and accounts in a checkpoint.
+//! - [`Books`] are the sums, [`TaskBooks`] those of one task; [`Snapshot`] is books and accounts in a checkpoint.
 //!
 //! # The rules
 //! An actor process is an *incarnation*, a number it draws once. Joining opens an account, `(actor index, incarnation,
@@ -32,7 +32,8 @@
 //!
 //! # Invariants
 //! - `produced = trained + dropped + in flight` whenever anyone looks; *in flight* is counted in the buffers, not
-//!   computed from the others.
+//!   computed from the others. The same holds of every task's own books. An unroll is of the task that has its first
+//!   row's clip; one that is invalid, or of another epoch, is of no task.
 //! - Memory is [`Config::ahead`] batches and the one at the trainer, whatever the number of actors.
 //! - No unroll is in two batches, or twice in one.
 
@@ -40,8 +41,10 @@ mod batch;
 mod batcher;
 mod ledger;
 mod snapshot;
+mod tasks;
 
 pub use batch::Batch;
 pub use batcher::{Batcher, Config, Next, Order, Outcome, Phase};
 pub use ledger::{Books, Dropped, JoinError, Joined, Ledger, Reason};
 pub use snapshot::{Account, Error, Snapshot};
+pub use tasks::{BooksByTask, TaskBooks};

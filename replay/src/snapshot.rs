@@ -1,11 +1,12 @@
 //! Books and accounts in a checkpoint.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::ledger::{Books, Entry, Ledger, Reason};
+use crate::tasks::{BooksByTask, TaskBooks};
 
 /// One open account.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -25,6 +26,9 @@ pub struct Account {
 pub struct Snapshot {
     /// The sums, what was in flight included.
     pub books: Books,
+    /// The same of each task, by its name.
+    #[serde(default)]
+    pub tasks: BTreeMap<String, TaskBooks>,
     /// The index the next new actor gets.
     pub next_actor: u64,
     /// Open accounts, the one heard of least recently first.
@@ -41,6 +45,14 @@ pub enum Error {
         /// As stored.
         books: Books,
     },
+    /// The law does not hold of one task, or the tasks come to more than all.
+    #[error("books of {task} in the checkpoint do not balance: {books:?}")]
+    UnbalancedTask {
+        /// The task's name.
+        task: String,
+        /// As stored.
+        books: TaskBooks,
+    },
     /// An index or an incarnation stands there twice, or an index that was never given out.
     #[error("account of actor {actor} in the checkpoint is repeated or out of range")]
     Account {
@@ -50,7 +62,7 @@ pub enum Error {
 }
 
 impl Ledger {
-    pub(crate) fn snapshot(&self, in_flight: u64) -> Snapshot {
+    pub(crate) fn snapshot(&self, waiting: impl Iterator<Item = u32>) -> Snapshot {
         let mut entries: Vec<_> = self.entries.iter().collect();
         entries.sort_by_key(|(_, entry)| entry.heard);
         let accounts = entries
@@ -61,7 +73,9 @@ impl Ledger {
                 next_sequence: entry.next_sequence,
             })
             .collect();
-        Snapshot { books: Books { in_flight, ..self.sums }, next_actor: self.next_actor, accounts }
+        let BooksByTask { all: books, mut tasks } = self.books(waiting);
+        tasks.extend(self.others.iter().map(|(task, books)| (task.clone(), *books)));
+        Snapshot { books, tasks, next_actor: self.next_actor, accounts }
     }
 
     /// The ledger a new life of the learner starts with: what was in flight at the snapshot is lost at restart.
@@ -88,6 +102,22 @@ impl Ledger {
             return Err(Error::Unbalanced { books: snapshot.books });
         }
         sums.dropped.count(Reason::LostAtRestart, std::mem::take(&mut sums.in_flight));
+        let parts = |books: &TaskBooks| [books.produced, books.trained, books.dropped.total(), books.in_flight];
+        let all = [sums.produced, sums.trained, snapshot.books.dropped.total(), snapshot.books.in_flight];
+        let mut together = [0u64; 4];
+        for (task, books) in &snapshot.tasks {
+            // Of books that balance no sum can leave its range.
+            let sound = books.balance() && {
+                together.iter_mut().zip(parts(books)).for_each(|(sum, part)| *sum = sum.saturating_add(part));
+                together.iter().zip(all).all(|(sum, all)| *sum <= all)
+            };
+            if !sound {
+                return Err(Error::UnbalancedTask { task: task.clone(), books: *books });
+            }
+            let mut books = *books;
+            books.dropped.count(Reason::LostAtRestart, std::mem::take(&mut books.in_flight));
+            ledger.others.insert(task.clone(), books);
+        }
         ledger.next_actor = snapshot.next_actor;
         ledger.sums = sums;
         Ok(ledger)

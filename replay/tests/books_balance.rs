@@ -7,8 +7,8 @@ mod common;
 
 use std::collections::{HashMap, HashSet};
 
-use comic_replay::{Batch, Batcher, Ledger, Outcome, Phase, Reason, Snapshot};
-use common::{Actor, CONFIG, PHASE, batch_now, insert_now, layout};
+use comic_replay::{Batch, Batcher, Ledger, Outcome, Phase, Reason, Snapshot, TaskBooks};
+use common::{Actor, CONFIG, PHASE, TASKS, batch_now, insert_now, layout, with_tasks};
 use proptest::prelude::*;
 
 const ACTORS: u64 = 3;
@@ -58,7 +58,14 @@ struct Known {
     /// Next sequence number of each incarnation, as the learner should see it.
     cursors: HashMap<u64, u64>,
     trained: HashSet<(u64, u64)>,
+    /// Unrolls of each task, and of none, that the batcher took or dropped.
+    decided: [u64; TASKS.len() + 1],
     refused: u64,
+}
+
+/// The task of an actor's unroll.
+fn task_of(sequence: u64) -> usize {
+    (sequence as usize / TASKS[0].1).min(TASKS.len())
 }
 
 struct World {
@@ -75,7 +82,7 @@ struct World {
 
 impl World {
     fn new() -> Self {
-        let batcher = Batcher::new(layout(), CONFIG, PHASE, Ledger::new());
+        let batcher = common::batcher();
         let actors = (0..ACTORS).map(|incarnation| Actor::join(&batcher, incarnation)).collect();
         Self {
             checkpoint: (batcher.snapshot(), Known::default()),
@@ -102,6 +109,7 @@ impl World {
             Some(Outcome::Taken | Outcome::Stale | Outcome::Superseded) => {
                 assert!(sequence >= *cursor);
                 *cursor = sequence + 1;
+                self.known.decided[task_of(sequence)] += 1;
             }
             Some(Outcome::Duplicate) => assert!(sequence < *cursor),
             Some(other) => panic!("{other:?}"),
@@ -127,7 +135,7 @@ impl World {
         self.taken.clear();
         self.known = known;
         self.phase.epoch += 1;
-        self.batcher = Batcher::new(layout(), CONFIG, self.phase, Ledger::restore(&snapshot).unwrap());
+        self.batcher = Batcher::new(layout(), CONFIG, self.phase, with_tasks(Ledger::restore(&snapshot).unwrap()));
         for actor in &mut self.actors {
             let joined = self.batcher.join(actor.incarnation, Some(actor.actor)).unwrap();
             actor.actor = joined.actor;
@@ -200,6 +208,27 @@ impl World {
         assert_eq!(books.unattributed, self.known.refused);
         assert!(books.in_flight <= 3 * CONFIG.unrolls as u64);
         assert_eq!(self.batcher.snapshot().books, books);
+        self.check_tasks();
+    }
+}
+
+impl World {
+    fn check_tasks(&self) {
+        let books = self.batcher.books_by_task();
+        assert_eq!(books.all, self.batcher.books());
+        assert_eq!(books.tasks, self.batcher.snapshot().tasks);
+        for (index, (task, _)) in TASKS.iter().enumerate() {
+            let own = books.tasks[*task];
+            assert!(own.balance(), "{task}: {own:?}");
+            assert_eq!(own.produced, self.known.decided[index], "{task}");
+            let trained = self.known.trained.iter().filter(|(_, sequence)| task_of(*sequence) == index);
+            assert_eq!(own.trained, trained.count() as u64, "{task}");
+        }
+        let sum = |part: fn(&TaskBooks) -> u64| books.tasks.values().map(part).sum::<u64>();
+        let nobodys = self.known.trained.iter().filter(|(_, sequence)| task_of(*sequence) == TASKS.len()).count();
+        assert_eq!(sum(|books| books.trained) + nobodys as u64, books.all.trained, "together they are all");
+        assert!(sum(|books| books.in_flight) <= books.all.in_flight);
+        assert!(sum(|books| books.dropped.total()) <= books.all.dropped.total());
     }
 }
 

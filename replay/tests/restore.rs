@@ -4,14 +4,14 @@
 
 mod common;
 
-use comic_replay::{Batcher, Books, Dropped, Error, Ledger, Outcome, Phase, Snapshot};
-use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, layout};
+use comic_replay::{Batcher, Books, Dropped, Error, Ledger, Outcome, Phase, Snapshot, TaskBooks};
+use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, layout, with_tasks};
 
 /// The next life of the learner, from what a checkpoint file would hold.
 fn restarted(snapshot: &Snapshot) -> Batcher {
     let stored = serde_json::to_string(snapshot).unwrap();
     let ledger = Ledger::restore(&serde_json::from_str(&stored).unwrap()).unwrap();
-    Batcher::new(layout(), CONFIG, Phase { epoch: PHASE.epoch + 1, ..PHASE }, ledger)
+    Batcher::new(layout(), CONFIG, Phase { epoch: PHASE.epoch + 1, ..PHASE }, with_tasks(ledger))
 }
 
 #[test]
@@ -34,6 +34,38 @@ fn what_was_in_flight_at_the_checkpoint_is_lost_and_never_trained_on_later() {
 }
 
 #[test]
+fn every_task_goes_on_with_its_own_books_and_a_new_one_begins_with_none() {
+    let before = batcher();
+    let actor = Actor::join(&before, 5);
+    for sequence in 7..12 {
+        assert_eq!(actor.send(&before, sequence), Some(Outcome::Taken));
+    }
+    before.trained(batch_now(&before).unwrap());
+    let stored = serde_json::to_string(&before.snapshot()).unwrap();
+
+    let ledger = Ledger::restore(&serde_json::from_str(&stored).unwrap()).unwrap();
+    let tasks = [("ball-catch", 1), ("get-up", 10)].map(|(name, clips)| (name.to_string(), clips));
+    let away = Batcher::new(layout(), CONFIG, PHASE, ledger.with_tasks(tasks));
+    let after = away.books_by_task().tasks;
+    let lost = Dropped { lost_at_restart: 2, ..Dropped::default() };
+    assert_eq!(after["get-up"], TaskBooks { produced: 2, dropped: lost, ..TaskBooks::default() });
+    assert_eq!(after["ball-catch"], TaskBooks::default());
+    assert_eq!(after.len(), 2);
+    // A task that one life does not have is known to the next one.
+    let back = with_tasks(Ledger::restore(&away.snapshot()).unwrap());
+    let tracking = Batcher::new(layout(), CONFIG, PHASE, back).books_by_task().tasks["tracking"];
+    assert_eq!(tracking, TaskBooks { produced: 3, trained: 3, ..TaskBooks::default() });
+}
+
+#[test]
+fn a_snapshot_from_before_tasks_had_books_is_restored_without_them() {
+    let before = batcher();
+    let mut stored = serde_json::to_value(before.snapshot()).unwrap();
+    stored.as_object_mut().unwrap().remove("tasks");
+    assert!(Ledger::restore(&serde_json::from_value(stored).unwrap()).is_ok());
+}
+
+#[test]
 fn an_actor_that_reconnects_finds_its_account_and_the_learner_counts_what_it_missed() {
     let before = batcher();
     let actor = Actor::join(&before, 5);
@@ -46,7 +78,9 @@ fn an_actor_that_reconnects_finds_its_account_and_the_learner_counts_what_it_mis
     let after = restarted(&snapshot);
     let joined = after.join(5, Some(actor.actor)).unwrap();
     assert_eq!((joined.actor, joined.next_sequence), (actor.actor, 1));
+    let of_tasks = after.books_by_task().tasks;
     assert_eq!(actor.send(&after, 3), Some(Outcome::Superseded), "resent, but made in the life before");
+    assert_eq!(after.books_by_task().tasks, of_tasks, "what that life called a clip is no task's here");
     let mut fresh = actor.header(4);
     fresh.learner_epoch = PHASE.epoch + 1;
     assert_eq!(insert_now(&after, &fresh), Some(Outcome::Taken));
@@ -85,4 +119,16 @@ fn a_snapshot_that_contradicts_itself_is_refused() {
     let repeated = |snapshot: &mut Snapshot| snapshot.accounts.push(snapshot.accounts[0]);
     assert_eq!(refusal(repeated), Some(Error::Account { actor: 0 }));
     assert_eq!(refusal(|snapshot| snapshot.next_actor = 0), Some(Error::Account { actor: 0 }));
+    let unbalanced = |snapshot: &mut Snapshot| snapshot.tasks.get_mut("tracking").unwrap().trained += 1;
+    assert!(matches!(refusal(unbalanced), Some(Error::UnbalancedTask { .. })));
+    let too_many = |snapshot: &mut Snapshot| {
+        let own = TaskBooks { produced: 1, trained: 1, ..TaskBooks::default() };
+        snapshot.tasks.insert("get-up".into(), own);
+    };
+    assert!(matches!(refusal(too_many), Some(Error::UnbalancedTask { .. })), "more than all tasks have");
+    let trained = |snapshot: &mut Snapshot| {
+        let own = snapshot.tasks.get_mut("tracking").unwrap();
+        (own.trained, own.in_flight) = (own.in_flight, 0);
+    };
+    assert!(matches!(refusal(trained), Some(Error::UnbalancedTask { .. })), "one was trained on, and none of all");
 }

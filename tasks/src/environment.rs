@@ -12,7 +12,7 @@ use crate::observation::{ALL, Body, Observation, View};
 use crate::physics::{Data, Simulation, is_healthy};
 use crate::reference::Reference;
 use crate::tracking::TrackingTask;
-use crate::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Scenery, Simulated, Step, control, reward};
+use crate::{Environment, Episode, Outcome, Scenery, Simulated, Step, control, reward};
 
 /// An environment of a [`TrackingTask`]. Owns its simulation state and its random numbers, shares all else.
 #[derive(Debug)]
@@ -74,7 +74,7 @@ impl TrackingEnvironment {
 
     fn diverge(&mut self) -> Step {
         self.diverged = true;
-        Step { reward_terms: [0.0; MAX_REWARD_TERMS], discount: 0.0, outcome: Outcome::Diverged }
+        Step::DIVERGED
     }
 
     fn reference(&self) -> &Reference {
@@ -178,7 +178,8 @@ impl Simulated for TrackingEnvironment {
         } else {
             Outcome::Running
         };
-        Step { reward_terms, discount: if outcome == Outcome::Terminated { 0.0 } else { 1.0 }, outcome }
+        let discount = if outcome == Outcome::Terminated { 0.0 } else { 1.0 };
+        Step { reward_terms, discount, outcome, head_height: task.walker.head_height(data) }
     }
 
     fn model(&self) -> Arc<MjModel> {

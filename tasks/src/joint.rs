@@ -171,6 +171,7 @@ impl Simulated for JointEnvironment {
 mod tests {
     use comic_clips::Catalogue;
     use comic_experiment::{Experiment, resolve};
+    use mujoco_rs::prelude::MjtObjBase;
 
     use super::*;
     use crate::Outcome;
@@ -200,6 +201,24 @@ mod tests {
                 (f64::from(draws) * probability, (f64::from(draws) * probability * (1.0 - probability)).sqrt());
             assert!((count - expected).abs() < 5.0 * deviation, "{counts:?}");
         }
+    }
+
+    #[test]
+    fn every_step_tells_where_the_head_is() {
+        let task = build(&experiment(BOTH));
+        let mut environment = task.environment(3).unwrap();
+        for clip in 0..3 {
+            environment.reset_to(clip, 10).unwrap();
+            let step = environment.step_control(&[0.0; 56]);
+            let head = environment.model().name_to_id(MjtObjBase::mjOBJ_BODY, "walker/head").unwrap();
+            assert_eq!(step.head_height, environment.simulation().xpos()[head][2], "clip {clip}");
+            assert!((0.1..2.0).contains(&step.head_height), "{}", step.head_height);
+        }
+        // What get-up pays is a function of it (supplement): target height 1.808 m.
+        environment.reset_to(1, 10).unwrap();
+        let step = environment.step_control(&[0.0; 56]);
+        assert!((step.reward() - (-(step.head_height - 1.808).powi(2)).exp()).abs() < 1e-12, "{step:?}");
+        assert_eq!(environment.step_control(&[f64::NAN; 56]).head_height, 0.0);
     }
 
     #[test]

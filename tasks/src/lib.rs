@@ -257,9 +257,15 @@ pub struct Step {
     pub discount: f64,
     /// Whether and how the episode ended.
     pub outcome: Outcome,
+    /// Height of the head above the floor's plane, m; 0 where the simulation diverged. For people to see: no learner needs it.
+    pub head_height: f64,
 }
 
 impl Step {
+    /// What a simulation gives that has diverged.
+    pub(crate) const DIVERGED: Self =
+        Self { reward_terms: [0.0; MAX_REWARD_TERMS], discount: 0.0, outcome: Outcome::Diverged, head_height: 0.0 };
+
     /// The reward: the sum of its terms.
     pub fn reward(&self) -> f64 {
         self.reward_terms.iter().sum()

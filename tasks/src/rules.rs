@@ -166,7 +166,7 @@ impl<R: Rules> RuledEnvironment<R> {
 
     fn diverge(&mut self) -> Step {
         self.diverged = true;
-        Step { reward_terms: [0.0; MAX_REWARD_TERMS], discount: 0.0, outcome: Outcome::Diverged }
+        Step::DIVERGED
     }
 }
 
@@ -243,7 +243,8 @@ impl<R: Rules> Simulated for RuledEnvironment<R> {
         } else {
             Outcome::Running
         };
-        Step { reward_terms, discount: if failed { 0.0 } else { 1.0 }, outcome }
+        let discount = if failed { 0.0 } else { 1.0 };
+        Step { reward_terms, discount, outcome, head_height: self.stage.head_height() }
     }
 
     fn model(&self) -> Arc<MjModel> {

@@ -150,9 +150,8 @@ impl Stage {
         (&self.data.xpos()[root], &self.data.xmat()[root])
     }
 
-    /// Height of the head, m (`head_height` of `walkers/legacy_base.py`).
+    /// Height of the head, m.
     pub(crate) fn head_height(&self) -> f64 {
-        let [.., head] = self.arena.walker.appendages;
-        self.data.xpos()[head][2]
+        self.arena.walker.head_height(&self.data)
     }
 }

@@ -7,6 +7,7 @@ use mujoco_rs::prelude::*;
 
 use crate::error::Error;
 use crate::humanoid::{END_EFFECTORS, PREFIX};
+use crate::physics::Simulation;
 
 /// Number of coordinates of the root before the joints: position and quaternion.
 pub(crate) const ROOT_COORDINATES: usize = 7;
@@ -62,6 +63,12 @@ impl Walker {
         };
         walker.check(model)?;
         Ok(walker)
+    }
+
+    /// Height of the head, m (`head_height` of `walkers/legacy_base.py`).
+    pub(crate) fn head_height(&self, data: &Simulation) -> f64 {
+        let [.., head] = self.appendages;
+        data.xpos()[head][2]
     }
 
     /// The order of joints and servos is a constant of this workspace; here the compiled model confirms it.

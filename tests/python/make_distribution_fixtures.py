@@ -15,10 +15,11 @@ same numbers. Inputs are float32, everything else float64 on them. With N rows, 
                             weights
     grad_logits, grad_mean, grad_std
                             of the sum of all four of log_prob, kl_weights, kl_mean and kl_std
-`product_*.npz`:
-    logits [N, K], mean, std [N, K, A], action [N, A]; the exponents are sigmoid(logits)
+`product_*.npz`; old = behaviour:
+    logits, old_logits [N, K], mean, std, old_mean, old_std [N, K, A], action [N, A]; the exponents are sigmoid(logits)
     product_mean, product_std [N, A], log_prob [N] of action
-    grad_logits, grad_mean, grad_std   of the sum of log_prob
+    kl_mean, kl_std [N]     KL of the old product to one with the new mean, or the new standard deviation
+    grad_logits, grad_mean, grad_std   of the sum of all three of log_prob, kl_mean and kl_std
 
 The product is normalised on a grid here: the density of its Gaussian is compared with the product of the densities,
 each to its exponent, before anything is written.
@@ -105,16 +106,32 @@ def product(random, _, rows, count, actions, scale):
         "std": std,
         "action": random.normal(0.0, 0.5, (rows, actions)),
     }
+    inputs |= {
+        "old_logits": inputs["logits"] + 0.3 * random.normal(0.0, 1.0, (rows, count)),
+        "old_mean": mean + 0.3 * std * random.normal(0.0, 1.0, mean.shape),
+        "old_std": std * np.exp(0.2 * random.normal(0.0, 1.0, std.shape)),
+    }
     inputs = {key: np.asarray(value, np.float32) for key, value in inputs.items()}
     x = {key: learnt(value) for key, value in inputs.items()}
-    exponents = torch.sigmoid(x["logits"]).unsqueeze(-1)
-    precision = (exponents / x["std"] ** 2).sum(1)
-    composed_mean = (exponents * x["mean"] / x["std"] ** 2).sum(1) / precision
-    composed_std = precision**-0.5
+    exponents, composed_mean, composed_std = composed(x["logits"], x["mean"], x["std"])
     check_on_a_grid(x, exponents, composed_mean, composed_std)
-    log_prob = diagonal(composed_mean, composed_std).log_prob(x["action"])
-    gradients = torch.autograd.grad(log_prob.sum(), [x[k] for k in LEARNT])
-    return inputs, {"product_mean": composed_mean, "product_std": composed_std, "log_prob": log_prob}, gradients
+    _, *old = composed(x["old_logits"], x["old_mean"], x["old_std"])
+    old_mean, old_std = (value.detach() for value in old)
+    before = diagonal(old_mean, old_std)
+    outputs = {
+        "log_prob": diagonal(composed_mean, composed_std).log_prob(x["action"]),
+        "kl_mean": distributions.kl_divergence(before, diagonal(composed_mean, old_std)),
+        "kl_std": distributions.kl_divergence(before, diagonal(old_mean, composed_std)),
+    }
+    gradients = torch.autograd.grad(sum(value.sum() for value in outputs.values()), [x[k] for k in LEARNT])
+    return inputs, outputs | {"product_mean": composed_mean, "product_std": composed_std}, gradients
+
+
+def composed(logits, mean, std):
+    """Exponents, mean and standard deviation of the Gaussians' product."""
+    exponents = torch.sigmoid(logits).unsqueeze(-1)
+    precision = (exponents / std**2).sum(1)
+    return exponents, (exponents * mean / std**2).sum(1) / precision, precision**-0.5
 
 
 def check_on_a_grid(x, exponents, mean, std):

@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail, ensure};
 use serde_json::Value;
 
 use crate::repository::root;
-use crate::system::SMALL;
+use crate::system::{SMALL, balance_of_json};
 
 /// How often a condition is looked at again: each look starts a process in a container.
 const POLL: Duration = Duration::from_millis(500);
@@ -115,7 +115,7 @@ impl Project {
         while begin.elapsed() < limit {
             match self.status() {
                 Ok(status) => {
-                    ensure!(balance(&status["books"]), "{what}: the books do not balance: {}", status["books"]);
+                    ensure!(balance_of_json(&status["books"]), "{what}: the books do not balance: {}", status["books"]);
                     if condition(&status) {
                         println!("{what}: after {:.1} s, books {}", begin.elapsed().as_secs_f64(), status["books"]);
                         return Ok(status);
@@ -207,14 +207,6 @@ impl Container {
         }
         Ok(())
     }
-}
-
-/// produced = trained + dropped by reason + in flight.
-fn balance(books: &Value) -> bool {
-    let of = |value: &Value| value.as_u64();
-    let dropped = books["dropped"].as_object().map(|reasons| reasons.values().filter_map(of).sum::<u64>());
-    let parts = [of(&books["trained"]), dropped, of(&books["in_flight"])];
-    of(&books["produced"]) == parts.into_iter().sum::<Option<u64>>()
 }
 
 /// Compose, v2 or v1.

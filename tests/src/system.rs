@@ -334,6 +334,14 @@ fn flags(access: &Access) -> Vec<OsString> {
     given.flat_map(|(flag, path)| [flag.into(), path.into()]).collect()
 }
 
+/// [`balance`] of books as metrics and `comic-learner status --json` write them.
+pub fn balance_of_json(books: &Value) -> bool {
+    let of = |value: &Value| value.as_u64();
+    let dropped = books["dropped"].as_object().map(|reasons| reasons.values().filter_map(of).sum::<u64>());
+    let parts = [of(&books["trained"]), dropped, of(&books["in_flight"])];
+    of(&books["produced"]).is_some_and(|produced| Some(produced) == parts.into_iter().sum::<Option<u64>>())
+}
+
 /// produced = trained + dropped by reason + in flight.
 pub fn balance(books: &Books) -> bool {
     let Books { produced, trained, in_flight, .. } = *books;

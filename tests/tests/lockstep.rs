@@ -14,6 +14,12 @@ use comic_tests::system::{SMALL, System};
 /// Environments in all: one for each unroll of a batch.
 const ALL: u32 = 8;
 const UPDATES: u64 = 6;
+const MEMORY_AND_TWO_TASKS: [&str; 4] = [
+    "network.low_level=lstm",
+    "network.lstm.units=[12, 8]",
+    r#"joint=[{task="get-up", probability=0.3}]"#,
+    "get_up.lying_share=0",
+];
 
 /// A run in lockstep with a warm start, a normaliser that is set twice, and updates that publish nothing new.
 fn lockstep(overrides: &[&str]) -> Result<System> {
@@ -73,10 +79,8 @@ async fn one_actor_or_two_learn_the_same_and_another_seed_something_else() -> Re
 
 #[tokio::test]
 async fn with_a_memory_and_two_tasks_too() -> Result<()> {
-    let joint = r#"joint=[{task="get-up", probability=0.3}]"#;
-    let overrides = ["network.low_level=lstm", "network.lstm.units=[12, 8]", joint, "get_up.lying_share=0"];
-    let one = learnt_by(&[ALL], &overrides).await?;
-    ensure!(one == learnt_by(&[5, 3], &overrides).await?, "two actors learnt something else than one");
+    let one = learnt_by(&[ALL], &MEMORY_AND_TWO_TASKS).await?;
+    ensure!(one == learnt_by(&[5, 3], &MEMORY_AND_TWO_TASKS).await?, "two actors learnt something else than one");
     Ok(())
 }
 
@@ -99,8 +103,18 @@ async fn a_paused_actor_and_broken_connections_change_nothing() -> Result<()> {
 
 #[tokio::test]
 async fn a_resumed_run_hangs_on_where_it_was_interrupted_and_on_nothing_else() -> Result<()> {
+    resumes_alike(&[]).await
+}
+
+#[tokio::test]
+async fn so_does_one_with_a_memory_and_two_tasks() -> Result<()> {
+    resumes_alike(&MEMORY_AND_TWO_TASKS).await
+}
+
+/// Interrupts a run, and lets other actors go on with it.
+async fn resumes_alike(overrides: &[&str]) -> Result<()> {
     let interrupted = async |before: &[u32], after: &[u32]| {
-        let mut system = lockstep(&["budget.updates=3"])?;
+        let mut system = lockstep(&[&["budget.updates=3"], overrides].concat())?;
         train(&mut system, before).await?;
         system.set(&format!("budget.updates={UPDATES}"));
         train(&mut system, after).await?;

@@ -7,7 +7,7 @@ use comic_proto::v1::Status;
 use comic_tests::steps::{
     LIMIT, kill_and_restart_the_learner, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on,
 };
-use comic_tests::system::{SMALL, System};
+use comic_tests::system::{SMALL, System, balance_of_json};
 
 async fn two_actors_learn(overrides: &[&str], check: fn(&Status) -> Option<()>) -> Result<()> {
     let arguments = overrides.iter().flat_map(|field| ["--set", *field]);
@@ -26,6 +26,7 @@ async fn two_actors_learn(overrides: &[&str], check: fn(&Status) -> Option<()>) 
         actor.until_log_holds(&format!("learner_epoch={}", resumed.learner_epoch), LIMIT).await?;
     }
     trains_on(&mut system, "training goes on after the restart").await?;
+    system.until("the metrics say so again", LIMIT, check).await?;
     for actor in actors {
         leaves(actor).await?;
     }
@@ -59,7 +60,14 @@ async fn with_two_tasks() -> Result<()> {
         let both = ["tracking", "get-up"];
         let trained = both.iter().all(|task| of(task, "environment_steps") > 0.0 && of(task, "unrolls") > 0.0);
         let padded = both.iter().any(|task| of(task, "padding_share") > 0.0);
-        (trained && padded).then_some(())
+        let ended = both.iter().all(|task| of(task, "head_height") > 0.0);
+        for task in both {
+            let (own, all) = (&metrics["tasks"][task]["books"], &metrics["books"]);
+            assert!(balance_of_json(own), "{task}: {own}");
+            let trained = own["trained"].as_u64().unwrap();
+            assert!(Some(trained) <= all["trained"].as_u64(), "{task}: {own} of {all}");
+        }
+        (trained && padded && ended).then_some(())
     })
     .await
 }

@@ -33,6 +33,7 @@ With --json one object goes to standard output:
     normalised_reward  mean of return / (most a step pays x steps left at the episode's start)
     reward_per_step    reward per survived step / most a step pays, 1.45 in tracking
     fraction_survived  mean of steps / steps left in the clip at the episode's start
+    head_height        mean over all steps of the head's height, m; 0 in a step that diverged
     reward_terms       each reward term's mean per step, by name
   tasks          in joint training the same for each task, over the episodes of all its clips
   overall        the same over all episodes; its clip is \"overall\"";

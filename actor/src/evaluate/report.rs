@@ -21,6 +21,8 @@ pub struct Finished {
     pub rewards: Vec<f64>,
     /// Sums of the reward terms.
     pub returns: [f64; MAX_REWARD_TERMS],
+    /// Sum of the head's heights after each step, m.
+    pub head_heights: f64,
     /// The simulation diverged.
     pub diverged: bool,
 }
@@ -69,6 +71,8 @@ pub struct ClipReport {
     pub reward_per_step: f64,
     /// Mean of steps / steps left in the clip at the start.
     pub fraction_survived: f64,
+    /// Mean over all steps of the head's height, m; 0 in a step that diverged.
+    pub head_height: f64,
     /// Mean over all steps of each reward term.
     pub reward_terms: BTreeMap<String, f64>,
 }
@@ -114,6 +118,7 @@ impl ClipReport {
             normalised_reward: mean(&|episode| ratio(total(episode), most(episode) * episode.steps_left as f64)),
             reward_per_step: per_step(&|episode| ratio(total(episode), most(episode))),
             fraction_survived: mean(&|episode| ratio(episode.steps() as f64, episode.steps_left as f64)),
+            head_height: per_step(&|episode| episode.head_heights),
             reward_terms: spec
                 .reward_terms
                 .iter()
@@ -154,7 +159,9 @@ mod tests {
     fn episode(clip: usize, steps_left: usize, steps: usize, pose: f64, velocity: f64) -> Finished {
         let mut returns = [0.0; MAX_REWARD_TERMS];
         returns[..2].copy_from_slice(&[pose, velocity]);
-        Finished { clip, start: 0, steps_left, rewards: vec![0.0; steps], returns, diverged: false }
+        // 1 m in a short episode and 2 m in a long one.
+        let head_heights = if steps < 10 { 1.0 } else { 2.0 } * steps as f64;
+        Finished { clip, start: 0, steps_left, rewards: vec![0.0; steps], returns, head_heights, diverged: false }
     }
 
     #[test]
@@ -172,6 +179,8 @@ mod tests {
         close(walk.reward_per_step, 23.0 / 25.0);
         close(walk.fraction_survived, 0.75);
         close(walk.length_mean, 12.5);
+        // (5 × 1 m + 20 × 2 m) / 25: over steps, not episodes.
+        close(walk.head_height, 1.8);
         close(walk.reward_terms["pose"], (2.9 + 14.5) / 25.0);
         close(walk.reward_terms["velocity"], (1.45 + 14.5) / 25.0);
 

@@ -160,6 +160,7 @@ impl<E: Environment> Lane<E> {
             steps_left,
             rewards: Vec::new(),
             returns: [0.0; MAX_REWARD_TERMS],
+            head_heights: 0.0,
             diverged: false,
         });
         audience.watch(number, &mut self.environment)
@@ -187,6 +188,7 @@ impl<E: Environment> Lane<E> {
         for (sum, term) in episode.returns.iter_mut().zip(&step.reward_terms) {
             *sum += term;
         }
+        episode.head_heights += step.head_height;
         episode.diverged = step.outcome == Outcome::Diverged;
         row.previous_latent.copy_from_slice(row.latent);
         self.environment.observe(row.proprioception, row.task);
@@ -222,7 +224,7 @@ mod tests {
                 (_, 10) => (1.0, Outcome::Truncated),
                 _ => (1.0, Outcome::Running),
             };
-            Step { reward_terms, discount, outcome }
+            Step { reward_terms, discount, outcome, head_height: 1.5 }
         }
         fn observe(&self, proprioception: &mut [f32], _task: &mut [f32]) {
             proprioception[0] = self.step as f32;

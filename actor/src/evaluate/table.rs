@@ -4,7 +4,7 @@ use std::fmt;
 
 use super::{ClipReport, Report};
 
-const FIXED: [&str; 6] = ["episodes", "return", "normalised", "per step", "survived", "length"];
+const FIXED: [&str; 7] = ["episodes", "return", "normalised", "per step", "survived", "length", "head"];
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -46,6 +46,7 @@ fn row(clip: &ClipReport) -> Vec<String> {
         format!("{:.3}", clip.reward_per_step),
         format!("{:.3}", clip.fraction_survived),
         format!("{:.1}", clip.length_mean),
+        format!("{:.2} m", clip.head_height),
     ];
     cells.extend(clip.reward_terms.values().map(|value| format!("{value:.3}")));
     cells

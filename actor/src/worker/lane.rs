@@ -28,6 +28,8 @@ pub(super) struct Lane<E> {
     /// Steps and sums of the reward terms since the episode began.
     steps: u32,
     returns: [f64; MAX_REWARD_TERMS],
+    /// Sum of the head's heights, m.
+    head_heights: f64,
     /// Episodes that ended in the current unroll.
     finished: Vec<EpisodeStatistics>,
     /// Scratch: the action that the simulator sees.
@@ -56,6 +58,7 @@ impl<E: Environment> Lane<E> {
             task: episode.task,
             steps: 0,
             returns: [0.0; MAX_REWARD_TERMS],
+            head_heights: 0.0,
             finished: Vec::new(),
             clipped: vec![0.0; layout.shape().action],
         };
@@ -121,6 +124,7 @@ impl<E: Environment> Lane<E> {
         for (sum, term) in self.returns.iter_mut().zip(&step.reward_terms) {
             *sum += term;
         }
+        self.head_heights += step.head_height;
         row.previous_latent.copy_from_slice(row.latent);
         self.observe(row);
         self.end(step.outcome);
@@ -144,6 +148,7 @@ impl<E: Environment> Lane<E> {
         self.ended = false;
         self.steps = 0;
         self.returns = [0.0; MAX_REWARD_TERMS];
+        self.head_heights = 0.0;
         row.forget();
         self.observe(row);
     }
@@ -192,6 +197,7 @@ impl<E: Environment> Lane<E> {
             steps_left_at_start: self.episode.steps_left as u32,
             returns: self.returns.iter().take(terms).map(|sum| *sum as f32).collect(),
             end: end.into(),
+            head_height: Some((self.head_heights / f64::from(self.steps.max(1))) as f32),
         });
     }
 }

@@ -55,7 +55,7 @@ impl Environment for Counter {
             (true, 1) => (1.0, Outcome::Truncated),
             (true, _) => (0.0, Outcome::Diverged),
         };
-        Step { reward_terms, discount, outcome }
+        Step { reward_terms, discount, outcome, head_height: self.step as f64 }
     }
     fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
         proprioception.copy_from_slice(&[self.episodes as f32, self.step as f32]);

@@ -3,6 +3,7 @@
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, Result, bail};
+use comic_experiment::LowLevelName;
 use serde::{Deserialize, Serialize};
 
 use crate::{python, setup, workspace};
@@ -52,7 +53,9 @@ struct Figure {
 const ROUNDS: usize = 3;
 
 /// Low levels beside the MLP, which has figures for everything.
-const OTHERS: [&str; 3] = ["lstm", "mixture", "product"];
+fn others() -> impl Iterator<Item = &'static str> {
+    LowLevelName::ALL.into_iter().filter(|name| *name != LowLevelName::Mlp).map(LowLevelName::name)
+}
 
 /// Builds and measures.
 pub(crate) fn run(options: &Options) -> Result<()> {
@@ -64,8 +67,8 @@ pub(crate) fn run(options: &Options) -> Result<()> {
                 show(&figures(Command::new(workspace::program("comic-actor")?).arg("bench").args(arguments))?)
             };
             bench(&options.arguments)?;
-            let others = if options.arguments.is_empty() { &OTHERS[..] } else { &[] };
-            others.iter().try_for_each(|name| bench(&["policy", "--low-level", name].map(String::from)))
+            let mut others = others().filter(|_| options.arguments.is_empty());
+            others.try_for_each(|name| bench(&["policy", "--low-level", name].map(String::from)))
         }
         Side::Vision => {
             let mut bench = Command::new(workspace::program("comic-actor")?);
@@ -74,11 +77,11 @@ pub(crate) fn run(options: &Options) -> Result<()> {
         Side::Learner => {
             let arguments = &options.arguments;
             learner(options.threads, arguments)?;
-            if arguments.iter().any(|argument| argument.starts_with("--low-level") || argument == "--joint") {
+            if chooses(arguments) {
                 return Ok(());
             }
-            let others = OTHERS.map(|name| vec!["--low-level".to_owned(), name.to_owned()]);
-            let mut ways = others.into_iter().chain([vec!["--joint".to_owned()]]);
+            let others = others().map(|name| vec!["--low-level".to_owned(), name.to_owned()]);
+            let mut ways = others.chain([vec!["--joint".to_owned()]]);
             ways.try_for_each(|way| learner(options.threads, &[way, arguments.clone()].concat()))
         }
         Side::Ingest => load("ingest", &options.arguments),
@@ -95,10 +98,15 @@ fn load(figure: &str, arguments: &[String]) -> Result<()> {
     workspace::run(&mut load)
 }
 
+/// Whether these choose something else to measure than the MLP on one task.
+fn chooses(arguments: &[String]) -> bool {
+    arguments.iter().any(|argument| argument.starts_with("--low-level") || argument == "--joint")
+}
+
 /// Our update and the same update in Python PyTorch, by turns, so that a busy moment of the machine meets both.
 fn learner(threads: u16, arguments: &[String]) -> Result<()> {
     // The other script knows the MLP alone.
-    let compares = !arguments.iter().any(|argument| argument.starts_with("--low-level") || argument == "--joint");
+    let compares = !chooses(arguments);
     let mut ours = Vec::new();
     let mut theirs = Vec::new();
     for _ in 0..ROUNDS {

@@ -55,9 +55,9 @@ enum Command {
         /// behind it draws one task of joint training
         #[arg(required = true)]
         metrics: Vec<String>,
-        /// What the curves show
-        #[arg(long = "y", value_enum, default_value = "episode-return")]
-        quantity: plot::Quantity,
+        /// What the curves show; several, with commas between them, are drawn one below the other
+        #[arg(long = "y", value_enum, value_delimiter = ',', default_value = "episode-return")]
+        quantities: Vec<plot::Quantity>,
         /// The picture
         #[arg(long, default_value = "curves.svg")]
         out: PathBuf,
@@ -75,7 +75,7 @@ fn main() -> ExitCode {
         Command::Train(options) => train::run(options),
         Command::Sweep(options) => sweep::run(options),
         Command::Bench(options) => bench::run(&options),
-        Command::Plot { metrics, quantity, out } => plot::run(&metrics, quantity, &out),
+        Command::Plot { metrics, quantities, out } => plot::run(&metrics, &quantities, &out),
         Command::Fixtures(options) => python::fixtures(&options),
     };
     match result {

@@ -25,6 +25,8 @@ pub(crate) enum Quantity {
     NormalisedReward,
     /// Reward per survived step / the most a step pays.
     RewardPerStep,
+    /// Mean height of the head, m.
+    HeadHeight,
 }
 
 impl Quantity {
@@ -33,6 +35,7 @@ impl Quantity {
             Self::EpisodeReturn => line.episode_return,
             Self::NormalisedReward => line.normalised_reward,
             Self::RewardPerStep => line.reward_per_step,
+            Self::HeadHeight => line.head_height,
         }
     }
 
@@ -41,6 +44,7 @@ impl Quantity {
             Self::EpisodeReturn => "episode return (with noise)",
             Self::NormalisedReward => "normalised reward (with noise)",
             Self::RewardPerStep => "reward per step (with noise)",
+            Self::HeadHeight => "height of the head, m (with noise)",
         }
     }
 }
@@ -88,15 +92,21 @@ struct Point {
 }
 
 /// `cargo xtask plot`.
-pub(crate) fn run(metrics: &[String], quantity: Quantity, out: &Path) -> Result<()> {
+pub(crate) fn run(metrics: &[String], quantities: &[Quantity], out: &Path) -> Result<()> {
     let sources: Vec<Source> = metrics.iter().map(|argument| Source::parse(argument)).collect();
-    draw_runs(&sources, quantity, out)?;
+    draw_runs(&sources, quantities, out)?;
     eprintln!("drew {}", out.display());
     Ok(())
 }
 
-/// Draws a curve for each run, over wall-clock time and over environment steps.
-pub(crate) fn draw_runs(sources: &[Source], quantity: Quantity, out: &Path) -> Result<()> {
+/// Draws a curve for each run, over wall-clock time and over environment steps; a row for each quantity.
+pub(crate) fn draw_runs(sources: &[Source], quantities: &[Quantity], out: &Path) -> Result<()> {
+    let rows = quantities.iter().map(|quantity| Ok((*quantity, over_both(sources, *quantity)?)));
+    draw(&rows.collect::<Result<Vec<_>>>()?, out)
+}
+
+/// The curves of one quantity over wall-clock time, and over environment steps.
+fn over_both(sources: &[Source], quantity: Quantity) -> Result<Vec<Panel>> {
     let curves = sources
         .iter()
         .map(|source| read(&source.path, source.task.as_deref(), quantity))
@@ -106,11 +116,10 @@ pub(crate) fn draw_runs(sources: &[Source], quantity: Quantity, out: &Path) -> R
         let named = sources.iter().zip(&curves);
         named.map(|(source, points)| Series::line(source.label.clone(), line(points))).collect()
     };
-    let panels = [
+    Ok(vec![
         ("minutes of wall clock", series(|point| point.minutes)),
         ("million environment steps", series(|point| point.steps)),
-    ];
-    draw(&panels, quantity, out)
+    ])
 }
 
 /// Draws each group of runs as their mean over environment steps, with a band from the least to the most of them.
@@ -119,7 +128,7 @@ pub(crate) fn draw_groups(groups: &[(String, Vec<PathBuf>)], quantity: Quantity,
         let curves = runs.iter().map(|path| read(path, None, quantity)).collect::<Result<Vec<_>>>()?;
         Ok(pool(label.clone(), &curves))
     });
-    draw(&[("million environment steps", series.collect::<Result<Vec<_>>>()?)], quantity, out)
+    draw(&[(quantity, vec![("million environment steps", series.collect::<Result<Vec<_>>>()?)])], out)
 }
 
 fn read(path: &Path, task: Option<&str>, quantity: Quantity) -> Result<Vec<Point>> {
@@ -138,7 +147,7 @@ fn read(path: &Path, task: Option<&str>, quantity: Quantity) -> Result<Vec<Point
     }
     if points.is_empty() {
         let of_task = task.map_or_else(String::new, |task| format!(" of {task}"));
-        bail!("{} holds no finished episode{of_task} yet", path.display());
+        bail!("{} holds no finished episode{of_task} yet, or none that tells the {}", path.display(), quantity.label());
     }
     Ok(smooth(&points))
 }
@@ -153,13 +162,18 @@ fn smooth(points: &[Point]) -> Vec<Point> {
     smoothed.collect()
 }
 
-/// Panels side by side, each with what is written along its x axis.
-fn draw(panels: &[(&str, Vec<Series>)], quantity: Quantity, out: &Path) -> Result<()> {
-    let root = SVGBackend::new(out, (1000, 400)).into_drawing_area();
+/// What is written along the x axis, and what is drawn over it.
+type Panel = (&'static str, Vec<Series>);
+
+/// A row of panels, side by side, for each quantity.
+fn draw(rows: &[(Quantity, Vec<Panel>)], out: &Path) -> Result<()> {
+    let root = SVGBackend::new(out, (1000, 400 * rows.len() as u32)).into_drawing_area();
     let drawn = || -> Result<()> {
         root.fill(&WHITE).map_err(|error| anyhow!("{error}"))?;
-        for (area, (x_label, series)) in root.split_evenly((1, panels.len())).iter().zip(panels) {
-            panel(area, series, x_label, quantity.label())?;
+        for (row, (quantity, panels)) in root.split_evenly((rows.len(), 1)).iter().zip(rows) {
+            for (area, (x_label, series)) in row.split_evenly((1, panels.len())).iter().zip(panels) {
+                panel(area, series, x_label, quantity.label())?;
+            }
         }
         root.present().map_err(|error| anyhow!("{error}"))
     };
@@ -189,11 +203,26 @@ mod tests {
         std::fs::write(&baseline, "{\"seconds\": 30, \"env_steps\": 8030, \"episode_return\": 1.0}\n").unwrap();
         let out = directory.path().join("curve.svg");
         let arguments = [run.display().to_string(), format!("PPO={}", baseline.display())];
-        super::run(&arguments, Quantity::EpisodeReturn, &out).unwrap();
+        super::run(&arguments, &[Quantity::EpisodeReturn], &out).unwrap();
         let picture = std::fs::read_to_string(out).unwrap();
         for text in ["walk-1", "PPO", "minutes of wall clock", "million environment steps"] {
             assert!(picture.contains(text), "{text} is missing");
         }
+    }
+
+    #[test]
+    fn every_quantity_is_a_row_of_its_own_and_one_that_nobody_told_is_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let (path, out) = (directory.path().join("metrics.jsonl"), directory.path().join("curve.svg"));
+        std::fs::write(&path, "{\"environment_steps\":1000000,\"episode_return\":9.0,\"head_height\":1.2}\n").unwrap();
+        let arguments = [path.display().to_string()];
+        super::run(&arguments, &[Quantity::EpisodeReturn, Quantity::HeadHeight], &out).unwrap();
+        let picture = std::fs::read_to_string(&out).unwrap();
+        for text in ["episode return (with noise)", "height of the head, m (with noise)"] {
+            assert_eq!(picture.matches(text).count(), 2, "{text}: over wall clock and over steps");
+        }
+        let error = super::run(&arguments, &[Quantity::NormalisedReward], &out).unwrap_err();
+        assert!(error.to_string().contains("normalised reward"), "{error}");
     }
 
     #[test]
@@ -231,7 +260,7 @@ mod tests {
         };
         assert_eq!(of("FILE").unwrap(), (1.0, 9.0));
         assert_eq!(of("up=FILE#get-up").unwrap(), (1.0, 2.0));
-        assert!(of("FILE#gaps").unwrap_err().to_string().ends_with("no finished episode of gaps yet"));
+        assert!(of("FILE#gaps").unwrap_err().to_string().contains("no finished episode of gaps yet"));
     }
 
     #[test]

@@ -41,7 +41,7 @@ impl Shared {
     pub fn metrics_page(&self) -> String {
         let Census { alive, slow, lost, waiting } = self.roster.census(Instant::now());
         self.telemetry.page(&Sample {
-            books: self.batcher.books(),
+            books: self.batcher.books_by_task(),
             capacity: self.capacity,
             waiting,
             actors: [("alive", alive), ("slow", slow), ("lost", lost)],

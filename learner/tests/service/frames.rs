@@ -7,8 +7,9 @@ use std::future::poll_fn;
 use std::time::Duration;
 
 use bytes::{Buf as _, Bytes};
-use comic_proto::frame;
 use comic_proto::v1::{UnrollAck, Verdict};
+use comic_proto::{Field, frame};
+use comic_replay::Next;
 use futures::stream;
 use http::Request;
 use http_body::Frame;
@@ -57,6 +58,9 @@ async fn unrolls_are_taken_whatever_frames_they_come_in() {
         let (acks, status) = send(&world, cut(&both, length.min(both.len()))).await;
         let found: Vec<_> = acks.iter().map(|ack| (ack.sequence, ack.verdict())).collect();
         assert_eq!((found, status), (vec![(0, Verdict::Taken), (1, Verdict::Taken)], Code::Ok), "frames of {length}");
+        let Next::Batch(batch) = world.batcher.next_batch_within(Duration::ZERO) else { panic!("two unrolls fill it") };
+        let rewards: Vec<f32> = [0u64, 1].map(|sequence| [sequence as f32; 8]).concat();
+        assert_eq!(batch.f32(Field::Reward), rewards, "frames of {length}");
     }
 }
 

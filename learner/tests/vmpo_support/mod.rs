@@ -3,9 +3,9 @@
 
 use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives, TaskPart, TaskSpec};
 use comic_learner::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
-use comic_networks::{Memory, Routing};
+use comic_networks::{Acting, Memory, Routing};
 use comic_proto::UnrollShape;
-use tch::{Device, Tensor};
+use tch::{Device, Kind, Tensor};
 
 pub(crate) const UNROLLS: usize = 6;
 pub(crate) const LENGTH: usize = 8;
@@ -283,6 +283,48 @@ impl Unrolls {
         let noise = Numbers::new(77).take(means.len());
         self.action = means.iter().zip(&stds).zip(noise).map(|((mean, std), noise)| mean + std * 1.7 * noise).collect();
         (self.mean, self.std) = (means, stds);
+    }
+}
+
+/// Fails when two tensors of the same rows are further apart than 1e-5 anywhere.
+pub(crate) fn assert_close(what: &str, left: &Tensor, right: &Tensor) {
+    let (left, right) = (left.reshape([-1]), right.reshape([-1]));
+    assert_eq!(left.size(), right.size(), "{what}");
+    if left.numel() > 0 {
+        let apart = (left - right).abs().max().double_value(&[]);
+        assert!(apart < 1e-5, "{what}: {apart} apart");
+    }
+}
+
+impl Unrolls {
+    /// What the learner's policy does on the whole unrolls at once, as learning takes it.
+    pub(crate) fn act_at_once(&self, learner: &VmpoLearner, experiment: &Experiment, routing: &Routing) -> Acting {
+        let count = self.count as i64;
+        let steps = |values: &[f32], length: usize| {
+            let width = values.len() / (self.count * length);
+            Tensor::from_slice(values).reshape([count, length as i64, width as i64]).narrow(1, 0, LENGTH as i64)
+        };
+        let begins = steps(&self.first, LENGTH + 1).squeeze_dim(-1);
+        assert!(begins.sum(Kind::Float).double_value(&[]) > 0.0, "an episode begins inside");
+        let before = Tensor::from_slice(&self.state).reshape([count, experiment.network.state_size() as i64]);
+        tch::no_grad(|| {
+            let (proprioception, task) = (steps(&self.proprioception, LENGTH + 1), steps(&self.task, LENGTH + 1));
+            let observation = learner.policy().normalise(&proprioception, &task, None, routing);
+            let (previous, noise) = (steps(&self.previous_latent, LENGTH), steps(&self.latent_noise, LENGTH));
+            let memory = Memory { state: &before, first: Some(&begins) };
+            learner.policy().act(&observation, &previous, &noise, memory)
+        })
+    }
+
+    /// Fails unless the decisions in these unrolls, mean, deviation and weights, are these.
+    pub(crate) fn assert_decided(&self, name: &str, acting: &Acting) {
+        let (mean, std, log_weights) = acting.action.to_rows();
+        assert_close(&format!("{name}: mean"), &mean, &Tensor::from_slice(&self.mean));
+        assert_close(&format!("{name}: std"), &std, &Tensor::from_slice(&self.std));
+        assert_eq!(log_weights.is_some(), !self.log_weights.is_empty(), "{name}");
+        if let Some(log_weights) = log_weights {
+            assert_close(&format!("{name}: weights"), &log_weights, &Tensor::from_slice(&self.log_weights));
+        }
     }
 }
 

@@ -1,8 +1,9 @@
 //! How many weights an experiment's networks have, before they are built.
 
-use comic_experiment::{LowLevelName, Network, TaskSpec};
+use comic_experiment::{Network, TaskSpec};
 
 use super::Part;
+use crate::low_level::{Layer, Sizes, low_level_layers};
 
 /// Entries of the matrices of encoders and low level, as far as `part` goes. Whoever reads a file compares it with what
 /// the file holds: an experiment in a file of a thousand numbers must not make networks of a billion.
@@ -17,7 +18,8 @@ pub(super) fn count(part: Part, spec: &TaskSpec, network: &Network) -> u64 {
 
 /// Whether [`count`] counts a tensor of this name and shape.
 pub(super) fn is_counted(name: &str, shape: &[usize]) -> bool {
-    shape.len() > 1 && (name.starts_with("encoder.") || name.starts_with("low_level."))
+    let matrix = shape.len() > 1 && !name.ends_with("biases");
+    matrix && (name.starts_with("encoder.") || name.starts_with("low_level."))
 }
 
 /// Weights of hidden layers, and the width of the last one.
@@ -36,30 +38,8 @@ fn encoder(spec: &TaskSpec, observation: usize, network: &Network) -> u64 {
 }
 
 fn low_level(spec: &TaskSpec, network: &Network) -> u64 {
-    let (latent, proprioception, actions) =
-        (network.latent.size as u64, spec.proprioception as u64, spec.action as u64);
-    match network.low_level {
-        LowLevelName::Mlp => {
-            let (weights, width) = hidden(latent + proprioception, &network.mlp.hidden);
-            weights + width * 2 * actions
-        }
-        LowLevelName::Lstm => {
-            let layer = |(weights, width): (u64, u64), units: &usize| {
-                let units = *units as u64;
-                (weights + 4 * units * (width + units), units)
-            };
-            let (weights, width) = network.lstm.units.iter().fold((0, latent + proprioception), layer);
-            weights + width * 2 * actions
-        }
-        LowLevelName::Mixture | LowLevelName::Product => {
-            let sizes = &network.primitives;
-            let (count, units) = (sizes.count as u64, sizes.hidden as u64);
-            let (torso, width) = hidden(proprioception, &sizes.torso);
-            let primitives = torso + width * count * units + count * (units + 1) * 2 * actions;
-            let (gate, width) = hidden(latent + proprioception, &sizes.gate);
-            primitives + if latent > 0 { gate + width * count } else { 0 }
-        }
-    }
+    let sizes = Sizes { proprioception: spec.proprioception, actions: spec.action, network };
+    low_level_layers(&sizes).into_iter().map(Layer::weights).sum()
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use tch::{Tensor, nn};
 
-use super::{Config, Input, LowLevel, Output};
+use super::{Config, Input, Layer, LowLevel, Output, Sizes};
 use crate::ActionDistribution;
 use crate::layers::{GaussianHead, GaussianHeadConfig};
 use crate::lstm::LstmStack;
@@ -21,6 +21,14 @@ impl LstmLowLevel {
         let head = GaussianHead::new(path, stack.output(), &GaussianHeadConfig::of_actions(config.pose, network));
         Self { stack, head }
     }
+}
+
+/// As they are made in [`LstmLowLevel::new`].
+pub(super) fn layers(sizes: &Sizes<'_>) -> Vec<Layer> {
+    let units = &sizes.network.lstm.units;
+    let inputs = std::iter::once(sizes.joined()).chain(units.iter().copied());
+    let stacked = inputs.clone().zip(units).map(|(input, units)| Layer::Lstm { input, units: *units });
+    stacked.chain(inputs.last().map(|width| Layer::dense(width, sizes.head()))).collect()
 }
 
 impl LowLevel for LstmLowLevel {

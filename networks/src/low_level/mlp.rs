@@ -2,7 +2,7 @@
 
 use tch::{Tensor, nn};
 
-use super::{Config, Input, LowLevel, Output};
+use super::{Config, Input, Layer, LowLevel, Output, Sizes};
 use crate::ActionDistribution;
 use crate::layers::{GaussianHead, GaussianHeadConfig, Torso};
 
@@ -21,6 +21,11 @@ impl MlpLowLevel {
         let head = GaussianHead::new(path, torso.output(), &GaussianHeadConfig::of_actions(config.pose, network));
         Self { torso, head }
     }
+}
+
+/// As they are made in [`MlpLowLevel::new`].
+pub(super) fn layers(sizes: &Sizes<'_>) -> Vec<Layer> {
+    Layer::stack(sizes.joined(), &[&sizes.network.mlp.hidden[..], &[sizes.head()]].concat())
 }
 
 impl LowLevel for MlpLowLevel {

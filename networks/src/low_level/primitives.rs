@@ -2,7 +2,7 @@
 
 use tch::{Tensor, nn};
 
-use super::{Config, Input};
+use super::{Config, Input, Layer, Sizes};
 use crate::DiagonalGaussian;
 use crate::layers::{Torso, inverse_softplus, linear};
 
@@ -62,6 +62,23 @@ impl Primitives {
         let std = output.narrow(2, actions, actions).softplus() + self.min_std;
         DiagonalGaussian { mean, std }
     }
+}
+
+/// As they are made in [`Primitives::new`] and [`Gate::new`].
+pub(super) fn layers(sizes: &Sizes<'_>) -> Vec<Layer> {
+    let network = sizes.network;
+    let primitives = &network.primitives;
+    let side_by_side = primitives.count * primitives.hidden;
+    let mut layers = Layer::stack(sizes.proprioception, &[&primitives.torso[..], &[side_by_side]].concat());
+    // Nothing below an observation is learnt.
+    if let Some(Layer::Dense { flows_on, .. }) = layers.first_mut() {
+        *flows_on = false;
+    }
+    layers.extend(std::iter::repeat_n(Layer::dense(primitives.hidden, sizes.head()), primitives.count));
+    if network.latent.size > 0 {
+        layers.extend(Layer::stack(sizes.joined(), &[&primitives.gate[..], &[primitives.count]].concat()));
+    }
+    layers
 }
 
 fn evenly(count: usize) -> Vec<f32> {

@@ -30,8 +30,17 @@ pub(crate) fn layout() -> Arc<UnrollLayout> {
     Arc::new(UnrollLayout::new(shape))
 }
 
+/// Clips are numbered as sequences are here: an actor's first ten unrolls are of one task, the next ten of another, and
+/// those that follow of none.
+pub(crate) const TASKS: [(&str, usize); 2] = [("tracking", 10), ("get-up", 10)];
+
+/// The books of these tasks are kept.
+pub(crate) fn with_tasks(ledger: Ledger) -> Ledger {
+    ledger.with_tasks(TASKS.map(|(name, clips)| (name.to_string(), clips)))
+}
+
 pub(crate) fn batcher() -> Batcher {
-    Batcher::new(layout(), CONFIG, PHASE, Ledger::new())
+    Batcher::new(layout(), CONFIG, PHASE, with_tasks(Ledger::new()))
 }
 
 /// An actor that has joined.

@@ -21,6 +21,7 @@ struct Run {
     sound: Snapshot,
     learner: VmpoLearner,
     statistics: ObservationStatistics,
+    spec: TaskSpec,
 }
 
 thread_local! {
@@ -36,7 +37,7 @@ fn run() -> Run {
     state.extend(statistics.state());
     let policy = to_safetensors(learner.policy_store()).expect("parameters are written");
     let config = Config { unrolls: 2, max_staleness: 2, ahead: 0, order: Order::Arrival };
-    let batcher = Batcher::new(Arc::new(layout(&spec, &experiment)), config, Phase::default(), Ledger::new());
+    let batcher = Batcher::new(Arc::new(layout(&spec, &experiment)), config, Phase::default(), with_tasks(Ledger::new(), &spec));
     let text = |written: Result<Vec<u8>, serde_json::Error>| written.expect("JSON is written");
     let parts = [
         ("experiment.toml", experiment.to_toml().expect("an experiment is written").into_bytes()),
@@ -52,7 +53,7 @@ fn run() -> Run {
         seed(name, &[&[number as u8], &bytes[..]].concat());
     }
     let directory = tempfile::tempdir().expect("a directory");
-    Run { directory, sound, learner, statistics }
+    Run { directory, sound, spec, learner, statistics }
 }
 
 fuzz_target!(init: {
@@ -78,11 +79,16 @@ fuzz_target!(init: {
     });
 });
 
+fn with_tasks(ledger: Ledger, spec: &TaskSpec) -> Ledger {
+    ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)))
+}
+
 /// What a learner makes of each part when it goes on from a checkpoint.
 fn resume(run: &mut Run, snapshot: &Snapshot) -> Option<()> {
     Experiment::from_toml("experiment.toml", snapshot.text("experiment.toml").ok()?).ok()?;
     serde_json::from_slice::<TaskSpec>(snapshot.part("task.json").ok()?).ok()?;
-    Ledger::restore(&serde_json::from_slice(snapshot.part("books.json").ok()?).ok()?).ok()?;
+    let ledger = Ledger::restore(&serde_json::from_slice(snapshot.part("books.json").ok()?).ok()?).ok()?;
+    drop(with_tasks(ledger, &run.spec));
     let mut state = tensors::from_bytes(snapshot.part("learner.safetensors").ok()?).ok()?;
     run.statistics.restore(&mut state).ok()?;
     run.learner.load_state(&state).ok()

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use comic_fuzz::{experiment, layout, seed, spec};
 use comic_proto::v1::{UnrollHeader, UnrollMessage};
 use comic_proto::{Expected, Field, Pieces, ReceivedUnroll, UnrollBuffer, UnrollLayout, validate};
-use comic_replay::{Batcher, Config, Ledger, Order, Phase};
+use comic_replay::{Batcher, Config, Ledger, Order, Phase, TaskBooks};
 use futures::executor::block_on;
 use libfuzzer_sys::fuzz_target;
 use prost::Message as _;
@@ -52,11 +52,13 @@ fuzz_target!(init: {
     let expected = Expected { clips, epoch: 0, newest_version: 3 };
     if validate(layout, &header, &payload, &expected).is_ok() {
         let config = Config { unrolls: 2, max_staleness: 2, ahead: 0, order: Order::Arrival };
-        let mut ledger = Ledger::new();
+        let tasks = clips.iter().enumerate().map(|(task, clips)| (task.to_string(), *clips));
+        let mut ledger = Ledger::new().with_tasks(tasks);
         let _ = ledger.join(header.incarnation, None);
         let batcher = Batcher::new(layout.clone(), config, Phase::default(), ledger);
         // The first of two: there is room.
         block_on(batcher.insert(&header, payload));
-        assert!(batcher.books().balance());
+        let books = batcher.books_by_task();
+        assert!(books.all.balance() && books.tasks.values().all(TaskBooks::balance));
     }
 });

@@ -169,10 +169,21 @@ fn panel_text(line: &Line) -> String {
             books.produced, books.trained, books.in_flight
         )
     });
+    // In joint training a line for each task: their rewards have nothing to do with one another.
+    let tasks = line.tasks.iter().map(|(task, own)| {
+        format!(
+            "\n{task:<12}      {:>6}   survived {:>5}   head {:>5} m   environment steps lately {}",
+            number(own.normalised_reward, 3),
+            number(own.fraction_survived, 2),
+            number(own.head_height, 2),
+            own.environment_steps
+        )
+    });
+    let tasks: String = tasks.collect();
     format!(
         "environment steps {:>10}   steps/s {:>8}   updates {:>7}   unroll age {:>5}\n\
          reward per step {:>7}   latent KL {:>7} nats/step   episode length {:>6}   return {:>7}\n\
-         normalised reward {:>6}   survived {:>5}{books}",
+         normalised reward {:>6}   survived {:>5}{tasks}{books}",
         line.environment_steps,
         number(line.steps_per_second, 0),
         line.updates,
@@ -198,6 +209,19 @@ fn row_text(line: &Line) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_panel_shows_every_tasks_own_reward() {
+        let line: Line = serde_json::from_str(
+            r#"{"normalised_reward":0.25,"tasks":{"tracking":{"normalised_reward":0.125},
+                "get-up":{"normalised_reward":0.5,"head_height":1.25,"environment_steps":77}}}"#,
+        )
+        .unwrap();
+        let text = panel_text(&line);
+        let of = |task: &str| text.lines().find(|line| line.starts_with(task)).map(str::to_owned).unwrap_or_default();
+        assert!(of("tracking").contains("0.125"), "{text}");
+        assert!(["0.500", "1.25 m", "77"].iter().all(|part| of("get-up").contains(part)), "{text}");
+    }
 
     #[test]
     fn panel_and_row_show_the_latents_kl_beside_the_reward() {

@@ -17,6 +17,9 @@ use crate::workspace;
 #[derive(Clone, Debug, Deserialize, Serialize)]
 pub(crate) struct Evaluation {
     clips: Vec<ClipEvaluation>,
+    /// In joint training, each over all its clips.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    tasks: Vec<ClipEvaluation>,
     pub(crate) overall: ClipEvaluation,
 }
 
@@ -33,6 +36,9 @@ pub(crate) struct ClipEvaluation {
     /// Reward per survived step / the most a step pays.
     pub(crate) reward_per_step: f64,
     fraction_survived: f64,
+    /// m; unknown to evaluations of earlier releases.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    head_height: Option<f64>,
     /// Per survived step.
     reward_terms: BTreeMap<String, f64>,
 }
@@ -89,7 +95,7 @@ fn evaluate(checkpoint: &Path, episodes: Option<u32>, stderr: Stdio) -> Result<E
 impl Evaluation {
     /// The block of this name.
     fn of(&self, clip: &str) -> Option<&ClipEvaluation> {
-        self.clips.iter().chain([&self.overall]).find(|evaluation| evaluation.clip == clip)
+        self.clips.iter().chain(&self.tasks).chain([&self.overall]).find(|evaluation| evaluation.clip == clip)
     }
 }
 
@@ -99,7 +105,9 @@ pub(super) fn table(columns: &[(String, Evaluation)]) -> String {
     let Some((_, first)) = columns.first() else { return text };
     // One clip is all clips.
     let overall = (first.clips.len() > 1).then_some(&first.overall);
-    for clip in first.clips.iter().chain(overall) {
+    // A task of one clip has its block already.
+    let tasks = first.tasks.iter().filter(|_| first.clips.len() > first.tasks.len());
+    for clip in first.clips.iter().chain(tasks).chain(overall) {
         let of_clip: Vec<_> = columns.iter().map(|(_, evaluation)| evaluation.of(&clip.clip)).collect();
         text += &format!("\n{:<28}", clip.clip);
         for (name, _) in columns {
@@ -118,6 +126,7 @@ pub(super) fn table(columns: &[(String, Evaluation)]) -> String {
         row("normalised reward", &|clip| Some(clip.normalised_reward));
         row("reward per step / most", &|clip| Some(clip.reward_per_step));
         row("fraction survived", &|clip| Some(clip.fraction_survived));
+        row("head's height, m", &|clip| clip.head_height);
         for term in clip.reward_terms.keys() {
             row(&format!("{term}, per step"), &|clip| clip.reward_terms.get(term).copied());
         }
@@ -138,6 +147,7 @@ mod tests {
             normalised_reward,
             reward_per_step: 0.5,
             fraction_survived: 0.25,
+            head_height: Some(1.5),
             reward_terms: [("com".to_owned(), 0.01)].into(),
         }
     }
@@ -145,6 +155,7 @@ mod tests {
     fn evaluation(clips: &[&str], normalised_reward: f64) -> Evaluation {
         Evaluation {
             clips: clips.iter().map(|clip| of_clip(clip, normalised_reward)).collect(),
+            tasks: Vec::new(),
             overall: of_clip("overall", normalised_reward),
         }
     }

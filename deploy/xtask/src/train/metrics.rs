@@ -26,6 +26,8 @@ pub(crate) struct Line {
     /// Return / (the most a step pays × the steps that were left at the episode's start).
     pub(crate) normalised_reward: Option<f64>,
     pub(crate) fraction_survived: Option<f64>,
+    /// m.
+    pub(crate) head_height: Option<f64>,
     /// Versions between the parameters that acted and those that were trained.
     pub(crate) unroll_age: Option<f64>,
     pub(crate) books: Option<Books>,

@@ -139,7 +139,7 @@ impl Job {
         let metrics = self.metrics();
         if metrics.exists() {
             let curve = self.path().join("curve.svg");
-            match plot::draw_runs(&[plot::Source::of(metrics)], plot::Quantity::EpisodeReturn, &curve) {
+            match plot::draw_runs(&[plot::Source::of(metrics)], &[plot::Quantity::EpisodeReturn], &curve) {
                 Ok(()) => display.event("drew", &[("curve", curve.display().to_string())]),
                 Err(error) => display.event("no curve", &[("reason", format!("{error:#}"))]),
             }
