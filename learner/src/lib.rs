@@ -43,6 +43,7 @@ mod state;
 pub mod statistics;
 pub mod status;
 pub mod telemetry;
+mod tensorboard;
 pub mod tensors;
 pub mod trainer;
 pub mod vmpo;

@@ -1,4 +1,5 @@
-//! What a person sees of a run: one JSON line every few seconds in `RUN/metrics.jsonl`, the newest one as the status.
+//! What a person sees of a run: one JSON line every few seconds in `RUN/metrics.jsonl` and for TensorBoard, the newest one
+//! as the status.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write as _;
@@ -14,6 +15,7 @@ use comic_replay::{Batch, BooksByTask};
 use serde_json::{Map, Value, json};
 
 use crate::service::Evaluation;
+use crate::tensorboard::Events;
 
 /// Sums since the last line.
 #[derive(Debug, Default)]
@@ -115,6 +117,8 @@ pub struct Metrics {
     spec: TaskSpec,
     run: PathBuf,
     file: File,
+    /// None where it could not be begun.
+    events: Option<Events>,
     window: Window,
     since: Instant,
     /// The books of the last line.
@@ -150,11 +154,20 @@ impl Metrics {
             spec: spec.clone(),
             run: run.to_path_buf(),
             file,
+            events: None,
             window: Window::default(),
             since: Instant::now(),
             books: BooksByTask::default(),
             torn: false,
         })
+    }
+
+    /// Begins a life of the learner after so many environment steps: what these books say is no news. It can do without
+    /// TensorBoard.
+    pub fn begin(&mut self, epoch: u64, environment_steps: u64, books: BooksByTask) {
+        self.books = books;
+        let begun = Events::begin(&self.run, epoch, environment_steps);
+        self.events = begun.map_err(|error| tracing::error!("nothing is written for TensorBoard: {error:#}")).ok();
     }
 
     /// Seconds since the last line.
@@ -286,6 +299,9 @@ impl Metrics {
                 .into();
         }
         self.books = books;
+        if let Some(Err(error)) = self.events.as_mut().map(|events| events.write(&line)) {
+            tracing::error!("TensorBoard's file lacks a line: {error}");
+        }
         let line = line.to_string();
         // What a full disk cut off keeps its own line.
         let start = if self.torn { "\n" } else { "" };

@@ -42,7 +42,7 @@ pub struct Options {
     /// What becomes of invalid unrolls.
     #[command(flatten)]
     pub quarantine: QuarantineOptions,
-    /// The run's directory: checkpoints, metrics.jsonl, the resolved experiment. A directory that holds checkpoints is
+    /// The run's directory: checkpoints, metrics.jsonl, tensorboard, the resolved experiment. A directory that holds checkpoints is
     /// resumed.
     #[arg(long, value_name = "DIR", default_value = "runs/default")]
     pub run: PathBuf,

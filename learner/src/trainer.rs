@@ -156,6 +156,8 @@ impl Trainer {
             }
             None => trainer.keep(Name::Initial)?,
         }
+        let books = trainer.batcher.books_by_task();
+        trainer.metrics.begin(epoch, trainer.progress.environment_steps, books);
         tracing::info!("buffers take {}", trainer.memory());
         Ok(trainer)
     }

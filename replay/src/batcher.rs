@@ -151,7 +151,7 @@ impl Batcher {
             Order::Environment => header.environment as usize,
         };
         if !ledger.record(header.actor, header.sequence, first_clip(&self.inner.layout, &payload)) {
-            ledger.sums.unattributed += 1;
+            ledger.refuse();
             return Outcome::Invalid;
         }
         batch.put(&self.inner.layout, place, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
@@ -175,7 +175,7 @@ impl Batcher {
 
     /// Counts a message without so much as a header.
     pub fn refuse_unattributed(&self) {
-        self.lock().ledger.sums.unattributed += 1;
+        self.lock().ledger.refuse();
     }
 
     /// Says what is wanted from now on. What waits in the batcher for another epoch or phase is superseded.
@@ -376,15 +376,15 @@ fn refuse_unaccountable(ledger: &mut Ledger, header: &UnrollHeader) -> Option<Ou
     match ledger.sight(header.actor, header.incarnation, header.sequence) {
         Sighting::New => None,
         Sighting::Duplicate => {
-            ledger.sums.duplicates += 1;
+            ledger.repeat();
             Some(Outcome::Duplicate)
         }
         Sighting::Broken => {
-            ledger.sums.unattributed += 1;
+            ledger.refuse();
             Some(Outcome::Invalid)
         }
         Sighting::Unknown => {
-            ledger.sums.unattributed += 1;
+            ledger.refuse();
             Some(Outcome::NotJoined)
         }
     }
@@ -401,7 +401,7 @@ fn first_clip(layout: &UnrollLayout, payload: &Pieces) -> Option<u32> {
 
 fn drop_unroll(ledger: &mut Ledger, header: &UnrollHeader, clip: Option<u32>, reason: Reason) -> Outcome {
     if !ledger.record(header.actor, header.sequence, clip) {
-        ledger.sums.unattributed += 1;
+        ledger.refuse();
         return Outcome::Invalid;
     }
     ledger.end(clip, Some(reason));

@@ -253,6 +253,16 @@ impl Ledger {
         true
     }
 
+    /// Counts a message without an account to charge. A checkpoint may claim any number of them.
+    pub(crate) fn refuse(&mut self) {
+        self.sums.unattributed = self.sums.unattributed.saturating_add(1);
+    }
+
+    /// Counts a message that repeats an unroll.
+    pub(crate) fn repeat(&mut self) {
+        self.sums.duplicates = self.sums.duplicates.saturating_add(1);
+    }
+
     /// Counts unrolls of these first clips as being with the trainer.
     pub(crate) fn hand_out(&mut self, clips: impl Iterator<Item = u32>) {
         for clip in clips {

@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
+use comic_proto::MAX_SEQUENCE;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -95,6 +96,9 @@ impl Ledger {
             ledger.actors.insert(incarnation, actor);
             ledger.clock = heard;
             in_accounts = in_accounts.saturating_add(next_sequence);
+        }
+        if snapshot.next_actor > MAX_SEQUENCE {
+            return Err(Error::Account { actor: snapshot.next_actor });
         }
         let mut sums = snapshot.books;
         // Closed accounts are in the sum too, so the open ones can only fall short of it.

@@ -102,6 +102,15 @@ fn an_actor_the_checkpoint_does_not_know_starts_afresh() {
 }
 
 #[test]
+fn a_snapshot_may_claim_any_number_of_refusals() {
+    let mut snapshot = batcher().snapshot();
+    (snapshot.books.duplicates, snapshot.books.unattributed) = (u64::MAX, u64::MAX);
+    let after = restarted(&snapshot);
+    after.refuse_unattributed();
+    assert_eq!(after.books().unattributed, u64::MAX);
+}
+
+#[test]
 fn a_snapshot_that_contradicts_itself_is_refused() {
     let before = batcher();
     let actor = Actor::join(&before, 5);
@@ -119,6 +128,7 @@ fn a_snapshot_that_contradicts_itself_is_refused() {
     let repeated = |snapshot: &mut Snapshot| snapshot.accounts.push(snapshot.accounts[0]);
     assert_eq!(refusal(repeated), Some(Error::Account { actor: 0 }));
     assert_eq!(refusal(|snapshot| snapshot.next_actor = 0), Some(Error::Account { actor: 0 }));
+    assert_eq!(refusal(|snapshot| snapshot.next_actor = u64::MAX), Some(Error::Account { actor: u64::MAX }));
     let unbalanced = |snapshot: &mut Snapshot| snapshot.tasks.get_mut("tracking").unwrap().trained += 1;
     assert!(matches!(refusal(unbalanced), Some(Error::UnbalancedTask { .. })));
     let too_many = |snapshot: &mut Snapshot| {

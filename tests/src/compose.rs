@@ -49,7 +49,7 @@ impl Project {
         for (name, _) in env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with("COMIC_")) {
             command.env_remove(name);
         }
-        command.env("COMIC_OPTIONS", &self.options).env("COMIC_METRICS_PORT", "");
+        command.env("COMIC_OPTIONS", &self.options).env("COMIC_METRICS_PORT", "").env("COMIC_TENSORBOARD_PORT", "");
         command.env("COMIC_LEARNER_CPUS", "1").env("COMIC_ACTOR_CPUS", "0.5");
         run(&mut command)
     }
@@ -135,7 +135,9 @@ impl Project {
 
 impl Drop for Project {
     fn drop(&mut self) {
-        if let Err(error) = self.compose(&["down", "--volumes", "--remove-orphans", "--timeout", "1"]) {
+        if let Err(error) =
+            self.compose(&["--profile", "tensorboard", "down", "--volumes", "--remove-orphans", "--timeout", "1"])
+        {
             eprintln!("not everything is gone: {error:#}");
         }
     }

@@ -9,6 +9,7 @@
 //! - [`repository`] looks at the workspace's own files and dependencies.
 //! - [`steps`] is what they make a learner and its actors go through.
 //! - [`system`] runs a learner and actors as a user would: real programs, real sockets, one directory for the run.
+//! - [`tensorboard`] reads curves as TensorBoard does.
 
 pub mod certificates;
 pub mod compose;
@@ -18,3 +19,4 @@ pub mod relay;
 pub mod repository;
 pub mod steps;
 pub mod system;
+pub mod tensorboard;

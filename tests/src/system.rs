@@ -86,7 +86,7 @@ pub fn help(name: &str, command: &[&str]) -> Result<String> {
     Ok(String::from_utf8(output.with_context(|| format!("cannot start {name}"))?.stdout)?)
 }
 
-/// The Python that has dm_control and torch.
+/// The Python that has dm_control, torch and TensorBoard.
 ///
 /// # Errors
 /// When it has not been made, with the command that does.

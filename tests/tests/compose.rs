@@ -38,7 +38,9 @@ async fn containers_survive_what_happens_to_them_and_their_books_balance() -> Re
     project.up(2)?;
     trains_on_with(2, &project, "two actors train").await?;
     they_are_what_the_image_promises(&project).await?;
-    ensure!(metrics(&project)?.contains("comic_actors{state=\"alive\"} 2\n"), "Prometheus sees two actors");
+    let metrics = get(&project, "learner", "9090", "/metrics")?;
+    ensure!(metrics.contains("comic_actors{state=\"alive\"} 2\n"), "Prometheus sees two actors");
+    tensorboard_shows_the_curves(&project).await?;
 
     let [killed, kept] = &project.containers("actor")?[..] else { bail!("not two actors") };
     killed.docker(&["kill"])?;
@@ -105,11 +107,31 @@ async fn they_are_what_the_image_promises(project: &Project) -> Result<()> {
     Ok(())
 }
 
-/// The page at the port that Compose publishes.
-fn metrics(project: &Project) -> Result<String> {
-    let address = project.compose(&["port", "learner", "9090"])?;
+/// The profile `tensorboard`: what the learner writes into its volume is read there, by a container that cannot write.
+async fn tensorboard_shows_the_curves(project: &Project) -> Result<()> {
+    project.compose(&["--profile", "tensorboard", "up", "--detach", "--no-build", "--no-deps", "tensorboard"])?;
+    let begun = Instant::now();
+    loop {
+        match get(project, "tensorboard", "6006", "/data/plugin/scalars/tags") {
+            Ok(tags) if tags.contains("normalised_reward") => break,
+            answer => ensure!(begun.elapsed() < LIMIT, "TensorBoard shows no curve: {answer:?}"),
+        }
+        tokio::time::sleep(Duration::from_secs(1)).await;
+    }
+    let container = project.container("tensorboard")?;
+    container.until_is(".State.Health.Status", "healthy", LIMIT).await?;
+    ensure!(container.exec(&["id", "--user"])?.trim() == "10001", "another user");
+    ensure!(container.inspect(".HostConfig.ReadonlyRootfs")? == "true", "it could write into its image as root");
+    ensure!(container.exec(&["touch", "/runs/file"]).is_err(), "it can write into the runs");
+    project.compose(&["--profile", "tensorboard", "rm", "--stop", "--force", "tensorboard"]).map(drop)
+}
+
+/// A page at a port that Compose publishes.
+fn get(project: &Project, service: &str, port: &str, path: &str) -> Result<String> {
+    let address = project.compose(&["--profile", "tensorboard", "port", service, port])?;
     let mut stream = TcpStream::connect(address.trim())?;
-    stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: learner\r\n\r\n")?;
+    stream.set_read_timeout(Some(Duration::from_secs(10)))?;
+    stream.write_all(format!("GET {path} HTTP/1.1\r\nHost: {service}\r\nConnection: close\r\n\r\n").as_bytes())?;
     let mut page = String::new();
     stream.read_to_string(&mut page)?;
     Ok(page)

@@ -29,7 +29,7 @@ fn command(file: &str, service: &str) -> Result<Vec<String>> {
 #[test]
 fn every_container_is_limited_and_writes_where_it_is_told() -> Result<()> {
     let document = compose("compose.yaml")?;
-    for service in ["learner", "actor"] {
+    for service in ["learner", "actor", "tensorboard"] {
         let service = &document["services"][service];
         ensure!(service["read_only"] == true && service["cap_drop"][0] == "ALL", "{service:?}");
         ensure!(service["security_opt"][0] == "no-new-privileges:true", "{service:?}");
@@ -69,17 +69,29 @@ fn with_tls_the_learner_is_told_the_same_but_for_who_gets_in() -> Result<()> {
     Ok(())
 }
 
+fn arguments_of(dockerfile: &str) -> BTreeSet<String> {
+    let name = |line: &str| Some(line.strip_prefix("ARG ")?.split('=').next()?.to_owned());
+    dockerfile.lines().filter_map(name).collect()
+}
+
 #[test]
 fn every_argument_of_the_dockerfile_can_be_given_to_compose() -> Result<()> {
     let dockerfile = text("Dockerfile")?;
-    let mut asked: BTreeSet<_> =
-        dockerfile.lines().filter_map(|line| line.strip_prefix("ARG ")?.split('=').next()).collect();
+    let mut asked = arguments_of(&dockerfile);
     // Of images that compose does not build.
     ensure!(asked.remove("ACCELERATOR"), "what do the images for accelerators ask for?");
-    for service in ["learner", "actor"] {
-        let build = &compose("compose.yaml")?["services"][service]["build"];
+    let given_to = |service: &str| -> Result<(Value, BTreeSet<String>)> {
+        let build = compose("compose.yaml")?["services"][service]["build"].clone();
         let given = build["args"].as_mapping().context("no arguments")?;
-        let given: BTreeSet<_> = given.keys().filter_map(Value::as_str).collect();
+        let given = given.keys().filter_map(Value::as_str).map(str::to_owned).collect();
+        Ok((build, given))
+    };
+    let (build, given) = given_to("tensorboard")?;
+    let file = build["dockerfile"].as_str().context("no file")?;
+    let own = arguments_of(&text(file.trim_start_matches("deploy/"))?);
+    ensure!(given == own, "tensorboard: {given:?} for {own:?}");
+    for service in ["learner", "actor"] {
+        let (build, given) = given_to(service)?;
         ensure!(given == asked, "{service}: {given:?} for {asked:?}");
         ensure!(dockerfile.contains(&format!(" AS {service}\n")) && build["target"] == service, "{service}: {build:?}");
     }

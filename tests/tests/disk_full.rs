@@ -10,7 +10,8 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result, ensure};
 use comic_tests::steps::{LIMIT, checkpoint_in, half_written, leaves, the_books_balance_at_the_end, trains_on};
-use comic_tests::system::{SMALL, System};
+use comic_tests::system::{SMALL, System, metric};
+use comic_tests::tensorboard::curves;
 
 /// Room for a few dozen checkpoints.
 const DISK: u64 = 64 << 20;
@@ -42,6 +43,10 @@ async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
     let before = checkpoint_in(&run);
     fs::remove_file(&filler)?;
     system.until("checkpoints are written again", LIMIT, |_| (checkpoint_in(&run) > before).then_some(())).await?;
+    let step = system.until("an answer", LIMIT, |status| Some(metric(status, "environment_steps"))).await?;
+    // A line of which half was written would be the last that TensorBoard reads.
+    let last = |run: &Path| Some(curves(&run.join("tensorboard")).ok()?.get("updates")?.last()?.0 as f64);
+    system.until("TensorBoard sees what is learnt since", LIMIT, |_| (last(&run)? > step).then_some(())).await?;
     leaves(actor).await?;
     the_books_balance_at_the_end(system).await
 }

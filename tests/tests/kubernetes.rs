@@ -193,7 +193,7 @@ fn default_of(option: &str, help: &str) -> Result<i32> {
 
 #[test]
 fn images_are_pinned_to_this_version_everywhere() -> Result<()> {
-    let programs = ["comic-learner", "comic-learner-cuda", "comic-learner-xla", "comic-actor"];
+    let programs = ["comic-learner", "comic-learner-cuda", "comic-learner-xla", "comic-actor", "comic-tensorboard"];
     let expected = programs.map(|name| format!("{name}:{}", env!("CARGO_PKG_VERSION")));
     each(|cluster| {
         let learner = container(cluster.learner_pod()?)?;

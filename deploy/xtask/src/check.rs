@@ -38,7 +38,7 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
         return test_xla(&options.arguments);
     }
     setup::run(&setup::Options::default())?;
-    // Files written here are read by dm_control's own loader, and policies act in its own environment.
+    // Files written here are read by dm_control's own loader and by TensorBoard, and policies act in dm_control's environment.
     python::prepare_tests()?;
     // The whole-system tests start the programs, so these are built first.
     workspace::build()?;

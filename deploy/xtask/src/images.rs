@@ -29,7 +29,9 @@ pub(crate) fn build() -> Result<()> {
         }
     }
     trust_whom_this_machine_trusts()?;
-    workspace::run(compose().args(["--file", "deploy/compose.yaml", "build"]).current_dir(root()))
+    workspace::run(
+        compose().args(["--file", "deploy/compose.yaml", "--profile", "tensorboard", "build"]).current_dir(root()),
+    )
 }
 
 /// Compose, v2 or v1.

@@ -38,7 +38,7 @@ pub(crate) fn fixtures(options: &FixtureOptions) -> Result<()> {
     Ok(())
 }
 
-/// Makes the environment in which tests run dm_control and torch; under a second when it is there.
+/// Makes the environment in which tests run dm_control, torch and TensorBoard; under a second when it is there.
 pub(crate) fn prepare_tests() -> Result<()> {
     environment(&workspace::root().join("tests/python/requirements-export.txt")).map(drop)
 }

@@ -88,7 +88,7 @@ fn resume(run: &mut Run, snapshot: &Snapshot) -> Option<()> {
     Experiment::from_toml("experiment.toml", snapshot.text("experiment.toml").ok()?).ok()?;
     serde_json::from_slice::<TaskSpec>(snapshot.part("task.json").ok()?).ok()?;
     let ledger = Ledger::restore(&serde_json::from_slice(snapshot.part("books.json").ok()?).ok()?).ok()?;
-    drop(with_tasks(ledger, &run.spec));
+    let _ = with_tasks(ledger, &run.spec).join(1, None);
     let mut state = tensors::from_bytes(snapshot.part("learner.safetensors").ok()?).ok()?;
     run.statistics.restore(&mut state).ok()?;
     run.learner.load_state(&state).ok()

@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 
 use crate::workspace;
 
-/// A run's directory: checkpoints, metrics.jsonl, logs, the evaluation and the curve.
+/// A run's directory: checkpoints, metrics.jsonl, tensorboard, logs, the evaluation and the curve.
 pub(super) struct RunDirectory(PathBuf);
 
 impl RunDirectory {

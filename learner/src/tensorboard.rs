@@ -1,0 +1,171 @@
+//! The lines of `metrics.jsonl` for TensorBoard: `RUN/tensorboard/events.out.tfevents.…`, a file for each life of the
+//! learner.
+//!
+//! A file is a sequence of records, a record a length, its checksum, a message and the message's checksum (TensorFlow's
+//! `record_writer.cc`); the messages are `event.proto`'s and `summary.proto`'s, of which four fields are wanted.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::Write as _;
+use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context as _, Result};
+use prost::Message as _;
+use serde_json::Value;
+
+/// What a reader looks for in the first record.
+const VERSION: &str = "brain.Event:2";
+/// `SessionLog.SessionStatus.START`: what another life wrote of this step and later ones is forgotten.
+const START: i32 = 1;
+/// Added to a checksum so that one of data that holds checksums is none (`crc32c.h`).
+const MASK: u32 = 0xa282_ead8;
+/// What a line says of where it stands, and what is no curve.
+const POSITION: [&str; 3] = ["environment_steps", "seconds", "learner_epoch"];
+
+#[derive(Clone, PartialEq, prost::Message)]
+struct Event {
+    /// Seconds since 1970.
+    #[prost(double, tag = "1")]
+    wall_time: f64,
+    #[prost(int64, tag = "2")]
+    step: i64,
+    #[prost(string, optional, tag = "3")]
+    file_version: Option<String>,
+    #[prost(message, optional, tag = "5")]
+    summary: Option<Summary>,
+    #[prost(message, optional, tag = "7")]
+    session_log: Option<SessionLog>,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
+struct SessionLog {
+    #[prost(int32, tag = "1")]
+    status: i32,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
+struct Summary {
+    #[prost(message, repeated, tag = "1")]
+    values: Vec<Scalar>,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
+struct Scalar {
+    #[prost(string, tag = "1")]
+    tag: String,
+    /// 0 is written too.
+    #[prost(float, optional, tag = "2")]
+    value: Option<f32>,
+}
+
+/// The file of one life.
+#[derive(Debug)]
+pub(crate) struct Events {
+    file: File,
+    /// Bytes of whole records.
+    length: u64,
+}
+
+impl Events {
+    /// Begins the file of life `epoch`, which goes on after so many environment steps.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub(crate) fn begin(run: &Path, epoch: u64, environment_steps: u64) -> Result<Self> {
+        let directory = run.join("tensorboard");
+        // TensorBoard reads the files of a directory in the order of their names.
+        let path = directory.join(format!("events.out.tfevents.{epoch:010}"));
+        let open = || {
+            fs::create_dir_all(&directory)?;
+            let file = OpenOptions::new().create(true).append(true).open(&path)?;
+            let mut events = Self { length: file.metadata()?.len(), file };
+            events.append(&opening(now(), environment_steps as i64 + 1))?;
+            Ok::<_, std::io::Error>(events)
+        };
+        open().with_context(|| format!("cannot write {}", path.display()))
+    }
+
+    /// Writes every number of a line, by its path within the line, over environment steps.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub(crate) fn write(&mut self, line: &Value) -> std::io::Result<()> {
+        self.append(&scalars(now(), line))
+    }
+
+    /// All of these bytes or none: a reader would stop at half a record for ever.
+    fn append(&mut self, records: &[u8]) -> std::io::Result<()> {
+        let written = self.file.write_all(records);
+        match &written {
+            Ok(()) => self.length += records.len() as u64,
+            Err(_) => drop(self.file.set_len(self.length)),
+        }
+        written
+    }
+}
+
+/// What begins a file; `step` is the first that it can speak of.
+fn opening(wall_time: f64, step: i64) -> Vec<u8> {
+    let first = Event { wall_time, file_version: Some(VERSION.to_owned()), ..Event::default() };
+    let start = Event { wall_time, step, session_log: Some(SessionLog { status: START }), ..Event::default() };
+    [record(&first), record(&start)].concat()
+}
+
+fn scalars(wall_time: f64, line: &Value) -> Vec<u8> {
+    let step = line["environment_steps"].as_i64().unwrap_or_default();
+    let mut values = Vec::new();
+    collect("", line, &mut values);
+    record(&Event { wall_time, step, summary: Some(Summary { values }), ..Event::default() })
+}
+
+fn now() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
+}
+
+fn collect(path: &str, value: &Value, scalars: &mut Vec<Scalar>) {
+    match value {
+        Value::Number(number) if !POSITION.contains(&path) => {
+            let value = number.as_f64().map(|number| number as f32);
+            scalars.push(Scalar { tag: path.to_owned(), value });
+        }
+        Value::Object(entries) => {
+            for (name, value) in entries {
+                let path = if path.is_empty() { name.clone() } else { format!("{path}/{name}") };
+                collect(&path, value, scalars);
+            }
+        }
+        _ => {}
+    }
+}
+
+fn record(event: &Event) -> Vec<u8> {
+    let message = event.encode_to_vec();
+    let length = (message.len() as u64).to_le_bytes();
+    let (of_length, of_message) = (checksum(&length).to_le_bytes(), checksum(&message).to_le_bytes());
+    [&length[..], &of_length, &message, &of_message].concat()
+}
+
+fn checksum(bytes: &[u8]) -> u32 {
+    crc32c::crc32c(bytes).rotate_right(15).wrapping_add(MASK)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    /// TensorBoard 2.20's own `RecordWriter` wrote this, of its own `event_pb2` and `summary_pb2`.
+    const THEIRS: &str = "1800000000000000a37f4b2209000000000000f83f1a0d627261696e2e4576656e743a322a28646c\
+        0f000000000000006d532b0909000000000000f83f10403a020801a94dbe8f\
+        3e00000000000000d9d240e709000000000000f83f10402a310a1f0a187461736b732f6765742d75702f686561645f68656967687415\
+        0000003f0a0e0a077570646174657315000000003ffbdbbf";
+
+    #[test]
+    fn every_number_of_a_line_is_a_curve_as_tensorboard_writes_it() {
+        let line = json!({"environment_steps": 64, "seconds": 1.0, "updates": 0, "episode_return": null,
+            "tasks": {"get-up": {"head_height": 0.5}}, "name": "walk"});
+        let hex = |bytes: Vec<u8>| bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+        assert_eq!(hex([opening(1.5, 64), scalars(1.5, &line)].concat()), THEIRS);
+    }
+}
