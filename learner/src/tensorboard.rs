@@ -75,11 +75,13 @@ impl Events {
         let directory = run.join("tensorboard");
         // TensorBoard reads the files of a directory in the order of their names.
         let path = directory.join(format!("events.out.tfevents.{epoch:010}"));
+        // A checkpoint may claim any number of steps.
+        let first = i64::try_from(environment_steps).unwrap_or(i64::MAX).saturating_add(1);
         let open = || {
             fs::create_dir_all(&directory)?;
             let file = OpenOptions::new().create(true).append(true).open(&path)?;
             let mut events = Self { length: file.metadata()?.len(), file };
-            events.append(&opening(now(), environment_steps as i64 + 1))?;
+            events.append(&opening(now(), first))?;
             Ok::<_, std::io::Error>(events)
         };
         open().with_context(|| format!("cannot write {}", path.display()))
