@@ -22,6 +22,8 @@ from dm_control.locomotion import arenas
 from dm_control.locomotion.tasks.reference_pose import tracking, types
 from dm_control.locomotion.walkers import cmu_humanoid
 
+if len(sys.argv) < 3:
+    sys.exit(__doc__)
 path, clips, starts = sys.argv[1], sys.argv[2], [int(start) for start in sys.argv[3:] or [0]]
 policy = torch.jit.load(path, _extra_files=(extra := {"comic.json": ""}))
 *observed, memory = (spec := json.loads(extra["comic.json"]))["inputs"]
