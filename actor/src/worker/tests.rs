@@ -273,6 +273,11 @@ proptest! {
             }
             reported.extend(unroll.episodes.iter().map(|e| (e.steps, e.steps_left_at_start, e.returns.clone())));
             prop_assert_eq!(&reported, &expected, "an episode is reported in the unroll it ends in");
+            for episode in &unroll.episodes {
+                // The head is as many metres high as the episode has steps, which is its second term, too.
+                let mean = episode.returns[1] / episode.steps as f32;
+                prop_assert!((episode.head_height.unwrap() - mean).abs() < 1e-5, "{:?}", episode);
+            }
         }
     }
 
