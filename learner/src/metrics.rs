@@ -326,6 +326,18 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_head_is_as_high_as_in_the_mean_step_of_the_episodes_that_say_so() {
+        let mut episodes = Episodes::default();
+        for (steps, head_height) in [(30, Some(1.0)), (10, Some(0.2)), (60, None)] {
+            episodes.add(&EpisodeStatistics { steps, head_height, ..EpisodeStatistics::default() }, 1.0);
+        }
+        let entries: Map<String, Value> =
+            episodes.entries().map(|(name, value)| (name.to_string(), value)).into_iter().collect();
+        let height = entries["head_height"].as_f64().unwrap();
+        assert!((height - 0.8).abs() < 1e-6, "(30 · 1.0 + 10 · 0.2) / 40 is not {height}");
+    }
+
+    #[test]
     fn a_full_disk_costs_lines_and_nothing_else() {
         let directory = tempfile::tempdir().unwrap();
         // A device that refuses every byte, for want of space.

@@ -137,7 +137,7 @@ impl fmt::Display for Text<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let status = self.0;
         let metrics = metrics(status);
-        let whole = |name: &str| grouped(metrics[name].as_u64().unwrap_or_default());
+        let whole = |name: &str| grouped(count(&metrics[name]));
         let rate = |name: &str| metrics[name].as_f64().unwrap_or_default();
         let seconds = status.uptime_seconds as u64;
         let (hours, minutes, seconds) = (seconds / 3600, seconds / 60 % 60, seconds % 60);
@@ -164,9 +164,22 @@ impl fmt::Display for Text<'_> {
         let reasons: Vec<_> = dropped.iter().map(|(reason, count)| format!("{reason} {}", grouped(*count))).collect();
         writeln!(f, "          dropped: {}", reasons.join(", "))?;
         writeln!(f, "          beside them: duplicates {duplicates}, unattributed {unattributed}")?;
+        for (name, task) in metrics["tasks"].as_object().into_iter().flatten() {
+            let [produced, trained, in_flight] =
+                ["produced", "trained", "in_flight"].map(|part| count(&task["books"][part]));
+            let dropped = task["books"]["dropped"].as_object().into_iter().flatten().map(|(_, part)| count(part)).sum();
+            let [produced, trained, dropped, in_flight] = [produced, trained, dropped, in_flight].map(grouped);
+            let shares = format!("trained {trained} + dropped {dropped} + in flight {in_flight}");
+            writeln!(f, "          {name}: produced {produced} = {shares}")?;
+        }
         let actors = status.actors.unwrap_or_default();
         writeln!(f, "actors    {} alive, {} slow, {} lost", actors.alive, actors.slow, actors.lost)
     }
+}
+
+/// What is not there is none.
+fn count(number: &Value) -> u64 {
+    number.as_u64().unwrap_or_default()
 }
 
 /// `1234567` as `1,234,567`.
@@ -191,6 +204,16 @@ mod tests {
     fn numbers_are_grouped() {
         let shown: Vec<_> = [0, 999, 1000, 1_234_567].map(grouped).into();
         assert_eq!(shown, ["0", "999", "1,000", "1,234,567"]);
+    }
+
+    #[test]
+    fn joint_training_shows_the_books_of_every_task() {
+        let books =
+            json!({ "produced": 1234, "trained": 1000, "dropped": { "stale": 200, "invalid": 30 }, "in_flight": 4 });
+        let metrics_json = json!({ "tasks": { "get-up": { "books": books }, "tracking": {} } }).to_string();
+        let text = Text(&v1::Status { metrics_json, ..v1::Status::default() }).to_string();
+        assert!(text.contains("get-up: produced 1,234 = trained 1,000 + dropped 230 + in flight 4\n"), "{text}");
+        assert!(text.contains("tracking: produced 0 = trained 0 + dropped 0 + in flight 0\n"), "{text}");
     }
 
     #[test]

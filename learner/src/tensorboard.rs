@@ -170,4 +170,16 @@ mod tests {
         let hex = |bytes: Vec<u8>| bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
         assert_eq!(hex([opening(1.5, 64), scalars(1.5, &line)].concat()), THEIRS);
     }
+
+    #[test]
+    fn a_life_begins_by_forgetting_every_step_after_its_checkpoint() {
+        let run = tempfile::tempdir().unwrap();
+        Events::begin(run.path(), 2, 4096).unwrap();
+        let bytes = fs::read(run.path().join("tensorboard/events.out.tfevents.0000000002")).unwrap();
+        // A record is eight bytes of length and four of checksum, the message, and four more.
+        let length = |at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize;
+        let second = length(0) + 16;
+        let event = Event::decode(&bytes[second + 12..second + 12 + length(second)]).unwrap();
+        assert_eq!((event.step, event.session_log), (4097, Some(SessionLog { status: START })));
+    }
 }

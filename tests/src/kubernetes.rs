@@ -105,15 +105,16 @@ pub fn render(directory: &Path) -> Result<Manifests> {
 /// # Errors
 /// What is no YAML, or no manifest.
 pub fn manifests_in(text: &str) -> Result<Manifests> {
-    let documents = serde_yaml_ng::Deserializer::from_str(text).map(Value::deserialize);
-    let named = documents.map(|document| {
-        let document = document?;
+    let mut manifests = Manifests::new();
+    for document in serde_yaml_ng::Deserializer::from_str(text) {
+        // By way of YAML's own type, which refuses a field that is there twice.
+        let document = serde_json::to_value(serde_yaml_ng::Value::deserialize(document)?)?;
         let name = |value: &Value| value.as_str().map(str::to_owned);
         let kind = name(&document["kind"]).context("a manifest without a kind")?;
         let name = name(&document["metadata"]["name"]).context("a manifest without a name")?;
-        Ok(((kind, name), document))
-    });
-    named.collect()
+        ensure!(manifests.insert((kind.clone(), name.clone()), document).is_none(), "{kind} {name} is there twice");
+    }
+    Ok(manifests)
 }
 
 /// A rendered overlay, read.
@@ -153,6 +154,14 @@ impl Cluster {
         Ok(cluster)
     }
 
+    /// The learner's pod, and the actors'.
+    ///
+    /// # Errors
+    /// When one is missing.
+    pub fn pods(&self) -> Result<[&PodSpec; 2]> {
+        Ok([self.learner_pod()?, self.actor_pod()?])
+    }
+
     /// The learner's pod.
     ///
     /// # Errors
@@ -169,6 +178,28 @@ impl Cluster {
         let spec = self.actors.spec.as_ref().context("no spec")?;
         spec.template.spec.as_ref().context("no pod")
     }
+}
+
+/// Does the same with every overlay, and with the base.
+///
+/// # Errors
+/// The first that cannot be read or does not pass.
+pub fn each(check: impl Fn(&Cluster) -> Result<()>) -> Result<()> {
+    for directory in applicable()? {
+        let cluster = render(&directory).and_then(Cluster::read);
+        cluster.and_then(|cluster| check(&cluster)).with_context(|| directory.display().to_string())?;
+    }
+    Ok(())
+}
+
+/// The one container of a pod.
+///
+/// # Errors
+/// When there are others.
+pub fn container(pod: &PodSpec) -> Result<&Container> {
+    let [container] = &pod.containers[..] else { bail!("{} containers", pod.containers.len()) };
+    ensure!(pod.init_containers.is_none() && pod.ephemeral_containers.is_none(), "other containers");
+    Ok(container)
 }
 
 fn take<T: DeserializeOwned + Serialize>(manifests: &mut Manifests, kind: &str, name: &str) -> Result<T> {

@@ -34,7 +34,12 @@ impl Process {
 
     fn start(what: &str, arguments: &[&str]) -> Result<Self> {
         let program = std::env::current_exe().context("cannot tell where this program lies")?;
-        let mut child = Command::new(program)
+        let mut command = Command::new(program);
+        if std::env::var_os("RUST_LOG").is_none() {
+            // Thousands of actors join.
+            command.env("RUST_LOG", "warn");
+        }
+        let mut child = command
             .args(["load", what])
             .args(arguments)
             .stdin(Stdio::piped())

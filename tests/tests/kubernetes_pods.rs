@@ -1,0 +1,121 @@
+//! Pods of every overlay, held against what a cluster should ask of them: who runs them, what they take, what they keep.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, bail, ensure};
+use comic_tests::kubernetes::{amount, container, each, option};
+use comic_tests::repository::root;
+use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
+
+#[test]
+fn what_is_taken_is_asked_for_and_limited() -> Result<()> {
+    each(|cluster| {
+        for pod in cluster.pods()? {
+            let resources = container(pod)?.resources.as_ref().context("no resources")?;
+            let (requests, limits) = (resources.requests.as_ref(), resources.limits.as_ref());
+            for name in ["cpu", "memory"] {
+                let request = amount(requests.and_then(|all| all.get(name)).context("nothing is asked for")?)?;
+                let limit = amount(limits.and_then(|all| all.get(name)).context("there is no limit")?)?;
+                ensure!(request > 0.0 && request <= limit, "{name}: {request} of {limit}");
+            }
+        }
+        Ok(())
+    })
+}
+
+/// https://kubernetes.io/docs/concepts/security/pod-security-standards, the standard `restricted`, and more.
+#[test]
+fn pods_are_restricted() -> Result<()> {
+    let user = user_of_the_images()?;
+    each(|cluster| {
+        let labels = cluster.namespace.metadata.labels.as_ref().context("no labels")?;
+        ensure!(labels.get("pod-security.kubernetes.io/enforce").is_some_and(|level| level == "restricted"));
+        for pod in cluster.pods()? {
+            let whole = pod.security_context.as_ref().context("no security context")?;
+            ensure!(whole.run_as_non_root == Some(true) && whole.run_as_user == Some(user), "who runs it?");
+            ensure!(whole.fs_group.is_some() && whole.fs_group == whole.run_as_group, "it cannot read its Secret");
+            ensure!(whole.seccomp_profile.as_ref().is_some_and(|profile| profile.type_ == "RuntimeDefault"), "seccomp");
+            ensure!([pod.host_network, pod.host_pid, pod.host_ipc].iter().all(Option::is_none), "a share of the host");
+            ensure!(pod.automount_service_account_token == Some(false), "a token for the cluster");
+            let container = container(pod)?;
+            let own = container.security_context.as_ref().context("no security context")?;
+            ensure!(own.allow_privilege_escalation == Some(false) && own.privileged.is_none(), "privileges");
+            // What a container says goes before what its pod says.
+            let overruled = own.run_as_user.is_some() || own.run_as_non_root.is_some() || own.run_as_group.is_some();
+            ensure!(!overruled && own.seccomp_profile.is_none(), "the pod is overruled");
+            ensure!(own.read_only_root_filesystem == Some(true), "it writes into its image");
+            let capabilities = own.capabilities.as_ref().context("capabilities")?;
+            ensure!(
+                capabilities.drop.as_deref() == Some(&["ALL".to_owned()]) && capabilities.add.is_none(),
+                "capabilities"
+            );
+            for volume in pod.volumes.iter().flatten() {
+                ensure!(volume.secret.is_some() || volume.empty_dir.is_some(), "what is {}?", volume.name);
+            }
+        }
+        Ok(())
+    })
+}
+
+/// The number of the one user as whom every image with a program runs.
+fn user_of_the_images() -> Result<i64> {
+    let dockerfile = fs::read_to_string(root().join("deploy/Dockerfile"))?;
+    let stages = dockerfile.split("\nFROM ").filter(|stage| stage.contains("\nENTRYPOINT "));
+    let users = stages.map(|stage| {
+        let user = stage.lines().find_map(|line| line.strip_prefix("USER ")?.split(':').next());
+        Ok(user.with_context(|| format!("nobody in FROM {}", stage.lines().next().unwrap_or_default()))?.parse()?)
+    });
+    let users = users.collect::<Result<Vec<i64>>>()?;
+    let [user, others @ ..] = &users[..] else { bail!("no image") };
+    ensure!(*user > 0 && others.len() == 3 && others.iter().all(|other| other == user), "{users:?}");
+    Ok(*user)
+}
+
+#[test]
+fn a_run_outlives_its_pod() -> Result<()> {
+    each(|cluster| {
+        let learner = container(cluster.learner_pod()?)?;
+        let run = PathBuf::from(option(learner, "--run")?);
+        let mounts = learner.volume_mounts.iter().flatten();
+        let mount = mounts.into_iter().find(|mount| run.starts_with(&mount.mount_path)).context("no volume for it")?;
+        let claims = cluster.learner.spec.volume_claim_templates.iter().flatten();
+        let claim = claims.into_iter().find(|claim| claim.metadata.name.as_ref() == Some(&mount.name));
+        let claim = claim.and_then(|claim| claim.spec.as_ref()).context("the volume is the pod's own")?;
+        ensure!(claim.access_modes.as_deref() == Some(&["ReadWriteOnce".to_owned()]), "{claim:?}");
+        let requests = claim.resources.as_ref().and_then(|resources| resources.requests.as_ref());
+        ensure!(amount(&requests.context("how large?")?["storage"])? > 0.0, "{requests:?}");
+        ensure!(mount.read_only.is_none() && mount.sub_path.is_none(), "{mount:?}");
+        Ok(())
+    })
+}
+
+#[test]
+fn a_learner_has_time_for_its_last_checkpoint_and_an_actor_for_its_unrolls() -> Result<()> {
+    each(|cluster| {
+        ensure!(cluster.learner_pod()?.termination_grace_period_seconds > Some(30));
+        ensure!(cluster.actor_pod()?.termination_grace_period_seconds > Some(5));
+        Ok(())
+    })
+}
+
+#[test]
+fn who_computes_on_an_accelerator_asks_for_one_and_tolerates_its_nodes() -> Result<()> {
+    each(|cluster| {
+        let pod = cluster.learner_pod()?;
+        let learner = container(pod)?;
+        let limits = learner.resources.as_ref().and_then(|resources| resources.limits.as_ref()).context("no limits")?;
+        let taken: Vec<_> = limits.iter().filter(|(name, _)| name.contains('/')).collect();
+        let tolerated: Vec<_> = pod.tolerations.iter().flatten().filter_map(|node| node.key.as_deref()).collect();
+        match option(learner, "--device").ok() {
+            None => ensure!(taken.is_empty() && tolerated.is_empty(), "{taken:?} for nothing"),
+            Some(device) => {
+                let resource = BTreeMap::from([("cuda", "nvidia.com/gpu"), ("xla", "google.com/tpu")])[device];
+                let [(name, Quantity(count))] = taken[..] else { bail!("{taken:?}") };
+                ensure!(name == resource && count == "1" && tolerated == [resource], "{taken:?} {tolerated:?}");
+            }
+        }
+        Ok(())
+    })
+}
