@@ -35,7 +35,7 @@ pub enum Error {
         message: String,
     },
     /// The learner has worked with this process and will not do so any longer.
-    #[error("the learner does not take actor {actor} back: {message}; start the actor again")]
+    #[error("the learner does not take actor {actor} back: {message}")]
     Dismissed {
         /// The index it had.
         actor: u64,

@@ -61,6 +61,10 @@ struct Act {
     learner: Option<String>,
     #[command(flatten)]
     access: Access,
+    /// Who this actor is over its restarts, such as a pod's index: of two processes of one name the newer one takes the older
+    /// one's place. Nobody unless given.
+    #[arg(long, value_name = "NAME", env = "COMIC_ACTOR_NAME", value_parser = clap::builder::NonEmptyStringValueParser::new())]
+    name: Option<String>,
     /// Threads; the experiment's number unless given.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
@@ -114,12 +118,12 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
         Some(Command::Health(health)) => health.run(),
         Some(Command::Bench(bench)) => bench.run().context("cannot measure"),
         None => {
-            let Act { learner, access, threads, environments, cache, dump_diverged, pulse } = arguments.act;
+            let Act { learner, access, name, threads, environments, cache, dump_diverged, pulse } = arguments.act;
             let learner = learner.ok_or_else(|| {
                 Error::Usage("no learner: give its address with --learner http://host:7070, or see --help".into())
             })?;
             let (threads, environments) = (threads.map(usize::from), environments.map(usize::from));
-            run::run(&run::Options { learner, access, threads, environments, cache, dump_diverged, pulse })
+            run::run(&run::Options { learner, access, name, threads, environments, cache, dump_diverged, pulse })
                 .context("cannot act")
         }
     }

@@ -40,6 +40,8 @@ pub struct Options {
     pub learner: String,
     /// Certificates and token.
     pub access: Access,
+    /// Who this actor is over its restarts, if anybody.
+    pub name: Option<String>,
     /// Threads; the experiment's number when absent.
     pub threads: Option<usize>,
     /// Environments a thread; the experiment's number when absent.
@@ -82,6 +84,7 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
         learner: options.learner.clone(),
         access: options.access.clone(),
         cache: options.cache.clone(),
+        name: options.name.clone(),
         threads: options.threads,
         environments: options.environments,
     };

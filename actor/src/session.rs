@@ -48,6 +48,8 @@ pub struct Options {
     pub access: Access,
     /// Directory of the asset cache; [`default_cache`] when absent.
     pub cache: Option<PathBuf>,
+    /// Who this actor is over its restarts: a newer process of a name takes the older one's place. Nobody when absent.
+    pub name: Option<String>,
     /// Threads; the experiment's number when absent.
     pub threads: Option<usize>,
     /// Environments a thread; the experiment's number when absent.
@@ -160,7 +162,7 @@ async fn join_for_ever(options: &Options) -> Result<Joined, Error> {
 type Answer = (Link, Told, HashMap<String, PathBuf>);
 
 async fn attempt(options: &Options, connector: &mut Connector) -> Result<Answer, Failure> {
-    let mut link = connector.connect().await?;
+    let mut link = connector.connect(0).await?;
     let told = read_reply(&link.reply).map_err(Failure::Fatal)?;
     let assets = assets::fetch(&mut link, options.cache.as_deref()).await?;
     Ok((link, told, assets))
@@ -239,7 +241,7 @@ impl Joined {
             }
             let attempt = match link.take() {
                 Some(link) => Ok(link),
-                None => self.connector.reconnect(&self.terms).await,
+                None => self.connector.reconnect(&self.terms, outbox.acknowledged()).await,
             };
             let reason = match attempt {
                 Ok(link) => {

@@ -19,12 +19,16 @@ use sha2::{Digest as _, Sha256};
 
 use steps::{Step, carry_out, hidden, put, replace};
 
+use crate::options::Misuse;
+
 const MANIFEST: &str = "MANIFEST.json";
 const EPOCH: &str = "epoch";
 const BEST: &str = "best";
 const BEST_RECORD: &str = "best.json";
 /// Of a checkpoint that another one of the same name takes the place of.
 const FORMER: &str = "former-";
+/// Of a checkpoint that does not verify.
+const DAMAGED: &str = "damaged-";
 /// The part that says which life of the learner made a checkpoint, and what it had published.
 pub(crate) const PROGRESS: &str = "progress.json";
 
@@ -328,8 +332,8 @@ impl Store {
     /// what an earlier life left half-done is put right.
     ///
     /// # Errors
-    /// When the directory cannot be listed, or when there are checkpoints and none of them verifies: beginning anew
-    /// beside them would be a loss nobody asked for.
+    /// When the directory cannot be listed; [`Misuse`] when there are, or were, checkpoints and none of them verifies:
+    /// beginning anew beside them would be a loss nobody asked for.
     pub fn newest(&self) -> Result<Option<(PathBuf, Snapshot)>> {
         self.put_right()?;
         let numbered = numbered(&self.directory)?;
@@ -339,16 +343,17 @@ impl Store {
                 Err(error) => self.put_aside(path, &error)?,
             }
         }
-        if !numbered.is_empty() {
-            bail!("every checkpoint in {} is damaged: mend one, or give another --run", self.directory.display());
-        }
-        Ok(None)
+        // At every start, not at the first alone.
+        let named = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(DAMAGED));
+        let Some(aside) = entries(&self.directory)?.into_iter().find(named) else { return Ok(None) };
+        let (all, remedy) = (self.directory.display(), "mend one, remove it to begin anew, or give another --run");
+        Err(Misuse::new(format!("every checkpoint in {all} is damaged, as {} is: {remedy}", aside.display())).into())
     }
 
     fn put_aside(&self, path: &Path, error: &anyhow::Error) -> Result<()> {
         tracing::warn!(checkpoint = %path.display(), "a damaged checkpoint is put aside: {error:#}");
         let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let aside = self.directory.join(format!("damaged-{name}"));
+        let aside = self.directory.join(format!("{DAMAGED}{name}"));
         Step::Remove(aside.clone()).carry_out()?;
         carry_out(&put(path.to_path_buf(), &aside))
     }

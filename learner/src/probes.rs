@@ -60,7 +60,7 @@ fn respond(method: &Method, path: &str, shared: &Shared) -> Response<Full<Bytes>
     let (status, kind, body) = match (method, path) {
         (&Method::GET | &Method::HEAD, "/metrics") => (StatusCode::OK, OPEN_METRICS, shared.metrics_page()),
         (&Method::GET | &Method::HEAD, "/healthz") => (StatusCode::OK, "text/plain", "ok\n".into()),
-        (&Method::GET | &Method::HEAD, "/readyz") if shared.is_closing() => {
+        (&Method::GET | &Method::HEAD, "/readyz") if shared.is_draining() => {
             (StatusCode::SERVICE_UNAVAILABLE, "text/plain", "going down\n".into())
         }
         (&Method::GET | &Method::HEAD, "/readyz") => (StatusCode::OK, "text/plain", "ready\n".into()),

@@ -85,7 +85,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
         listening["metrics"] = metrics.local_addr()?.to_string().into();
         tokio::spawn(probes::serve(metrics, shared.clone()));
     }
-    let serving = tokio::spawn(service::serve(listener, shared, async {
+    let serving = tokio::spawn(service::serve(listener, shared.clone(), async {
         let _ = stopped.await;
     }));
     // Nobody has to read it.
@@ -101,6 +101,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
         Some(ending) => ending,
         None => {
             tracing::info!("stopping after this update; a checkpoint follows. A second signal does not wait for it");
+            shared.drain();
             batcher.close();
             tokio::select! {
                 ending = &mut training => ending,

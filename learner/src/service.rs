@@ -34,11 +34,13 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, ensure};
 use comic_clips::Asset;
 use comic_experiment::{Experiment, TaskSpec};
+use comic_proto::v1::Behaviour;
 use comic_proto::v1::learner_server::LearnerServer;
 use comic_proto::{FILE_DESCRIPTOR_SET, UnrollShape};
 use comic_replay::Batcher;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
+use tonic::Status;
 use tonic::transport::Server;
 use tonic_health::ServingStatus;
 
@@ -154,6 +156,8 @@ pub struct Shared {
     /// Of an actor whose command line says nothing else: threads, and environments of each.
     actor: (u64, u64),
     pub(crate) telemetry: Arc<Telemetry>,
+    /// From the signal on: nobody else comes in.
+    draining: watch::Sender<bool>,
     closing: watch::Sender<bool>,
 }
 
@@ -202,6 +206,7 @@ impl Shared {
             metrics: Mutex::new(String::from("{}")),
             evaluations: Mutex::new(VecDeque::new()),
             complaints: Complaints::default(),
+            draining: watch::Sender::new(false),
             closing: watch::Sender::new(false),
         }))
     }
@@ -223,9 +228,20 @@ impl Shared {
         (self.limits.max_connections(), self.limits.max_requests, self.message_limit, held)
     }
 
+    /// From now on nobody else comes in, and who looks is told that the server goes down.
+    pub fn drain(&self) {
+        self.draining.send_replace(true);
+    }
+
     /// Whether the server goes down.
-    pub(crate) fn is_closing(&self) -> bool {
-        *self.closing.borrow()
+    pub(crate) fn is_draining(&self) -> bool {
+        *self.draining.borrow() || *self.closing.borrow()
+    }
+
+    /// What streams end with when the server closes: `None` once the run is over, which actors were told.
+    fn parting(&self) -> Option<Status> {
+        let over = self.publisher.newest().is_some_and(|newest| newest.behaviour == Behaviour::Leave);
+        (!over).then(calls::draining)
     }
 
     /// Keeps an evaluation for the trainer. False when too many wait already.
@@ -304,8 +320,16 @@ pub async fn serve(listener: TcpListener, shared: Arc<Shared>, shutdown: impl Fu
             closing.begun().await;
         });
     let mut server = pin!(server);
+    let draining = async {
+        Closing(shared.draining.subscribe()).begun().await;
+        for service in ["", "comic.v1.Learner"] {
+            reporter.set_service_status(service, ServingStatus::NotServing).await;
+        }
+        std::future::pending().await
+    };
     tokio::select! {
         served = &mut server => return served.context("the server stopped accepting connections"),
+        () = draining => {}
         () = shutdown => {}
     }
     for service in ["", "comic.v1.Learner"] {

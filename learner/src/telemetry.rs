@@ -280,8 +280,9 @@ impl Default for Telemetry {
             joins: all.labelled(
                 "counter",
                 ("comic_joins", "result"),
-                &["joined", "full", "refused"],
-                "Attempts to join, reconnections included: taken, refused since --max-actors are there, refused for good",
+                &["joined", "full", "draining", "refused"],
+                "Attempts to join, reconnections included: taken, refused since --max-actors are there or since the learner \
+                 goes down, refused for good",
             ),
             connections: all.gauge("comic_connections", "Connections that are open"),
             connections_refused: all.labelled(

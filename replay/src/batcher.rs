@@ -129,6 +129,11 @@ impl Batcher {
         self.lock().ledger.join(incarnation, claimed)
     }
 
+    /// See [`Ledger::catch_up`].
+    pub fn catch_up(&self, actor: u64, sequence: u64) -> u64 {
+        self.lock().ledger.catch_up(actor, sequence)
+    }
+
     /// Puts a validated unroll into a batch, waiting for a slot as long as it takes, or says why not.
     ///
     /// Cancel-safe: until it returns, nothing has happened.

@@ -212,6 +212,19 @@ impl Ledger {
         Ok(Joined { actor, next_sequence: 0 })
     }
 
+    /// Accounts for every number below `sequence`, all of which were acknowledged to the actor: those that its account does not
+    /// speak of were lost with the life of the learner that did. Says which number comes next.
+    pub fn catch_up(&mut self, actor: u64, sequence: u64) -> u64 {
+        let Some(entry) = self.entries.get_mut(&actor) else { return 0 };
+        let lost = sequence.min(MAX_SEQUENCE).saturating_sub(entry.next_sequence);
+        if let Some(produced) = self.sums.produced.checked_add(lost) {
+            entry.next_sequence += lost;
+            self.sums.produced = produced;
+            self.sums.dropped.count(Reason::LostAtRestart, lost);
+        }
+        entry.next_sequence
+    }
+
     fn close_least_recent(&mut self) {
         let least = self.entries.iter().min_by_key(|(_, entry)| entry.heard).map(|(actor, _)| *actor);
         if let Some(entry) = least.and_then(|actor| self.entries.remove(&actor)) {

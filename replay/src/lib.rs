@@ -14,6 +14,7 @@
 //! 2. Any other unroll that the batcher decides about moves the account to one past its number, so *produced* is the
 //!    sum of all accounts, open and closed. The numbers it skips were lost with an earlier life of the learner and are
 //!    dropped as **lost at restart**.
+//!    An actor that joins says how far it was acknowledged, and the account moves there in the same way.
 //! 3. The unroll itself is either dropped for a reason — **invalid**; **superseded**, made in another epoch or in
 //!    another phase (demonstrations and policy are phases); **stale**, made with parameters more than `max_staleness`
 //!    published versions old — or it is copied into a slot of the open batch and is then *in flight*. Where slots are

@@ -89,6 +89,26 @@ fn an_actor_that_reconnects_finds_its_account_and_the_learner_counts_what_it_mis
 }
 
 #[test]
+fn an_actor_that_sends_nothing_more_still_says_what_was_lost() {
+    let before = batcher();
+    let actor = Actor::join(&before, 5);
+    assert_eq!(actor.send(&before, 0), Some(Outcome::Taken));
+    let snapshot = before.snapshot();
+    assert_eq!(actor.send(&before, 1), Some(Outcome::Taken));
+    assert_eq!(actor.send(&before, 2), Some(Outcome::Taken));
+
+    let after = restarted(&snapshot);
+    let joined = after.join(5, Some(actor.actor)).unwrap();
+    assert_eq!(after.catch_up(joined.actor, 3), 3);
+    assert_eq!(after.catch_up(joined.actor, 2), 3, "an account does not go back");
+    let dropped = Dropped { lost_at_restart: 3, ..Dropped::default() };
+    assert_eq!(after.books(), Books { produced: 3, dropped, ..Books::default() });
+    assert_eq!(after.catch_up(99, 3), 0, "nobody's numbers are not counted");
+    assert_eq!(after.books().produced, 3);
+    assert_eq!(actor.send(&after, 2), Some(Outcome::Duplicate), "it is never trained on again");
+}
+
+#[test]
 fn an_actor_the_checkpoint_does_not_know_starts_afresh() {
     let before = batcher();
     let snapshot = before.snapshot();

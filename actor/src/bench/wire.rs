@@ -120,6 +120,7 @@ async fn send(address: &str, unroll: &FinishedUnroll, unrolls: usize) -> Result<
         learner: address.to_string(),
         access: Access::default(),
         cache: None,
+        name: None,
         threads: None,
         environments: None,
     };

@@ -48,6 +48,7 @@ pub(super) struct Link {
 pub(super) struct Connector {
     address: String,
     access: Access,
+    name: String,
     threads: Option<u32>,
     environments: Option<u32>,
     incarnation: u64,
@@ -62,6 +63,7 @@ impl Connector {
         let connector = Self {
             address: options.learner.clone(),
             access: options.access.clone(),
+            name: options.name.clone().unwrap_or_default(),
             threads: number(options.threads),
             environments: number(options.environments),
             incarnation: rand::random(),
@@ -95,7 +97,8 @@ impl Connector {
         self.incarnation
     }
 
-    pub(super) async fn connect(&mut self) -> Result<Link, Failure> {
+    /// `acknowledged` is one past the last sequence number that was.
+    pub(super) async fn connect(&mut self, acknowledged: u64) -> Result<Link, Failure> {
         let mut client = self.client().await?.max_decoding_message_size(MESSAGE_LIMIT);
         let mut request = Request::new(JoinRequest {
             incarnation: self.incarnation,
@@ -103,6 +106,8 @@ impl Connector {
             protocol: PROTOCOL_VERSION,
             threads: self.threads,
             environments: self.environments,
+            acknowledged,
+            name: self.name.clone(),
         });
         request.set_timeout(CALL);
         let reply = match client.join(request).await {
@@ -139,8 +144,8 @@ impl Connector {
     }
 
     /// Connects and checks that the experiment is still `terms`.
-    pub(super) async fn reconnect(&mut self, terms: &Terms) -> Result<Link, Failure> {
-        let link = self.connect().await?;
+    pub(super) async fn reconnect(&mut self, terms: &Terms, acknowledged: u64) -> Result<Link, Failure> {
+        let link = self.connect(acknowledged).await?;
         if Terms::of(&link.reply) == *terms { Ok(link) } else { Err(Failure::Fatal(Error::Changed)) }
     }
 

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use comic_proto::Client;
-use comic_proto::v1::{UnrollAck, UnrollMessage, WatchRequest};
+use comic_proto::v1::{UnrollAck, UnrollMessage, Verdict, WatchRequest};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio_stream::wrappers::ReceiverStream;
@@ -58,6 +58,9 @@ impl Exchange<'_> {
                     // Before the ticket comes back: the worker that waits for it goes on with this version or a newer.
                     self.mailbox.announce(ack.learner_epoch, ack.version);
                     self.outbox.settle(&ack);
+                    if ack.verdict() == Verdict::Rejoin && ack.learner_epoch != reply.learner_epoch {
+                        break Ended::Lost("the learner began another life: joining that".into());
+                    }
                 }
                 Ok(permit) = up.reserve(), if self.outbox.has_unsent() => {
                     if let Some(message) = self.outbox.send(actor, incarnation) {

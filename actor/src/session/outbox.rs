@@ -70,6 +70,11 @@ impl Outbox {
         self.settled
     }
 
+    /// One past the last number before which everything was acknowledged.
+    pub(super) fn acknowledged(&self) -> u64 {
+        self.waiting.front().map_or(self.next_sequence, |(sequence, _)| *sequence)
+    }
+
     /// A new connection: everything is to be sent again.
     pub(super) fn rewind(&mut self) {
         self.sent = 0;
@@ -123,7 +128,7 @@ impl Outbox {
         match Verdict::try_from(ack.verdict) {
             Ok(Verdict::Taken) => self.settled.taken += 1,
             Ok(Verdict::Duplicate) => self.settled.duplicate += 1,
-            Ok(Verdict::Stale | Verdict::Superseded) => self.settled.stale += 1,
+            Ok(Verdict::Stale | Verdict::Superseded | Verdict::Rejoin) => self.settled.stale += 1,
             Ok(Verdict::Invalid | Verdict::Unspecified) | Err(_) => {
                 self.settled.invalid += 1;
                 self.log_refusal(ack);

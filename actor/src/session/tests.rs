@@ -12,7 +12,14 @@ use learner::{FakeLearner, Script};
 const LIMITS: Limits = Limits { window: 4, parameters: 1000, flush: Duration::from_secs(60) };
 
 fn options_for(learner: impl Into<String>) -> Options {
-    Options { learner: learner.into(), access: Access::default(), cache: None, threads: None, environments: None }
+    Options {
+        learner: learner.into(),
+        access: Access::default(),
+        cache: None,
+        name: None,
+        threads: None,
+        environments: None,
+    }
 }
 
 /// An unroll that names itself by its version.
@@ -72,6 +79,8 @@ async fn connections_dropped_in_mid_stream_lose_nothing_repeat_nothing_and_keep_
         "one process, one incarnation"
     );
     assert_eq!(seen.joins[0].actor, None);
+    let acknowledged: Vec<_> = seen.joins.iter().map(|join| join.acknowledged).collect();
+    assert_eq!(acknowledged, [0, 1, 2, 7, 7, 7], "as far as every number was");
     assert!(seen.joins[1..].iter().all(|join| join.actor == Some(learner::ACTOR)));
 }
 

@@ -336,7 +336,7 @@ impl Crowd {
                     match ack.verdict() {
                         // Of a duplicate it was the acknowledgement that was lost.
                         Verdict::Taken | Verdict::Duplicate => &self.taken,
-                        Verdict::Stale | Verdict::Superseded => &self.stale,
+                        Verdict::Stale | Verdict::Superseded | Verdict::Rejoin => &self.stale,
                         _ => anyhow::bail!("refused: {}", ack.detail),
                     }
                     .fetch_add(1, Relaxed);

@@ -13,6 +13,7 @@ use tonic::body::Body;
 use tonic::{Status, Streaming};
 use tonic_prost::ProstDecoder;
 
+use super::calls::superseded;
 use super::roster::Presence;
 use super::streams::respond;
 use super::{Closing, Shared};
@@ -26,21 +27,30 @@ pub(super) async fn watch(shared: &Arc<Shared>, request: Body) -> Result<Respons
     let decoder = ProstDecoder::<WatchRequest>::default();
     let mut requests = Streaming::new_request(decoder, request, None, Some(REQUEST_LIMIT));
     let request = requests.message().await?.ok_or_else(|| Status::invalid_argument("the request is missing"))?;
+    if shared.roster.is_superseded(request.incarnation) {
+        return Err(superseded());
+    }
     let present = shared.roster.watch(request.incarnation);
-    let reader = Reader { parameters: shared.publisher.subscribe(), closing: shared.closing(), _present: present };
+    let (parameters, closing) = (shared.publisher.subscribe(), shared.closing());
+    let reader = Reader { shared: shared.clone(), parameters, closing, over: false, _present: present };
     Ok(respond(stream::unfold(reader, Reader::next)))
 }
 
 struct Reader {
+    shared: Arc<Shared>,
     parameters: Subscription,
     closing: Closing,
+    over: bool,
     _present: Presence,
 }
 
 impl Reader {
-    /// The next piece of the newest parameters. At the server's end only a farewell is still sent.
+    /// The next piece of the newest parameters. At the server's end only a farewell is still sent, or else that it drains.
     async fn next(mut self) -> Option<(Result<Bytes, Status>, Self)> {
-        let Self { parameters, closing, .. } = &mut self;
+        let Self { shared, parameters, closing, over, .. } = &mut self;
+        if *over {
+            return None;
+        }
         let piece = if closing.has_begun() {
             parameters.farewell()
         } else {
@@ -49,7 +59,9 @@ impl Reader {
                 () = closing.begun() => parameters.farewell(),
                 piece = parameters.next() => piece,
             }
-        }?;
-        Some((Ok(piece.frame), self))
+        };
+        *over = piece.is_none();
+        let answer = piece.map(|piece| Ok(piece.frame)).or_else(|| shared.parting().map(Err))?;
+        Some((answer, self))
     }
 }

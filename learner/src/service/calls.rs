@@ -3,18 +3,22 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use comic_proto::PROTOCOL_VERSION;
 use comic_proto::v1::learner_server::Learner;
 use comic_proto::v1::{
     self, AssetChunk, AssetRequest, Environments, EvaluationAck, EvaluationReport, JoinReply, JoinRequest,
     ParametersChunk, StatusRequest, UnrollAck, UnrollMessage, WatchRequest,
 };
+use comic_proto::{MAX_SEQUENCE, PROTOCOL_VERSION};
 use futures::stream::{BoxStream, StreamExt as _};
 use serde::de::IgnoredAny;
 use tonic::{Request, Response, Status, Streaming};
 
+use super::roster::Admission;
 use super::shares::{Denied, Share};
 use super::{Evaluation, Shared, assets, status};
+
+/// Bytes of an actor's name, as many as a host's can have.
+const NAME_LIMIT: usize = 253;
 
 /// The service, as tonic wants it: one per server, shared by every connection.
 #[derive(Debug)]
@@ -37,7 +41,7 @@ impl Learner for Calls {
     async fn join(&self, request: Request<JoinRequest>) -> Result<Response<JoinReply>, Status> {
         let peer = request.remote_addr();
         let request = request.into_inner();
-        let JoinRequest { incarnation, actor, protocol, .. } = request;
+        let JoinRequest { incarnation, actor, protocol, acknowledged, .. } = request;
         let shared = &self.shared;
         let joins = &shared.telemetry.joins;
         if protocol != PROTOCOL_VERSION {
@@ -46,15 +50,36 @@ impl Learner for Calls {
                 "this learner speaks protocol {PROTOCOL_VERSION}, the actor {protocol}: run both from the same release"
             )));
         }
-        if !shared.roster.join(incarnation, Instant::now()) {
-            joins.of("full").inc();
-            return Err(Status::resource_exhausted("as many actors as --max-actors allows are here: try again later"));
+        if acknowledged > MAX_SEQUENCE || request.name.len() > NAME_LIMIT {
+            joins.of("refused").inc();
+            return Err(Status::invalid_argument(format!(
+                "acknowledged are at most {MAX_SEQUENCE} unrolls, not {acknowledged}; a name has {NAME_LIMIT} bytes at most, \
+                 not {}",
+                request.name.len()
+            )));
+        }
+        if shared.is_draining() {
+            joins.of("draining").inc();
+            return Err(draining());
+        }
+        match shared.roster.join(incarnation, &request.name, Instant::now()) {
+            Admission::Welcome => {}
+            Admission::Full => {
+                joins.of("full").inc();
+                let said = "as many actors as --max-actors allows are here: try again later";
+                return Err(Status::resource_exhausted(said));
+            }
+            Admission::Superseded => {
+                joins.of("refused").inc();
+                return Err(superseded());
+            }
         }
         let environments = environments_of(shared, &request)?;
         let joined = shared.batcher.join(incarnation, actor).map_err(|refused| {
             joins.of("refused").inc();
             Status::failed_precondition(refused.to_string())
         })?;
+        let next_sequence = shared.batcher.catch_up(joined.actor, acknowledged);
         joins.of("joined").inc();
         tracing::info!(actor = joined.actor, incarnation = format_args!("{incarnation:016x}"), peer = ?peer, "actor joined");
         let epoch = shared.publisher.epoch();
@@ -68,7 +93,7 @@ impl Learner for Calls {
             task_spec: shared.task_spec.clone(),
             assets: shared.assets.iter().map(assets::described).collect(),
             layout_hash: shared.batcher.layout().hash().to_vec(),
-            next_sequence: joined.next_sequence,
+            next_sequence,
             environments,
         }))
     }
@@ -110,6 +135,16 @@ impl Learner for Calls {
     }
 }
 
+/// What actors are told while the learner goes down: it comes back, or another one does.
+pub(super) fn draining() -> Status {
+    Status::unavailable("the learner is draining: reconnect")
+}
+
+/// What an actor is told whose place is taken.
+pub(super) fn superseded() -> Status {
+    Status::failed_precondition("a newer process of the same name took this one's place")
+}
+
 /// What an actor simulates of a run in lockstep; nothing in particular otherwise.
 fn environments_of(shared: &Shared, request: &JoinRequest) -> Result<Option<Environments>, Status> {
     let JoinRequest { incarnation, actor, threads, environments, .. } = *request;
@@ -124,7 +159,7 @@ fn environments_of(shared: &Shared, request: &JoinRequest) -> Result<Option<Envi
         }
         Denied::Lost => {
             shared.telemetry.joins.of("refused").inc();
-            Status::failed_precondition("in lockstep the environments it had were begun anew")
+            Status::failed_precondition("in lockstep the environments it had were begun anew: start the actor again")
         }
     })?;
     tracing::info!(?environments, left, "in lockstep: every batch waits for every environment");

@@ -1,6 +1,7 @@
 //! Connections as they come in: counted, limited, and through TLS where it is on.
 
 use std::collections::HashMap;
+use std::future::Future as _;
 use std::io;
 use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
@@ -12,6 +13,7 @@ use futures::stream::{self, Stream};
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
+use tokio::time::Sleep;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
 use super::complaints::Complaints;
@@ -19,8 +21,10 @@ use super::lock;
 use crate::security::{Limits, Tls};
 use crate::telemetry::Telemetry;
 
-/// A handshake takes a few round trips; whoever takes longer is turned away.
+/// A handshake takes a few round trips, TLS's and HTTP/2's each; whoever takes longer is turned away.
 const HANDSHAKE: Duration = Duration::from_secs(10);
+/// Bytes with which HTTP/2 begins (RFC 9113, 3.4). From then on pings find out who is not there any more.
+const PREFACE: usize = 24;
 /// How long a peer whose handshake failed may take to read why.
 const LINGER: Duration = Duration::from_secs(1);
 /// Before listening again when the system has no file descriptor to give.
@@ -114,7 +118,7 @@ impl Door {
             Some(tls) => {
                 let handshake = tls.acceptor().accept(stream).into_fallible();
                 let (error, stream) = match tokio::time::timeout(HANDSHAKE, handshake).await {
-                    Ok(Ok(stream)) => return Some(Connection { stream: Box::pin(stream), info, _place: place }),
+                    Ok(Ok(stream)) => return Some(Connection::new(Box::pin(stream), info, place)),
                     Ok(Err((error, stream))) => (error, Some(stream)),
                     Err(_) => (io::ErrorKind::TimedOut.into(), None),
                 };
@@ -128,7 +132,7 @@ impl Door {
                 return None;
             }
         };
-        Some(Connection { stream, info, _place: place })
+        Some(Connection::new(stream, info, place))
     }
 }
 
@@ -168,8 +172,17 @@ impl<T: AsyncRead + AsyncWrite + Send> Socket for T {}
 /// A connection that got in, with TLS or without.
 pub(super) struct Connection {
     stream: Pin<Box<dyn Socket>>,
+    /// Of a peer that has not begun to speak HTTP/2: how many bytes are missing, and until when.
+    silence: Option<(usize, Pin<Box<Sleep>>)>,
     info: TcpConnectInfo,
     _place: Place,
+}
+
+impl Connection {
+    fn new(stream: Pin<Box<dyn Socket>>, info: TcpConnectInfo, place: Place) -> Self {
+        let silence = Some((PREFACE, Box::pin(tokio::time::sleep(HANDSHAKE))));
+        Self { stream, silence, info, _place: place }
+    }
 }
 
 impl Connected for Connection {
@@ -182,7 +195,17 @@ impl Connected for Connection {
 
 impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, context: &mut Context<'_>, into: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        self.stream.as_mut().poll_read(context, into)
+        let before = into.filled().len();
+        let read = self.stream.as_mut().poll_read(context, into);
+        if let Some((missing, deadline)) = &mut self.silence {
+            *missing = missing.saturating_sub(into.filled().len() - before);
+            if *missing == 0 {
+                self.silence = None;
+            } else if deadline.as_mut().poll(context).is_ready() {
+                return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
+            }
+        }
+        read
     }
 }
 

@@ -36,8 +36,22 @@ pub(super) struct Roster {
     actors: Mutex<HashMap<u64, Actor>>,
 }
 
-#[derive(Clone, Copy, Debug)]
+/// Whether an actor may come in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Admission {
+    Welcome,
+    /// There are too many.
+    Full,
+    /// A newer process of its name took its place.
+    Superseded,
+}
+
+#[derive(Clone, Debug)]
 struct Actor {
+    /// Who it is over its restarts; empty is nobody.
+    name: String,
+    /// A newer process of its name came.
+    superseded: bool,
     /// Streams of parameters that are open.
     streams: u32,
     /// Unrolls of it that wait for a place in a batch.
@@ -49,7 +63,8 @@ struct Actor {
 
 impl Actor {
     fn is_present(&self, now: Instant) -> bool {
-        self.streams > 0 || (self.gone.is_none() && now.duration_since(self.heard) < JOINING)
+        let lately = self.gone.is_none() && now.duration_since(self.heard) < JOINING;
+        !self.superseded && (self.streams > 0 || lately)
     }
 
     fn is_slow(&self, now: Instant) -> bool {
@@ -66,24 +81,40 @@ impl Roster {
         Self { limit, actors: Mutex::default() }
     }
 
-    /// Lets an actor in, or says that there are too many; one that is in already always stays.
-    pub(super) fn join(&self, incarnation: u64, now: Instant) -> bool {
+    /// Lets an actor in, in the place of an older one of its name, or says why not; one that is in already always stays.
+    pub(super) fn join(&self, incarnation: u64, name: &str, now: Instant) -> Admission {
         let mut actors = lock(&self.actors);
-        if let Some(actor) = actors.get_mut(&incarnation).filter(|actor| actor.is_present(now)) {
-            actor.heard = now;
-            return true;
+        match actors.get_mut(&incarnation) {
+            Some(actor) if actor.superseded => return Admission::Superseded,
+            Some(actor) if actor.is_present(now) => {
+                actor.heard = now;
+                return Admission::Welcome;
+            }
+            _ => {}
         }
-        if actors.values().filter(|actor| actor.is_present(now)).count() >= self.limit {
-            return false;
+        let older = |other: u64, actor: &Actor| other != incarnation && !name.is_empty() && actor.name == name;
+        let rivals = actors.iter().filter(|(other, actor)| actor.is_present(now) && !older(**other, actor));
+        if rivals.count() >= self.limit {
+            return Admission::Full;
+        }
+        for (other, actor) in actors.iter_mut() {
+            actor.superseded |= older(*other, actor);
         }
         if actors.len() >= LOST {
             actors.retain(|_, actor| actor.is_present(now));
         } else {
             actors.retain(|_, actor| actor.is_remembered(now));
         }
-        let actor = actors.entry(incarnation).or_insert(Actor { streams: 0, waiting: 0, heard: now, gone: None });
+        let name = name.to_owned();
+        let actor = Actor { name, superseded: false, streams: 0, waiting: 0, heard: now, gone: None };
+        let actor = actors.entry(incarnation).or_insert(actor);
         (actor.heard, actor.gone) = (now, None);
-        true
+        Admission::Welcome
+    }
+
+    /// Whether a newer process of its name took its place.
+    pub(super) fn is_superseded(&self, incarnation: u64) -> bool {
+        lock(&self.actors).get(&incarnation).is_some_and(|actor| actor.superseded)
     }
 
     /// Whether an actor is there, or went so lately that it may be on its way back.
@@ -91,14 +122,16 @@ impl Roster {
         let lately = |gone: Instant| now.duration_since(gone) < JOINING;
         lock(&self.actors)
             .get(&incarnation)
-            .is_some_and(|actor| actor.is_present(now) || actor.gone.is_some_and(lately))
+            .is_some_and(|actor| actor.is_present(now) || (!actor.superseded && actor.gone.is_some_and(lately)))
     }
 
-    /// Notes that something came from an actor.
-    pub(super) fn heard(&self, incarnation: u64, now: Instant) {
-        if let Some(actor) = lock(&self.actors).get_mut(&incarnation) {
-            actor.heard = now;
-        }
+    /// Notes that something came from an actor, which is there then, whatever became of its stream of parameters. False if it
+    /// is superseded.
+    pub(super) fn heard(&self, incarnation: u64, now: Instant) -> bool {
+        let mut actors = lock(&self.actors);
+        let Some(actor) = actors.get_mut(&incarnation) else { return true };
+        (actor.heard, actor.gone) = (now, None);
+        !actor.superseded
     }
 
     /// Notes a stream of parameters, until what is returned is dropped. Who has not joined is not counted.
@@ -176,10 +209,14 @@ mod tests {
         (alive, slow, lost, waiting)
     }
 
+    fn joins(roster: &Roster, incarnation: u64, now: Instant) -> bool {
+        roster.join(incarnation, "", now) == Admission::Welcome
+    }
+
     #[test]
     fn actors_are_alive_then_slow_then_lost_then_forgotten() {
         let (roster, start) = (Arc::new(Roster::new(10)), Instant::now());
-        assert!(roster.join(1, start));
+        assert!(joins(&roster, 1, start));
         assert_eq!(census(&roster, start), (1, 0, 0, 0));
         let watching = roster.watch(1);
         assert_eq!(census(&roster, start + SLOW), (0, 1, 0, 0));
@@ -196,17 +233,50 @@ mod tests {
     #[test]
     fn the_limit_counts_those_who_are_there_and_never_those_who_come_back() {
         let (roster, start) = (Arc::new(Roster::new(2)), Instant::now());
-        assert!(roster.join(1, start) && roster.join(2, start));
-        assert!(!roster.join(3, start));
-        assert!(roster.join(1, start), "a reconnection");
-        assert!(roster.join(3, start + JOINING), "who joins and opens no stream gives up the place");
+        assert!(joins(&roster, 1, start) && joins(&roster, 2, start));
+        assert!(!joins(&roster, 3, start));
+        assert!(joins(&roster, 1, start), "a reconnection");
+        assert!(joins(&roster, 3, start + JOINING), "who joins and opens no stream gives up the place");
+    }
+
+    #[test]
+    fn a_newer_process_of_a_name_takes_the_older_ones_place_for_ever() {
+        let (roster, start) = (Arc::new(Roster::new(2)), Instant::now());
+        assert_eq!(roster.join(1, "pod-0", start), Admission::Welcome);
+        assert_eq!(roster.join(2, "pod-1", start), Admission::Welcome);
+        let _watching = roster.watch(1);
+        assert_eq!(roster.join(3, "pod-2", start), Admission::Full);
+        assert_eq!(roster.join(4, "pod-0", start), Admission::Welcome, "there is one less");
+        assert!(!roster.heard(1, start) && roster.heard(4, start));
+        assert!(roster.is_superseded(1) && !roster.is_superseded(2) && !roster.is_superseded(4));
+        assert!(!roster.expects(1, start) && roster.expects(4, start));
+        assert_eq!(roster.join(1, "pod-0", start), Admission::Superseded);
+        assert_eq!(roster.join(4, "pod-0", start), Admission::Welcome, "a reconnection");
+        assert_eq!(roster.join(2, "pod-1", start), Admission::Welcome);
+    }
+
+    #[test]
+    fn who_has_no_name_is_in_nobodys_place() {
+        let (roster, start) = (Roster::new(2), Instant::now());
+        assert!(joins(&roster, 1, start) && joins(&roster, 2, start));
+        assert!(roster.heard(1, start) && roster.heard(2, start));
+    }
+
+    #[test]
+    fn who_sends_is_there_although_it_reads_no_parameters_any_more() {
+        let (roster, start) = (Arc::new(Roster::new(1)), Instant::now());
+        assert!(joins(&roster, 1, start));
+        drop(roster.watch(1));
+        let later = Instant::now();
+        roster.heard(1, later);
+        assert_eq!(roster.join(2, "", later), Admission::Full);
     }
 
     #[test]
     fn an_actor_is_expected_while_it_is_there_and_a_little_longer() {
         let (roster, start) = (Arc::new(Roster::new(10)), Instant::now());
         assert!(!roster.expects(1, start));
-        assert!(roster.join(1, start) && roster.expects(1, start));
+        assert!(joins(&roster, 1, start) && roster.expects(1, start));
         let watching = roster.watch(1);
         assert!(roster.expects(1, start + JOINING * 2));
         drop(watching);
@@ -221,7 +291,7 @@ mod tests {
         assert_eq!(lock(&roster.actors).len(), 0);
         let start = Instant::now();
         for incarnation in 0..100 {
-            assert!(roster.join(incarnation, start + (JOINING + REMEMBERED) * incarnation as u32));
+            assert!(joins(&roster, incarnation, start + (JOINING + REMEMBERED) * incarnation as u32));
         }
         assert!(lock(&roster.actors).len() < 3);
     }

@@ -11,6 +11,7 @@ use tonic::Status;
 use tonic::body::Body;
 use tracing::{Instrument as _, Span};
 
+use super::calls::superseded;
 use super::streams::{Broken, Messages};
 use super::{Closing, Shared};
 
@@ -29,15 +30,15 @@ impl UnrollStream {
         Self { closing: shared.closing(), shared, incoming, over: false }
     }
 
-    /// Takes one unroll and answers it. `None` when the actor has no more, or the server closes; an unroll that was
-    /// not answered then is the actor's to send again.
+    /// Takes one unroll and answers it. `None` when the actor has no more, or the run is over; an unroll that was not
+    /// answered when the server closes is the actor's to send again.
     pub(super) async fn next(mut self) -> Option<(Result<Bytes, Status>, Self)> {
         if self.over {
             return None;
         }
         let answer = tokio::select! {
             biased;
-            () = self.closing.begun() => None,
+            () = self.closing.begun() => self.shared.parting().map(Err),
             // Giving this up half-way is safe: the batcher records nothing before it takes the unroll.
             answer = answer(&self.shared, &mut self.incoming) => answer,
         }?;
@@ -75,7 +76,7 @@ fn span(header: Option<&UnrollHeader>) -> Span {
     tracing::debug_span!("unroll", actor, incarnation = format_args!("{incarnation:016x}"), sequence, version)
 }
 
-/// Checks an unroll and puts it into a batch. `None` when the batcher is closed.
+/// Checks an unroll and puts it into a batch. `None` when the batcher is closed since the run is over.
 async fn take(shared: &Shared, unroll: ReceivedUnroll) -> Result<Option<UnrollAck>, Status> {
     let ReceivedUnroll { header, payload } = unroll;
     let Some(header) = header else {
@@ -83,7 +84,9 @@ async fn take(shared: &Shared, unroll: ReceivedUnroll) -> Result<Option<UnrollAc
         return Ok(Some(ack(shared, 0, Verdict::Invalid, Invalid::Header.to_string())));
     };
     shared.telemetry.unroll_bytes.observe(payload.len() as f64);
-    shared.roster.heard(header.incarnation, Instant::now());
+    if !shared.roster.heard(header.incarnation, Instant::now()) {
+        return Err(superseded());
+    }
     if let Some(shares) = &shared.shares
         && !shares.owns(header.incarnation, header.environment)
     {
@@ -117,7 +120,10 @@ async fn take(shared: &Shared, unroll: ReceivedUnroll) -> Result<Option<UnrollAc
     Ok(Some(match outcome {
         Outcome::Taken => ack(shared, sequence, Verdict::Taken, String::new()),
         Outcome::Duplicate => ack(shared, sequence, Verdict::Duplicate, String::new()),
-        Outcome::Superseded => ack(shared, sequence, Verdict::Superseded, superseded(&header, shared)),
+        Outcome::Superseded => {
+            let (verdict, detail) = out_of_time(&header, shared);
+            ack(shared, sequence, verdict, detail)
+        }
         Outcome::Stale => {
             let newest = shared.batcher.phase().version;
             ack(
@@ -143,17 +149,17 @@ async fn take(shared: &Shared, unroll: ReceivedUnroll) -> Result<Option<UnrollAc
                 header.actor, header.incarnation
             )));
         }
-        Outcome::Closed => return Ok(None),
+        Outcome::Closed => return shared.parting().map_or(Ok(None), Err),
     }))
 }
 
-fn superseded(header: &UnrollHeader, shared: &Shared) -> String {
+fn out_of_time(header: &UnrollHeader, shared: &Shared) -> (Verdict, String) {
     let epoch = shared.publisher.epoch();
     if header.learner_epoch != epoch {
-        return format!("made in learner epoch {}, this is {epoch}", header.learner_epoch);
+        return (Verdict::Rejoin, format!("made in learner epoch {}, this is {epoch}", header.learner_epoch));
     }
     let wanted = if shared.batcher.phase().demonstration { "demonstrations" } else { "the policy's own unrolls" };
-    format!("the learner wants {wanted} now")
+    (Verdict::Superseded, format!("the learner wants {wanted} now"))
 }
 
 fn ack(shared: &Shared, sequence: u64, verdict: Verdict, detail: String) -> UnrollAck {

@@ -3,6 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
 use comic_learner::checkpoint::{Evaluated, Judgement, Name, Snapshot, Store, find, read};
+use comic_learner::options::Misuse;
+use proptest::prelude::*;
 
 fn snapshot(content: &str) -> Snapshot {
     let mut snapshot = Snapshot::default();
@@ -32,6 +34,31 @@ fn a_damaged_one_is_skipped() {
     assert_eq!(store.newest().unwrap().unwrap().1, snapshot("one"));
 }
 
+proptest! {
+    /// In the manifest, in its parts, anywhere.
+    #[test]
+    fn whatever_is_cut_off_or_flipped_costs_no_more_than_one_checkpoint(
+        file in prop::sample::select(vec!["MANIFEST.json", "part", "other"]), place: prop::sample::Index, bit in 0..8u8,
+        cut: bool,
+    ) {
+        let run = tempfile::tempdir().unwrap();
+        let store = Store::open(run.path(), 3).unwrap();
+        let whole = |content: &str| {
+            let mut whole = snapshot(content);
+            whole.parts.insert("other".into(), vec![7; 40]);
+            whole
+        };
+        store.write(Name::Updates(1), &whole("one")).unwrap();
+        let newest = store.write(Name::Updates(2), &whole("two, and a little longer")).unwrap();
+        let file = newest.join(file);
+        let mut bytes = std::fs::read(&file).unwrap();
+        let place = place.index(bytes.len());
+        if cut { bytes.truncate(place) } else { bytes[place] ^= 1 << bit }
+        std::fs::write(&file, bytes).unwrap();
+        prop_assert_eq!(store.newest().unwrap().unwrap().1, whole("one"));
+    }
+}
+
 #[test]
 fn whoever_only_reads_passes_over_a_damaged_one_and_leaves_it_there() {
     let run = tempfile::tempdir().unwrap();
@@ -54,7 +81,11 @@ fn a_run_with_nothing_but_damaged_ones_does_not_begin_anew() {
     let store = Store::open(run.path(), 3).unwrap();
     let only = store.write(Name::Updates(1), &snapshot("one")).unwrap();
     std::fs::write(only.join("part"), "øne").unwrap();
-    assert!(format!("{:#}", store.newest().unwrap_err()).contains("--run"));
+    for start in 1..=2 {
+        let refused = Store::open(run.path(), 3).unwrap().newest().unwrap_err();
+        assert!(refused.is::<Misuse>(), "whoever restarts it would be wrong to: {refused:#}");
+        assert!(format!("{refused:#}").contains("--run"), "start {start}: {refused:#}");
+    }
     assert!(run.path().join("checkpoints/damaged-checkpoint-0000000001").is_dir());
 }
 

@@ -8,7 +8,7 @@ use comic_learner::publish::Publisher;
 use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
-use comic_proto::v1::{Environments, JoinRequest};
+use comic_proto::v1::{Environments, JoinRequest, Verdict, WatchRequest};
 use comic_proto::{PROTOCOL_VERSION, UnrollLayout, UnrollShape};
 use tonic::Code;
 
@@ -44,10 +44,49 @@ async fn the_seed_depends_on_experiment_and_index_and_not_on_the_process() {
 #[tokio::test]
 async fn another_protocol_is_refused_with_the_remedy() {
     let world = World::start().await;
-    let request = JoinRequest { protocol: PROTOCOL_VERSION + 1, ..joining(70) };
-    let refused = world.client().await.join(request).await.unwrap_err();
+    for protocol in [PROTOCOL_VERSION - 1, PROTOCOL_VERSION + 1] {
+        let refused = world.client().await.join(JoinRequest { protocol, ..joining(70) }).await.unwrap_err();
+        assert_eq!(refused.code(), Code::FailedPrecondition);
+        assert!(refused.message().contains("same release"), "{}", refused.message());
+    }
+}
+
+#[tokio::test]
+async fn what_an_earlier_life_acknowledged_is_counted_as_lost_as_soon_as_its_actor_is_back() {
+    let world = World::start().await;
+    let mut client = world.client().await;
+    let reply = client.join(JoinRequest { acknowledged: 7, ..joining(70) }).await.unwrap().into_inner();
+    assert_eq!(reply.next_sequence, 7);
+    let again = client.join(JoinRequest { acknowledged: 5, ..joining(70) }).await.unwrap().into_inner();
+    assert_eq!(again.next_sequence, 7, "no number is lost twice");
+    let books = world.batcher.books();
+    assert_eq!((books.produced, books.dropped.lost_at_restart), (7, 7));
+    let boast = client.join(JoinRequest { acknowledged: u64::MAX, ..joining(70) }).await.unwrap_err();
+    assert_eq!(boast.code(), Code::InvalidArgument);
+    assert_eq!(world.batcher.books(), books);
+}
+
+#[tokio::test]
+async fn a_newer_process_of_a_name_takes_the_older_ones_place() {
+    let world = World::start().await;
+    let named = |incarnation| JoinRequest { name: "comic-actor-0".into(), ..joining(incarnation) };
+    let mut older = world.named_actor(71, "comic-actor-0").await;
+    let mut newer = world.named_actor(72, "comic-actor-0").await;
+    let mut unrolls = older.stream().await;
+    let refused = unrolls.send(older.unroll(0)).await.unwrap_err();
     assert_eq!(refused.code(), Code::FailedPrecondition);
-    assert!(refused.message().contains("same release"), "{}", refused.message());
+    let refused = older.client.join(named(71)).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition, "it ends: {refused}");
+    assert!(refused.message().contains("newer process"), "{refused}");
+    let watch = WatchRequest { incarnation: 71, ..WatchRequest::default() };
+    let refused = older.client.watch_parameters(watch).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    let mut unrolls = newer.stream().await;
+    assert_eq!(unrolls.verdict(newer.unroll(0)).await, Verdict::Taken);
+    let books = newer.books().await;
+    assert_eq!((books.produced, books.in_flight), (1, 1), "what was refused had no number");
+    let long = JoinRequest { name: "x".repeat(254), ..joining(73) };
+    assert_eq!(newer.client.join(long).await.unwrap_err().code(), Code::InvalidArgument);
 }
 
 #[tokio::test]

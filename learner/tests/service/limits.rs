@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
+use std::io::ErrorKind;
 use std::time::Duration;
 
 use crate::support::{EPOCH, World, joining, within};
@@ -12,6 +13,8 @@ use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{EvaluationReport, StatusRequest, WatchRequest};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
 use tonic::Code;
 
 const LIMIT: Duration = Duration::from_secs(10);
@@ -41,6 +44,21 @@ async fn connections_from_one_address() {
         }
     };
     within(LIMIT, again).await;
+}
+
+/// It would keep a place that somebody else wants.
+#[tokio::test]
+async fn silence_from_the_beginning() {
+    let world = World::start().await;
+    let address = world.address.trim_start_matches("http://");
+    for word in [&b""[..], b"PRI * HTTP/2.0"] {
+        let mut silent = TcpStream::connect(address).await.unwrap();
+        silent.write_all(word).await.unwrap();
+        let mut said = Vec::new();
+        // The learner's first words, and then the end.
+        let ended = within(3 * LIMIT, silent.read_to_end(&mut said)).await;
+        assert!(ended.is_ok() || ended.is_err_and(|error| error.kind() == ErrorKind::ConnectionReset));
+    }
 }
 
 #[tokio::test]

@@ -4,22 +4,46 @@
 
 use std::time::{Duration, Instant};
 
-use crate::support::{BATCH, World, parameters, within};
+use crate::support::{BATCH, World, joining, parameters, within};
 use comic_proto::v1::{Behaviour, StatusRequest, Verdict, WatchRequest};
+use tonic::{Code, Status};
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
 
 /// A second on a machine that has nothing else to do.
 const LIMIT: Duration = Duration::from_secs(10);
 
+/// An actor that reads this comes back.
+fn drains(status: Status) {
+    assert_eq!(status.code(), Code::Unavailable);
+    assert!(status.message().contains("draining: reconnect"), "{status}");
+}
+
 #[tokio::test]
-async fn idle_streams_end_cleanly_within_a_second() {
+async fn who_asks_while_the_learner_drains_is_told_to_come_back() {
+    let world = World::start().await;
+    let mut actor = world.actor(70).await;
+    let mut health = HealthClient::new(world.channel().await);
+    let mut watch = health.watch(HealthCheckRequest::default()).await.unwrap().into_inner();
+    assert_eq!(watch.message().await.unwrap().unwrap().status(), ServingStatus::Serving);
+    world.shared.drain();
+    drains(actor.client.join(joining(71)).await.unwrap_err());
+    assert_eq!(within(LIMIT, watch.message()).await.unwrap().unwrap().status(), ServingStatus::NotServing);
+    assert!(world.shared.metrics_page().contains("comic_joins_total{result=\"draining\"} 1\n"));
+    assert!(actor.client.get_status(StatusRequest {}).await.is_ok(), "the books can still be read");
+}
+
+#[tokio::test]
+async fn idle_streams_end_within_a_second_and_say_why() {
     let mut world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;
     assert_eq!(unrolls.verdict(actor.unroll(0)).await, Verdict::Taken);
     let mut watch = actor.client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
     world.begin_shutdown();
-    assert!(within(LIMIT, unrolls.acks.message()).await.unwrap().is_none());
-    assert!(within(LIMIT, watch.message()).await.unwrap().is_none());
+    drains(within(LIMIT, unrolls.acks.message()).await.unwrap_err());
+    drains(within(LIMIT, watch.message()).await.unwrap_err());
     drop((actor, unrolls, watch));
     within(LIMIT, world.ended()).await.unwrap();
 }
@@ -36,7 +60,7 @@ async fn an_unroll_that_waits_for_a_slot_is_let_go_unanswered() {
     // A round trip on the same connection: by now the unroll has most likely arrived, and it waits.
     actor.books().await;
     world.begin_shutdown();
-    assert!(within(LIMIT, unrolls.acks.message()).await.unwrap().is_none());
+    drains(within(LIMIT, unrolls.acks.message()).await.unwrap_err());
     let books = world.batcher.books();
     assert_eq!((books.produced, books.in_flight), (4, 4));
 }
@@ -48,7 +72,7 @@ async fn a_closed_batcher_ends_the_streams_of_unrolls_too() {
     let mut unrolls = actor.stream().await;
     world.batcher.close();
     unrolls.sender.send(actor.unroll(0)).await.unwrap();
-    assert!(within(LIMIT, unrolls.acks.message()).await.unwrap().is_none());
+    drains(within(LIMIT, unrolls.acks.message()).await.unwrap_err());
     assert!(actor.client.get_status(StatusRequest {}).await.is_ok(), "the books can still be read");
 }
 

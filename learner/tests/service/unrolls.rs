@@ -113,7 +113,7 @@ async fn old_unrolls_are_refused_as_stale_and_those_of_another_life_or_phase_as_
         (header.learner_epoch, header.version, header.layout_hash) = (EPOCH - 1, 99, vec![1; 32]);
     });
     let ack = unrolls.send(earlier).await.unwrap();
-    assert_eq!((ack.verdict(), ack.detail.as_str()), (Verdict::Superseded, "made in learner epoch 2, this is 3"));
+    assert_eq!((ack.verdict(), ack.detail.as_str()), (Verdict::Rejoin, "made in learner epoch 2, this is 3"));
 
     let demonstration = actor.unroll_with(2, |header| header.demonstration = true);
     let ack = unrolls.send(demonstration).await.unwrap();

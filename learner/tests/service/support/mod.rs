@@ -144,8 +144,13 @@ impl World {
 
     /// An actor that has joined.
     pub(crate) async fn actor(&self, incarnation: u64) -> Actor {
+        self.named_actor(incarnation, "").await
+    }
+
+    /// An actor that has joined, of this name.
+    pub(crate) async fn named_actor(&self, incarnation: u64, name: &str) -> Actor {
         let mut client = self.client().await;
-        let request = joining(incarnation);
+        let request = JoinRequest { name: name.into(), ..joining(incarnation) };
         let reply = client.join(request).await.unwrap().into_inner();
         Actor { client, reply, incarnation, layout: self.batcher.layout().clone() }
     }
