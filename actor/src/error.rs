@@ -42,6 +42,12 @@ pub enum Error {
         /// The learner's reason.
         message: String,
     },
+    /// A newer process of this one's name works in its place.
+    #[error("the learner does without this actor: {message}")]
+    Superseded {
+        /// The learner's reason.
+        message: String,
+    },
     /// The learner's experiment document is not one that this actor understands.
     #[error("the learner's experiment cannot be used")]
     Experiment(#[from] comic_experiment::Error),

@@ -63,7 +63,7 @@ struct Act {
     access: Access,
     /// Who this actor is over its restarts, such as a pod's index: of two processes of one name the newer one takes the older
     /// one's place. Nobody unless given.
-    #[arg(long, value_name = "NAME", env = "COMIC_ACTOR_NAME", value_parser = clap::builder::NonEmptyStringValueParser::new())]
+    #[arg(long, value_name = "NAME", env = "COMIC_ACTOR_NAME")]
     name: Option<String>,
     /// Threads; the experiment's number unless given.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]

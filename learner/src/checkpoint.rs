@@ -17,7 +17,7 @@ use anyhow::{Context as _, Result, bail};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
-use steps::{Step, carry_out, hidden, put, replace};
+use steps::{Step, carry_out, hidden, is_damage, put, replace};
 
 use crate::options::Misuse;
 
@@ -332,7 +332,7 @@ impl Store {
     /// what an earlier life left half-done is put right.
     ///
     /// # Errors
-    /// When the directory cannot be listed; [`Misuse`] when there are, or were, checkpoints and none of them verifies:
+    /// When something cannot be listed or read; [`Misuse`] when there are, or were, checkpoints and none of them verifies:
     /// beginning anew beside them would be a loss nobody asked for.
     pub fn newest(&self) -> Result<Option<(PathBuf, Snapshot)>> {
         self.put_right()?;
@@ -340,13 +340,17 @@ impl Store {
         for (_, path) in numbered.iter().rev() {
             match read(path) {
                 Ok(snapshot) => return Ok(Some((path.clone(), snapshot))),
-                Err(error) => self.put_aside(path, &error)?,
+                Err(error) if is_damage(&error) => self.put_aside(path, &error)?,
+                Err(error) => return Err(error),
             }
         }
         // At every start, not at the first alone.
         let named = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(DAMAGED));
         let Some(aside) = entries(&self.directory)?.into_iter().find(named) else { return Ok(None) };
-        let (all, remedy) = (self.directory.display(), "mend one, remove it to begin anew, or give another --run");
+        let (all, remedy) = (
+            self.directory.display(),
+            "mend one and give it its name back, remove it to begin anew, or give another --run",
+        );
         Err(Misuse::new(format!("every checkpoint in {all} is damaged, as {} is: {remedy}", aside.display())).into())
     }
 

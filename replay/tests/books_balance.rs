@@ -188,8 +188,11 @@ impl World {
                 self.batcher.set_phase(self.phase);
             }
             Event::Reconnect { actor } => {
+                let acknowledged = self.next_sequence(actor);
                 let actor = self.actors[actor as usize];
                 assert_eq!(self.batcher.join(actor.incarnation, Some(actor.actor)).unwrap().actor, actor.actor);
+                assert_eq!(self.batcher.catch_up(actor.actor, acknowledged), acknowledged);
+                self.known.cursors.insert(actor.incarnation, acknowledged);
             }
             Event::Replace { actor } => {
                 self.actors[actor as usize] = Actor::join(&self.batcher, self.incarnations);

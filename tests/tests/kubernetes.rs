@@ -165,6 +165,8 @@ fn actors_are_a_job_that_grows_and_ends_as_their_exit_codes_say() -> Result<()> 
         let parallelism = job.parallelism.context("no parallelism")?;
         ensure!(job.completions == Some(parallelism), "{parallelism} at once of {:?}", job.completions);
         let pod = cluster.actor_pod()?;
+        let name = option(container(pod)?, "--name")?;
+        ensure!(name.contains("$(JOB_COMPLETION_INDEX)"), "{name}: all pods but one would be superseded");
         ensure!(pod.restart_policy.as_deref() == Some("Never"), "a policy for failures takes this");
         let name = container(pod)?.name.as_str();
         let rules = &job.pod_failure_policy.as_ref().context("no policy for failures")?.rules;

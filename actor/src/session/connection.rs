@@ -161,6 +161,7 @@ impl Connector {
                 Some(actor) => Error::Dismissed { actor, message },
                 None => Error::Refused { url: self.address.clone(), message },
             }),
+            (Code::Aborted, _) => Failure::Fatal(Error::Superseded { message }),
             _ if self.is_barred(status) => Failure::Fatal(self.unwelcome(chain(status))),
             _ => Failure::Lost(message),
         }

@@ -85,6 +85,19 @@ async fn connections_dropped_in_mid_stream_lose_nothing_repeat_nothing_and_keep_
 }
 
 #[tokio::test]
+async fn a_learner_in_another_life_than_the_one_that_was_joined_is_joined_again() {
+    let learner = FakeLearner::start(Script { rejoin: true, ..Script::default() }).await;
+    let running = start(&learner).await;
+    running.unrolls.send(unroll(0)).await.unwrap();
+    learner.until(|seen| seen.joins.len() == 2).await;
+    running.unrolls.send(unroll(1)).await.unwrap();
+    drop(running.unrolls);
+    let settled = running.session.await.unwrap().unwrap();
+    assert_eq!((settled.stale, settled.taken), (1, 1));
+    assert_eq!(learner.seen().joins[1].acknowledged, 1);
+}
+
+#[tokio::test]
 async fn a_learner_that_acknowledges_nothing_holds_the_actor_at_its_window() {
     let learner = FakeLearner::start(Script { silent: true, ..Script::default() }).await;
     let running = start(&learner).await;

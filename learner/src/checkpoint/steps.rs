@@ -94,3 +94,9 @@ fn remove(path: &Path) -> Result<()> {
         _ => Ok(()),
     }
 }
+
+/// Whether it is the checkpoint that is at fault, and not a disk that does not answer or a file that may not be read.
+pub(super) fn is_damage(error: &anyhow::Error) -> bool {
+    let failed = error.chain().find_map(|cause| cause.downcast_ref::<std::io::Error>());
+    failed.is_none_or(|failed| failed.kind() == std::io::ErrorKind::NotFound)
+}

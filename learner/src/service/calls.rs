@@ -58,11 +58,14 @@ impl Learner for Calls {
                 request.name.len()
             )));
         }
-        if shared.is_draining() {
+        // Whoever comes when the run is over comes to hear that.
+        if shared.is_draining()
+            && let Some(parting) = shared.parting()
+        {
             joins.of("draining").inc();
-            return Err(draining());
+            return Err(parting);
         }
-        match shared.roster.join(incarnation, &request.name, Instant::now()) {
+        match shared.roster.join(incarnation, &request.name, actor, Instant::now()) {
             Admission::Welcome => {}
             Admission::Full => {
                 joins.of("full").inc();
@@ -79,6 +82,7 @@ impl Learner for Calls {
             joins.of("refused").inc();
             Status::failed_precondition(refused.to_string())
         })?;
+        shared.roster.number(incarnation, joined.actor);
         let next_sequence = shared.batcher.catch_up(joined.actor, acknowledged);
         joins.of("joined").inc();
         tracing::info!(actor = joined.actor, incarnation = format_args!("{incarnation:016x}"), peer = ?peer, "actor joined");
@@ -142,7 +146,7 @@ pub(super) fn draining() -> Status {
 
 /// What an actor is told whose place is taken.
 pub(super) fn superseded() -> Status {
-    Status::failed_precondition("a newer process of the same name took this one's place")
+    Status::aborted("a newer process of the same name took this one's place")
 }
 
 /// What an actor simulates of a run in lockstep; nothing in particular otherwise.

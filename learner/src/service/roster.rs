@@ -50,6 +50,9 @@ pub(super) enum Admission {
 struct Actor {
     /// Who it is over its restarts; empty is nobody.
     name: String,
+    /// Processes of a name take each other's place in this order: of their indices, and before it has one a process is the
+    /// newest.
+    order: u64,
     /// A newer process of its name came.
     superseded: bool,
     /// Streams of parameters that are open.
@@ -72,7 +75,7 @@ impl Actor {
     }
 
     fn is_remembered(&self, now: Instant) -> bool {
-        self.is_present(now) || now.duration_since(self.gone.unwrap_or(self.heard)) < REMEMBERED
+        self.streams > 0 || self.is_present(now) || now.duration_since(self.gone.unwrap_or(self.heard)) < REMEMBERED
     }
 }
 
@@ -81,8 +84,9 @@ impl Roster {
         Self { limit, actors: Mutex::default() }
     }
 
-    /// Lets an actor in, in the place of an older one of its name, or says why not; one that is in already always stays.
-    pub(super) fn join(&self, incarnation: u64, name: &str, now: Instant) -> Admission {
+    /// Lets an actor in, in the place of an older one of its name, or says why not; one that is in already always stays. Who
+    /// comes back says which index it had: after a restart of the learner that is all that tells the older from the newer.
+    pub(super) fn join(&self, incarnation: u64, name: &str, had: Option<u64>, now: Instant) -> Admission {
         let mut actors = lock(&self.actors);
         match actors.get_mut(&incarnation) {
             Some(actor) if actor.superseded => return Admission::Superseded,
@@ -92,24 +96,45 @@ impl Roster {
             }
             _ => {}
         }
-        let older = |other: u64, actor: &Actor| other != incarnation && !name.is_empty() && actor.name == name;
+        let order = had.unwrap_or(u64::MAX);
+        let namesake = |other: u64, actor: &Actor| other != incarnation && !name.is_empty() && actor.name == name;
+        let mut namesakes = actors.iter().filter(|(other, actor)| namesake(**other, actor));
+        if namesakes.any(|(_, actor)| actor.order > order && !actor.superseded) {
+            return Admission::Superseded;
+        }
+        let older = |other: u64, actor: &Actor| namesake(other, actor) && actor.order <= order;
         let rivals = actors.iter().filter(|(other, actor)| actor.is_present(now) && !older(**other, actor));
         if rivals.count() >= self.limit {
             return Admission::Full;
         }
         for (other, actor) in actors.iter_mut() {
-            actor.superseded |= older(*other, actor);
+            if older(*other, actor) && !actor.superseded {
+                actor.superseded = true;
+                tracing::warn!(
+                    name,
+                    older = format_args!("{other:016x}"),
+                    newer = format_args!("{incarnation:016x}"),
+                    "an actor is superseded"
+                );
+            }
         }
         if actors.len() >= LOST {
-            actors.retain(|_, actor| actor.is_present(now));
+            actors.retain(|_, actor| actor.streams > 0 || actor.is_present(now));
         } else {
             actors.retain(|_, actor| actor.is_remembered(now));
         }
         let name = name.to_owned();
-        let actor = Actor { name, superseded: false, streams: 0, waiting: 0, heard: now, gone: None };
+        let actor = Actor { name, order, superseded: false, streams: 0, waiting: 0, heard: now, gone: None };
         let actor = actors.entry(incarnation).or_insert(actor);
         (actor.heard, actor.gone) = (now, None);
         Admission::Welcome
+    }
+
+    /// Notes the index that an actor got, unless it had one before.
+    pub(super) fn number(&self, incarnation: u64, index: u64) {
+        if let Some(actor) = lock(&self.actors).get_mut(&incarnation) {
+            actor.order = actor.order.min(index);
+        }
     }
 
     /// Whether a newer process of its name took its place.
@@ -210,7 +235,7 @@ mod tests {
     }
 
     fn joins(roster: &Roster, incarnation: u64, now: Instant) -> bool {
-        roster.join(incarnation, "", now) == Admission::Welcome
+        roster.join(incarnation, "", None, now) == Admission::Welcome
     }
 
     #[test]
@@ -242,17 +267,31 @@ mod tests {
     #[test]
     fn a_newer_process_of_a_name_takes_the_older_ones_place_for_ever() {
         let (roster, start) = (Arc::new(Roster::new(2)), Instant::now());
-        assert_eq!(roster.join(1, "pod-0", start), Admission::Welcome);
-        assert_eq!(roster.join(2, "pod-1", start), Admission::Welcome);
+        assert_eq!(roster.join(1, "pod-0", None, start), Admission::Welcome);
+        assert_eq!(roster.join(2, "pod-1", None, start), Admission::Welcome);
         let _watching = roster.watch(1);
-        assert_eq!(roster.join(3, "pod-2", start), Admission::Full);
-        assert_eq!(roster.join(4, "pod-0", start), Admission::Welcome, "there is one less");
+        assert_eq!(roster.join(3, "pod-2", None, start), Admission::Full);
+        assert_eq!(roster.join(4, "pod-0", None, start), Admission::Welcome, "there is one less");
         assert!(!roster.heard(1, start) && roster.heard(4, start));
+        roster.number(4, 4);
         assert!(roster.is_superseded(1) && !roster.is_superseded(2) && !roster.is_superseded(4));
         assert!(!roster.expects(1, start) && roster.expects(4, start));
-        assert_eq!(roster.join(1, "pod-0", start), Admission::Superseded);
-        assert_eq!(roster.join(4, "pod-0", start), Admission::Welcome, "a reconnection");
-        assert_eq!(roster.join(2, "pod-1", start), Admission::Welcome);
+        assert_eq!(roster.join(1, "pod-0", None, start), Admission::Superseded);
+        assert_eq!(roster.join(4, "pod-0", None, start), Admission::Welcome, "a reconnection");
+        assert_eq!(roster.join(2, "pod-1", None, start), Admission::Welcome);
+    }
+
+    #[test]
+    fn which_process_of_a_name_is_the_newer_is_known_after_everything_else_was_forgotten() {
+        let later = Instant::now() + REMEMBERED * 2;
+        for order in [[(1, 3), (2, 7)], [(2, 7), (1, 3)]] {
+            let roster = Roster::new(2);
+            let joined = order.map(|(incarnation, had)| roster.join(incarnation, "pod-0", Some(had), later));
+            assert_eq!(joined[0], Admission::Welcome);
+            assert_eq!(roster.is_superseded(1), order[0].0 == 1, "the older one goes");
+            assert_eq!(joined[1], if order[1].0 == 2 { Admission::Welcome } else { Admission::Superseded });
+            assert!(!roster.is_superseded(2) && roster.heard(2, later));
+        }
     }
 
     #[test]
@@ -269,7 +308,7 @@ mod tests {
         drop(roster.watch(1));
         let later = Instant::now();
         roster.heard(1, later);
-        assert_eq!(roster.join(2, "", later), Admission::Full);
+        assert_eq!(roster.join(2, "", None, later), Admission::Full);
     }
 
     #[test]

@@ -35,6 +35,8 @@ fn a_damaged_one_is_skipped() {
 }
 
 proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
+
     /// In the manifest, in its parts, anywhere.
     #[test]
     fn whatever_is_cut_off_or_flipped_costs_no_more_than_one_checkpoint(
@@ -57,6 +59,20 @@ proptest! {
         std::fs::write(&file, bytes).unwrap();
         prop_assert_eq!(store.newest().unwrap().unwrap().1, whole("one"));
     }
+}
+
+#[test]
+fn what_cannot_be_read_is_no_damage_and_stays_where_it_is() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 3).unwrap();
+    store.write(Name::Updates(1), &snapshot("one")).unwrap();
+    let newest = store.write(Name::Updates(2), &snapshot("two")).unwrap();
+    // The system refuses to open a link that leads to itself, whoever asks.
+    std::fs::remove_file(newest.join("part")).unwrap();
+    std::os::unix::fs::symlink("part", newest.join("part")).unwrap();
+    let refused = store.newest().unwrap_err();
+    assert!(!refused.is::<Misuse>() && format!("{refused:#}").contains("cannot read"), "{refused:#}");
+    assert!(newest.is_dir());
 }
 
 #[test]

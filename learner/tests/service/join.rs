@@ -74,13 +74,13 @@ async fn a_newer_process_of_a_name_takes_the_older_ones_place() {
     let mut newer = world.named_actor(72, "comic-actor-0").await;
     let mut unrolls = older.stream().await;
     let refused = unrolls.send(older.unroll(0)).await.unwrap_err();
-    assert_eq!(refused.code(), Code::FailedPrecondition);
+    assert_eq!(refused.code(), Code::Aborted);
     let refused = older.client.join(named(71)).await.unwrap_err();
-    assert_eq!(refused.code(), Code::FailedPrecondition, "it ends: {refused}");
+    assert_eq!(refused.code(), Code::Aborted, "it ends: {refused}");
     assert!(refused.message().contains("newer process"), "{refused}");
     let watch = WatchRequest { incarnation: 71, ..WatchRequest::default() };
     let refused = older.client.watch_parameters(watch).await.unwrap_err();
-    assert_eq!(refused.code(), Code::FailedPrecondition);
+    assert_eq!(refused.code(), Code::Aborted);
     let mut unrolls = newer.stream().await;
     assert_eq!(unrolls.verdict(newer.unroll(0)).await, Verdict::Taken);
     let books = newer.books().await;

@@ -51,14 +51,15 @@ async fn connections_from_one_address() {
 async fn silence_from_the_beginning() {
     let world = World::start().await;
     let address = world.address.trim_start_matches("http://");
-    for word in [&b""[..], b"PRI * HTTP/2.0"] {
+    let falls_silent_after = async |word: &[u8]| {
         let mut silent = TcpStream::connect(address).await.unwrap();
         silent.write_all(word).await.unwrap();
         let mut said = Vec::new();
         // The learner's first words, and then the end.
         let ended = within(3 * LIMIT, silent.read_to_end(&mut said)).await;
         assert!(ended.is_ok() || ended.is_err_and(|error| error.kind() == ErrorKind::ConnectionReset));
-    }
+    };
+    tokio::join!(falls_silent_after(b""), falls_silent_after(b"PRI * HTTP/2.0"));
 }
 
 #[tokio::test]

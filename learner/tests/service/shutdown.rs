@@ -32,6 +32,11 @@ async fn who_asks_while_the_learner_drains_is_told_to_come_back() {
     assert_eq!(within(LIMIT, watch.message()).await.unwrap().unwrap().status(), ServingStatus::NotServing);
     assert!(world.shared.metrics_page().contains("comic_joins_total{result=\"draining\"} 1\n"));
     assert!(actor.client.get_status(StatusRequest {}).await.is_ok(), "the books can still be read");
+    // The update that was under way was the last one: who was sent away may come and hear that.
+    world.publisher.publish(1, Behaviour::Leave, &parameters(1, 0));
+    let mut late = world.actor(71).await;
+    let mut watch = late.client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
+    assert_eq!(within(LIMIT, watch.message()).await.unwrap().unwrap().behaviour(), Behaviour::Leave);
 }
 
 #[tokio::test]

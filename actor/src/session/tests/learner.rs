@@ -27,6 +27,8 @@ pub(super) struct Script {
     pub(super) breaks: Vec<(usize, usize)>,
     /// Takes and never acknowledges.
     pub(super) silent: bool,
+    /// The first unroll was made under another life of the learner.
+    pub(super) rejoin: bool,
     pub(super) refuse: bool,
     pub(super) wrong_layout: bool,
     /// What it has the actor simulate in lockstep.
@@ -190,7 +192,10 @@ impl Learner for FakeLearner {
                 if learner.inner.script.silent || breaks.is_some_and(|(_, acknowledged)| count > acknowledged) {
                     continue;
                 }
-                let ack = UnrollAck { sequence: header.sequence, verdict: verdict.into(), ..UnrollAck::default() };
+                let rejoin = learner.inner.script.rejoin && header.sequence == 0;
+                let (verdict, learner_epoch) = if rejoin { (Verdict::Rejoin, 2) } else { (verdict, 1) };
+                let sequence = header.sequence;
+                let ack = UnrollAck { sequence, verdict: verdict.into(), learner_epoch, ..UnrollAck::default() };
                 if acks.send(Ok(ack)).await.is_err() {
                     return;
                 }
