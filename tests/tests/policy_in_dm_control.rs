@@ -1,5 +1,5 @@
 //! `comic-learner export` end to end: what a run has learnt acts in `comic-actor evaluate` as the checkpoint does, and in
-//! dm_control's own environment, driven by a script of a few lines, as it does here.
+//! dm_control's own environment, driven by a script of ten statements, as it does here.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -65,13 +65,28 @@ fn evaluate(policy: &Path, more: &[&str]) -> Result<Value> {
     serde_json::from_slice(&succeeds(&mut command)?.stdout).context("evaluate printed no JSON")
 }
 
-/// Rewards of the first steps, start by start.
+/// Rewards of the first steps, start by start: of lines that are episodes.
 fn rewards(lines: &str) -> Result<Vec<(String, Vec<f64>)>> {
     let mut episodes = Vec::new();
     for line in lines.lines() {
         let episode: Value = serde_json::from_str(line)?;
         let rewards = episode["rewards"].as_array().context("no rewards")?.iter().filter_map(Value::as_f64);
         episodes.push((episode["start"].to_string(), rewards.take(STEPS).collect()));
+    }
+    Ok(episodes)
+}
+
+/// The same of lines that are steps.
+fn rewards_by_step(lines: &str) -> Result<Vec<(String, Vec<f64>)>> {
+    let mut episodes: Vec<(String, Vec<f64>)> = Vec::new();
+    for line in lines.lines() {
+        let step: Value = serde_json::from_str(line)?;
+        let (start, reward) = (step["start"].to_string(), step["reward"].as_f64().context("no reward")?);
+        match episodes.last_mut().filter(|(begun, _)| *begun == start) {
+            Some((_, rewards)) if rewards.len() == STEPS => {}
+            Some((_, rewards)) => rewards.push(reward),
+            None => episodes.push((start, vec![reward])),
+        }
     }
     Ok(episodes)
 }
@@ -91,7 +106,7 @@ async fn dm_control_pays_what_we_pay(low_level: &str) -> Result<()> {
     ensure!(report == evaluate(&system.run(), &[])?, "the file and its checkpoint are paid differently: {report}");
     let mut driver = Command::new(python()?);
     driver.arg(root().join("docs/drive_policy.py")).args([&script, &clips]).args(STARTS);
-    let theirs = rewards(&String::from_utf8(succeeds(&mut driver)?.stdout)?)?;
+    let theirs = rewards_by_step(&String::from_utf8(succeeds(&mut driver)?.stdout)?)?;
     let mut ours = rewards(&std::fs::read_to_string(&ours)?)?;
     ours.retain(|(start, _)| STARTS.contains(&start.as_str()));
 
