@@ -4,7 +4,7 @@
 
 mod common;
 
-use comic_replay::{Batcher, Books, Dropped, Error, Ledger, Outcome, Phase, Snapshot, TaskBooks};
+use comic_replay::{Batcher, Books, Dropped, Error, Joined, Ledger, Outcome, Phase, Snapshot, TaskBooks};
 use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, layout, with_tasks};
 
 /// The next life of the learner, from what a checkpoint file would hold.
@@ -65,18 +65,23 @@ fn a_snapshot_from_before_tasks_had_books_is_restored_without_them() {
     assert!(Ledger::restore(&serde_json::from_value(stored).unwrap()).is_ok());
 }
 
-#[test]
-fn an_actor_that_reconnects_finds_its_account_and_the_learner_counts_what_it_missed() {
+/// An actor of incarnation 5 whose unrolls 0 to 2 were taken, the last two after the checkpoint and so gone with the process; the
+/// next life of the learner, and what the actor learnt when it joined that.
+fn back_after_a_crash() -> (Actor, Batcher, Joined) {
     let before = batcher();
     let actor = Actor::join(&before, 5);
     assert_eq!(actor.send(&before, 0), Some(Outcome::Taken));
     let snapshot = before.snapshot();
-    // These two were taken after the checkpoint, and are gone with the process. Unroll 3 was never answered.
     assert_eq!(actor.send(&before, 1), Some(Outcome::Taken));
     assert_eq!(actor.send(&before, 2), Some(Outcome::Taken));
-
     let after = restarted(&snapshot);
     let joined = after.join(5, Some(actor.actor)).unwrap();
+    (actor, after, joined)
+}
+
+#[test]
+fn an_actor_that_reconnects_finds_its_account_and_the_learner_counts_what_it_missed() {
+    let (actor, after, joined) = back_after_a_crash();
     assert_eq!((joined.actor, joined.next_sequence), (actor.actor, 1));
     let of_tasks = after.books_by_task().tasks;
     assert_eq!(actor.send(&after, 3), Some(Outcome::Superseded), "resent, but made in the life before");
@@ -90,15 +95,7 @@ fn an_actor_that_reconnects_finds_its_account_and_the_learner_counts_what_it_mis
 
 #[test]
 fn an_actor_that_sends_nothing_more_still_says_what_was_lost() {
-    let before = batcher();
-    let actor = Actor::join(&before, 5);
-    assert_eq!(actor.send(&before, 0), Some(Outcome::Taken));
-    let snapshot = before.snapshot();
-    assert_eq!(actor.send(&before, 1), Some(Outcome::Taken));
-    assert_eq!(actor.send(&before, 2), Some(Outcome::Taken));
-
-    let after = restarted(&snapshot);
-    let joined = after.join(5, Some(actor.actor)).unwrap();
+    let (actor, after, joined) = back_after_a_crash();
     assert_eq!(after.catch_up(joined.actor, 3), 3);
     assert_eq!(after.catch_up(joined.actor, 2), 3, "an account does not go back");
     let dropped = Dropped { lost_at_restart: 3, ..Dropped::default() };
