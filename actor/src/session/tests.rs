@@ -85,6 +85,16 @@ async fn connections_dropped_in_mid_stream_lose_nothing_repeat_nothing_and_keep_
 }
 
 #[tokio::test]
+async fn an_actor_says_its_name_and_when_it_is_superseded_ends_as_one_whose_configuration_is_right() {
+    let learner = FakeLearner::start(Script { superseded: true, ..Script::default() }).await;
+    let options = Options { name: Some("pod-0".into()), ..options_for(learner.address()) };
+    let (_stop, stopped) = watch::channel(false);
+    let error = join(&options, stopped).await.unwrap_err();
+    assert!(matches!(error, Error::Superseded { .. }) && !error.is_configuration(), "{error}");
+    assert_eq!(learner.seen().joins[0].name, "pod-0");
+}
+
+#[tokio::test]
 async fn a_learner_in_another_life_than_the_one_that_was_joined_is_joined_again() {
     let learner = FakeLearner::start(Script { rejoin: true, ..Script::default() }).await;
     let running = start(&learner).await;

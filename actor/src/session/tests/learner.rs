@@ -30,6 +30,8 @@ pub(super) struct Script {
     /// The first unroll was made under another life of the learner.
     pub(super) rejoin: bool,
     pub(super) refuse: bool,
+    /// Somebody newer is there.
+    pub(super) superseded: bool,
     pub(super) wrong_layout: bool,
     /// What it has the actor simulate in lockstep.
     pub(super) environments: Option<Environments>,
@@ -137,6 +139,9 @@ impl Learner for FakeLearner {
             return Err(Status::failed_precondition("another protocol"));
         }
         self.inner.seen.send_modify(|seen| seen.joins.push(request.into_inner()));
+        if self.inner.script.superseded {
+            return Err(Status::aborted("a newer process"));
+        }
         let mut experiment = self.inner.experiment.lock().unwrap().clone();
         if self.inner.script.lockstep {
             (experiment.unroll.lockstep, experiment.unroll.ahead) = (true, 0);
