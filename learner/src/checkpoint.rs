@@ -7,6 +7,7 @@
 
 #[cfg(test)]
 mod crash;
+mod run;
 mod steps;
 
 use std::collections::BTreeMap;

@@ -5,7 +5,7 @@ use std::fmt;
 use comic_proto::Pieces;
 
 use crate::publish::VERSIONS;
-use crate::service::{CONNECTION_WINDOW, FRAME_SIZE};
+use crate::service::FRAME_SIZE;
 
 /// Bytes of a call's answers that its peer does not take: hyper's send buffer, and the largest piece beside it, an asset's.
 const ANSWER: usize = (400 + 256) * 1024;
@@ -13,6 +13,23 @@ const ANSWER: usize = (400 + 256) * 1024;
 /// A message is not copied out of the buffers that the socket was read to. One has at most twice the bytes of a frame, which
 /// is how it grows, and at least [`Pieces::KEPT`] of them are the message's.
 const BUFFERS: usize = 2 * FRAME_SIZE as usize / Pieces::KEPT;
+
+/// What bounds the bytes that peers have on their way.
+#[derive(Clone, Copy, Debug)]
+pub struct Ingest {
+    /// Connections at once.
+    pub connections: usize,
+    /// Bytes that one of them may have on its way unread.
+    pub window: usize,
+    /// Bytes of messages that were read, of all connections together.
+    pub room: usize,
+    /// Calls in flight at once.
+    pub requests: usize,
+    /// Bytes of the largest message that is taken.
+    pub message: usize,
+    /// Refused messages that may wait for the disk.
+    pub quarantined: usize,
+}
 
 /// What decides how large the buffers get.
 #[derive(Clone, Copy, Debug)]
@@ -23,14 +40,8 @@ pub struct Sizes {
     pub batch: usize,
     /// Bytes of an unroll.
     pub unroll: usize,
-    /// Connections at once.
-    pub connections: usize,
-    /// Calls in flight at once.
-    pub requests: usize,
-    /// Bytes of the largest message that is taken.
-    pub message: usize,
-    /// Refused messages that may wait for the disk.
-    pub quarantined: usize,
+    /// What peers have on their way.
+    pub ingest: Ingest,
     /// Bytes of the parameters that actors get.
     pub parameters: usize,
     /// Bytes of a checkpoint.
@@ -44,9 +55,11 @@ pub struct Bounds {
     pub batches: u64,
     /// Bytes on their way in that nobody read yet: a window for each connection.
     pub windows: u64,
-    /// Messages that are read and wait for a place in a batch: one for each call, with what a peer can make of its buffers
-    /// by frames of no use.
+    /// Messages that are read, half or whole, and wait for a place in a batch, with what a peer can make of its buffers by
+    /// frames of no use.
     pub messages: u64,
+    /// What came with the end of a message, and waits until that is answered: a frame for each call.
+    pub frames: u64,
     /// Versions of the parameters that are held for readers.
     pub parameters: u64,
     /// Answers on their way out: see [`ANSWER`].
@@ -61,11 +74,13 @@ impl Bounds {
     /// The bounds of these sizes.
     pub fn new(sizes: &Sizes) -> Self {
         let product = |factors: &[usize]| factors.iter().fold(1u64, |all, factor| all.saturating_mul(*factor as u64));
-        let Sizes { ahead, batch, unroll, connections, requests, message, quarantined, parameters, snapshot } = *sizes;
+        let Sizes { ahead, batch, unroll, ingest, parameters, snapshot } = *sizes;
+        let Ingest { connections, window, room, requests, message, quarantined } = ingest;
         Self {
             batches: product(&[ahead + 1, batch, unroll]),
-            windows: product(&[connections, CONNECTION_WINDOW as usize]),
-            messages: product(&[requests, message, BUFFERS]),
+            windows: product(&[connections, window]),
+            messages: product(&[room, BUFFERS]),
+            frames: product(&[requests, 2 * FRAME_SIZE as usize]),
             parameters: product(&[VERSIONS, parameters]),
             answers: product(&[requests, ANSWER]),
             quarantine: product(&[quarantined, message]),
@@ -73,12 +88,13 @@ impl Bounds {
         }
     }
 
-    fn parts(&self) -> [(&'static str, u64); 7] {
-        let Self { batches, windows, messages, parameters, answers, quarantine, snapshots } = *self;
+    fn parts(&self) -> [(&'static str, u64); 8] {
+        let Self { batches, windows, messages, frames, parameters, answers, quarantine, snapshots } = *self;
         [
             ("batches", batches),
             ("connection windows", windows),
             ("messages", messages),
+            ("frames", frames),
             ("parameters", parameters),
             ("answers", answers),
             ("quarantine", quarantine),
@@ -112,10 +128,14 @@ mod tests {
         ahead: 1,
         batch: 128,
         unroll: 200_000,
-        connections: 100,
-        requests: 300,
-        message: 1 << 20,
-        quarantined: 9,
+        ingest: Ingest {
+            connections: 100,
+            window: 1 << 19,
+            room: 64 << 20,
+            requests: 300,
+            message: 1 << 20,
+            quarantined: 9,
+        },
         parameters: 5_000_000,
         snapshot: 40_000_000,
     };
@@ -125,24 +145,25 @@ mod tests {
         let bounds = Bounds::new(&SIZES);
         let expected = Bounds {
             batches: 2 * 128 * 200_000,
-            windows: 100 * 1024 * 1024,
-            messages: 4 * 300 * 1024 * 1024,
+            windows: 50 * 1024 * 1024,
+            messages: 4 * 64 * 1024 * 1024,
+            frames: 300 * 512 * 1024,
             parameters: 7 * 5_000_000,
             answers: 300 * 656 * 1024,
             quarantine: 9 * 1024 * 1024,
             snapshots: 3 * 40_000_000,
         };
         assert_eq!(bounds, expected);
-        assert_eq!(bounds.sum(), 51_200_000 + 1309 * 1_048_576 + 35_000_000 + 201_523_200 + 120_000_000);
+        assert_eq!(bounds.sum(), 51_200_000 + 465 * 1_048_576 + 35_000_000 + 201_523_200 + 120_000_000);
         assert_eq!(
             bounds.to_string(),
-            "at most 1698 MiB: batches 49, connection windows 100, messages 1200, parameters 34, answers 193, quarantine 9, checkpoints 115"
+            "at most 854 MiB: batches 49, connection windows 50, messages 256, frames 150, parameters 34, answers 193, quarantine 9, checkpoints 115"
         );
     }
 
     #[test]
     fn limits_that_limit_nothing_give_a_bound_that_is_none() {
-        let bounds = Bounds::new(&Sizes { requests: usize::MAX, ..SIZES });
+        let bounds = Bounds::new(&Sizes { ingest: Ingest { room: usize::MAX, ..SIZES.ingest }, ..SIZES });
         assert_eq!((bounds.messages, bounds.sum()), (u64::MAX, u64::MAX));
     }
 }

@@ -199,6 +199,7 @@ fn prepare(
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {
         run: options.run.clone(),
+        id: store.run()?,
         security,
         limits: options.limits.clone(),
         experiment: experiment.clone(),

@@ -5,7 +5,8 @@
 //! - [`serve`] is the server, up to its graceful end.
 //! - `incoming` lets connections in, `admission` calls: TLS, tokens and limits are theirs, and nobody else's.
 //! - `calls` answers each call; `unrolls`, `assets`, and `broadcast` of what is [published](crate::publish) are the streams
-//!   with a life of their own. `streams` leads the two that carry bytes past tonic's codec. `status` tells how things are,
+//!   with a life of their own. `streams` leads the two that carry bytes past tonic's codec, `messages` takes those of one
+//!   apart, as there is room for them. `status` tells how things are,
 //!   `roster` how the actors are. `shares` says which actor simulates what of a run in lockstep. `complaints` keeps the log
 //!   readable when a peer misbehaves.
 //!
@@ -18,6 +19,7 @@ mod broadcast;
 mod calls;
 pub(crate) mod complaints;
 mod incoming;
+mod messages;
 mod roster;
 mod shares;
 mod status;
@@ -36,7 +38,7 @@ use comic_clips::Asset;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::v1::Behaviour;
 use comic_proto::v1::learner_server::LearnerServer;
-use comic_proto::{FILE_DESCRIPTOR_SET, UnrollShape};
+use comic_proto::{FILE_DESCRIPTOR_SET, UnrollLayout, UnrollShape};
 use comic_replay::Batcher;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
@@ -45,6 +47,7 @@ use tonic::transport::Server;
 use tonic_health::ServingStatus;
 
 use crate::checkpoint::Evaluated;
+use crate::memory::Ingest;
 use crate::options::Misuse;
 use crate::publish::Publisher;
 use crate::quarantine::{Quarantine, QuarantineOptions};
@@ -54,6 +57,7 @@ use admission::Admission;
 use calls::Calls;
 use complaints::Complaints;
 use incoming::Door;
+use messages::Room;
 use roster::Roster;
 use shares::Shares;
 use streams::Streams;
@@ -64,13 +68,17 @@ const KEEPALIVE: Duration = Duration::from_secs(15);
 const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 /// A call has to be answered, or its stream begun, in this time. A stream that has begun is not limited.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
-/// Bytes an unread stream may have under way: the memory a waiting actor costs the learner, with one unroll.
-const STREAM_WINDOW: u32 = 512 * 1024;
+/// What a message has beside the numbers of an unroll in which one episode ends. More makes two frames of every message.
+const HEADER: usize = 128;
 /// An unroll of 200 KB in frames of HTTP/2's default 16 KiB costs five times the processor time.
 pub(crate) const FRAME_SIZE: u32 = 256 * 1024;
-/// Bytes an unread connection may have under way. Above the stream's, or a full unroll stream would stall every other
-/// call of its actor.
-pub(crate) const CONNECTION_WINDOW: u32 = 1024 * 1024;
+/// Bytes that a connection may have under way beside a stream that is not read, or such a one would stall every other call
+/// of its actor.
+const BESIDE: u32 = 128 * 1024;
+/// RFC 9113, 6.9.2: so much a peer may send before it has heard of any other.
+pub(crate) const SMALLEST_WINDOW: u32 = 65_535;
+/// RFC 9113, 6.9.1.
+const LARGEST_WINDOW: u32 = (1 << 31) - 1;
 /// Streams a connection may have open; an actor needs three.
 const MAX_STREAMS: u32 = 64;
 /// The decoding limit when unrolls are smaller than that: a report on many clips is JSON of some hundred KB.
@@ -85,6 +93,8 @@ const EVALUATIONS: usize = 16;
 pub struct Setup {
     /// The run's directory, for those who ask.
     pub run: PathBuf,
+    /// What tells this run from every other.
+    pub id: u64,
     /// Who gets in.
     pub security: Security,
     /// How many get in.
@@ -142,6 +152,7 @@ pub struct Shared {
     /// The experiment's name.
     name: String,
     run: PathBuf,
+    id: u64,
     since: Instant,
     /// Unrolls that the batches have room for: open, full, ahead, and at the trainer.
     capacity: u64,
@@ -149,6 +160,9 @@ pub struct Shared {
     tokens: Option<Arc<Tokens>>,
     limits: Limits,
     message_limit: usize,
+    /// Bytes unread on a stream.
+    window: u32,
+    room: Room,
     roster: Arc<Roster>,
     quarantine: Option<Quarantine>,
     /// Of a run in lockstep.
@@ -168,7 +182,7 @@ impl Shared {
     /// [`Misuse`] when no unroll fits the limit of a message; otherwise when the batcher's layout or epoch are not those
     /// of the rest, experiment or spec cannot be written as TOML, or there is no quarantine where one was asked for.
     pub fn new(setup: Setup) -> Result<Arc<Self>> {
-        let Setup { run, security, limits, experiment, spec, assets, batcher, publisher, quarantine } = setup;
+        let Setup { run, id, security, limits, experiment, spec, assets, batcher, publisher, quarantine } = setup;
         let shape = UnrollShape::new(&spec, &experiment);
         let found = *batcher.layout().shape();
         ensure!(shape == found, "the batcher takes unrolls of {found:?}, the experiment makes {shape:?}");
@@ -180,16 +194,25 @@ impl Shared {
             let remedy = format!("--max-message-bytes {message_limit} lets no unroll through: it takes {needed}");
             return Err(Misuse::new(remedy).into());
         }
+        if limits.max_ingest_bytes < message_limit {
+            let room = limits.max_ingest_bytes;
+            let remedy =
+                format!("--max-ingest-bytes {room} has no room for one message, of {message_limit} bytes at most");
+            return Err(Misuse::new(remedy).into());
+        }
         let telemetry = Arc::<Telemetry>::default();
         let buffers = experiment.unroll.ahead as u64 + 1;
         Ok(Arc::new(Self {
             name: experiment.name.clone(),
             run,
+            id,
             since: Instant::now(),
             capacity: buffers * experiment.unroll.batch as u64,
             tls: security.tls.map(Arc::new),
             tokens: security.tokens.map(Arc::new),
             message_limit,
+            window: limits.max_unread_bytes.unwrap_or_else(|| window(batcher.layout())),
+            room: Room::new(limits.max_ingest_bytes),
             roster: Arc::new(Roster::new(limits.max_actors)),
             shares: experiment.unroll.lockstep.then(|| Shares::new(experiment.unroll.batch)),
             actor: (experiment.actor.threads as u64, experiment.actor.environments as u64),
@@ -221,11 +244,16 @@ impl Shared {
         lock(&self.evaluations).drain(..).collect()
     }
 
-    /// How many may be connected, how many calls may be in flight, how many bytes a message may have, and how many
-    /// refused ones may wait for the disk.
-    pub(crate) fn ingest(&self) -> (usize, usize, usize, usize) {
-        let held = if self.quarantine.is_some() { Quarantine::HELD } else { 0 };
-        (self.limits.max_connections(), self.limits.max_requests, self.message_limit, held)
+    /// What bounds the bytes that peers have on their way.
+    pub(crate) fn ingest(&self) -> Ingest {
+        Ingest {
+            connections: self.limits.max_connections(),
+            window: self.window.saturating_add(BESIDE) as usize,
+            room: self.limits.max_ingest_bytes,
+            requests: self.limits.max_requests,
+            message: self.message_limit,
+            quarantined: if self.quarantine.is_some() { Quarantine::HELD } else { 0 },
+        }
     }
 
     /// From now on nobody else comes in, and who looks is told that the server goes down.
@@ -280,13 +308,20 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// HTTP/2 as actors meet it.
-pub(crate) fn server() -> Server {
+/// Bytes that a stream may have under way unread, unless an operator says otherwise: one unroll's message, so that it comes
+/// in one frame, as good as whole, or waits at its actor. What is cut, where a window ends, has to be copied to be joined, keeps the buffers
+/// of both its halves, and costs twice the processor time.
+pub(crate) fn window(layout: &UnrollLayout) -> u32 {
+    u32::try_from(layout.size().saturating_add(HEADER)).unwrap_or(u32::MAX).clamp(SMALLEST_WINDOW, LARGEST_WINDOW)
+}
+
+/// HTTP/2 as actors meet it, with so many bytes unread on a stream.
+pub(crate) fn server(window: u32) -> Server {
     Server::builder()
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
-        .initial_stream_window_size(STREAM_WINDOW)
-        .initial_connection_window_size(CONNECTION_WINDOW)
+        .initial_stream_window_size(window)
+        .initial_connection_window_size(window.saturating_add(BESIDE).min(LARGEST_WINDOW))
         .max_frame_size(FRAME_SIZE)
         .max_concurrent_streams(MAX_STREAMS)
         .timeout(ANSWER_TIMEOUT)
@@ -311,7 +346,7 @@ pub async fn serve(listener: TcpListener, shared: Arc<Shared>, shutdown: impl Fu
     let admission = Admission::new(shared.tokens.clone(), shared.limits.max_requests, telemetry.clone());
     let door = Door::new(shared.tls.clone(), &shared.limits, telemetry.clone());
     let mut closing = shared.closing();
-    let server = server()
+    let server = server(shared.window)
         .layer(admission)
         .add_service(Streams::new(calls, shared.clone()))
         .add_service(health)

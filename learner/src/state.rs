@@ -40,15 +40,11 @@ impl Trainer {
 
     /// How much memory the learner's buffers can take, now that every size is known.
     pub(crate) fn memory(&self) -> Bounds {
-        let (connections, requests, message, quarantined) = self.shared.ingest();
         Bounds::new(&Sizes {
             ahead: self.experiment.unroll.ahead,
             batch: self.experiment.unroll.batch,
             unroll: self.batcher.layout().size(),
-            connections,
-            requests,
-            message,
-            quarantined,
+            ingest: self.shared.ingest(),
             parameters: self.target.len(),
             snapshot: self.good.parts.values().map(Vec::len).sum(),
         })

@@ -139,6 +139,7 @@ fn live_evaluated(
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {
         run: run.to_path_buf(),
+        id: store.run().unwrap(),
         security: Security::default(),
         limits: Limits::default(),
         experiment: experiment.clone(),

@@ -54,6 +54,8 @@ pub(super) struct Connector {
     incarnation: u64,
     actor: Option<u64>,
     learner_epoch: Option<u64>,
+    /// Which run it belongs to.
+    run: Option<u64>,
 }
 
 impl Connector {
@@ -69,6 +71,7 @@ impl Connector {
             incarnation: rand::random(),
             actor: None,
             learner_epoch: None,
+            run: None,
         };
         connector.endpoint()?;
         connector.access.bearer()?;
@@ -97,7 +100,7 @@ impl Connector {
         self.incarnation
     }
 
-    /// `acknowledged` is one past the last sequence number that was.
+    /// `acknowledged` is the number below which all were.
     pub(super) async fn connect(&mut self, acknowledged: u64) -> Result<Link, Failure> {
         let mut client = self.client().await?.max_decoding_message_size(MESSAGE_LIMIT);
         let mut request = Request::new(JoinRequest {
@@ -108,6 +111,7 @@ impl Connector {
             environments: self.environments,
             acknowledged,
             name: self.name.clone(),
+            run: self.run,
         });
         request.set_timeout(CALL);
         let reply = match client.join(request).await {
@@ -120,6 +124,8 @@ impl Connector {
             tracing::info!(actor = reply.actor, "reconnected to the learner");
         }
         self.actor = Some(reply.actor);
+        // A learner from before there were numbers of runs says 0.
+        self.run = Some(reply.run).filter(|run| *run != 0);
         Ok(Link { client, reply })
     }
 

@@ -78,10 +78,10 @@ async fn connections_dropped_in_mid_stream_lose_nothing_repeat_nothing_and_keep_
         seen.joins.iter().all(|join| join.incarnation == seen.joins[0].incarnation),
         "one process, one incarnation"
     );
-    assert_eq!(seen.joins[0].actor, None);
+    assert_eq!((seen.joins[0].actor, seen.joins[0].run), (None, None));
     let acknowledged: Vec<_> = seen.joins.iter().map(|join| join.acknowledged).collect();
     assert_eq!(acknowledged, [0, 1, 2, 7, 7, 7], "as far as every number was");
-    assert!(seen.joins[1..].iter().all(|join| join.actor == Some(learner::ACTOR)));
+    assert!(seen.joins[1..].iter().all(|join| (join.actor, join.run) == (Some(learner::ACTOR), Some(learner::RUN))));
 }
 
 #[tokio::test]

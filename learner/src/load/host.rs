@@ -26,7 +26,7 @@ use crate::publish::Publisher;
 use crate::quarantine::QuarantineOptions;
 use crate::run::service_runtime;
 use crate::security::{Limits, Security, Tls};
-use crate::service::{Setup, Shared, serve, server};
+use crate::service::{Setup, Shared, serve, server, window};
 
 const EPOCH: u64 = 1;
 
@@ -75,12 +75,12 @@ impl Options {
             }
             Kind::Tonic => {
                 let bytes = Arc::<AtomicU64>::default();
-                let limit = super::experiment()?.2.message_limit();
-                let service = LearnerServer::new(Bare(bytes.clone())).max_decoding_message_size(limit);
+                let layout = super::experiment()?.2;
+                let service = LearnerServer::new(Bare(bytes.clone())).max_decoding_message_size(layout.message_limit());
                 let incoming = TcpListenerStream::new(listener).inspect(|socket| {
                     let _ = socket.as_ref().map(|socket| socket.set_nodelay(true));
                 });
-                runtime.spawn(server().add_service(service).serve_with_incoming(incoming));
+                runtime.spawn(server(window(&layout)).add_service(service).serve_with_incoming(incoming));
                 obey(|_| json!({ "bytes": bytes.load(Relaxed) }))
             }
             Kind::Sockets => {
@@ -126,6 +126,7 @@ impl Stand {
         crate::run::allow_descriptors(16_384);
         let shared = Shared::new(Setup {
             run: "runs/load".into(),
+            id: 0,
             security: security(options.tls.as_deref())?,
             limits,
             experiment,

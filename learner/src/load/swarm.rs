@@ -12,6 +12,8 @@ use super::{MEGABYTE, PATIENCE};
 
 /// How often memory is looked at.
 const GLANCE: Duration = Duration::from_secs(2);
+/// Seconds without an acknowledgement, or a version, that no actor is to see.
+const STARVED: f64 = 30.0;
 
 /// How many actors, and how they live.
 #[derive(Clone, Debug, Args)]
@@ -90,6 +92,11 @@ impl Options {
             line.extend(rest);
         }
         println!("{line}");
+        ensure!(peak <= bound, "the learner had more memory than it may have: {peak:.0} MB");
+        for promise in ["longest_without_an_acknowledgement", "longest_without_a_version"] {
+            let seconds = line["crowd"][promise].as_f64().unwrap_or(f64::INFINITY);
+            ensure!(seconds <= STARVED, "an actor was starved: {promise}, {seconds:.1} s");
+        }
         Ok(())
     }
 }

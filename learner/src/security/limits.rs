@@ -17,11 +17,28 @@ pub struct Limits {
     /// Bytes of a message to the learner; as many as an unroll takes, and at least 1 MiB, unless given.
     #[arg(long, value_name = "BYTES", value_parser = positive, help_heading = "Limits")]
     pub max_message_bytes: Option<usize>,
+    /// Bytes of messages that were read and wait for a place in a batch, of all actors together; what is beyond stays unread.
+    #[arg(long, value_name = "BYTES", default_value_t = INGEST, value_parser = positive, help_heading = "Limits")]
+    pub max_ingest_bytes: usize,
+    /// Bytes that a stream may have under way unread; as many as an unroll has, unless given. More for actors that are far away:
+    /// so many arrive in a round trip.
+    #[arg(long, value_name = "BYTES", value_parser = clap::value_parser!(u32).range(65_535..1 << 31), help_heading = "Limits")]
+    pub max_unread_bytes: Option<u32>,
 }
+
+/// More than a thousand of the paper's unrolls.
+const INGEST: usize = 256 * 1024 * 1024;
 
 impl Default for Limits {
     fn default() -> Self {
-        Self { max_actors: 4096, max_connections_per_address: 1024, max_requests: 16_384, max_message_bytes: None }
+        Self {
+            max_actors: 4096,
+            max_connections_per_address: 1024,
+            max_requests: 16_384,
+            max_message_bytes: None,
+            max_ingest_bytes: INGEST,
+            max_unread_bytes: None,
+        }
     }
 }
 

@@ -58,6 +58,11 @@ impl Learner for Calls {
                 request.name.len()
             )));
         }
+        // Its unrolls bear epochs and versions that are other policies here.
+        if request.run.is_some_and(|run| run != shared.id) {
+            joins.of("refused").inc();
+            return Err(Status::failed_precondition("another run has begun here since: start the actor again"));
+        }
         // Whoever comes when the run is over comes to hear that.
         if shared.is_draining()
             && let Some(parting) = shared.parting()
@@ -99,6 +104,7 @@ impl Learner for Calls {
             layout_hash: shared.batcher.layout().hash().to_vec(),
             next_sequence,
             environments,
+            run: shared.id,
         }))
     }
 

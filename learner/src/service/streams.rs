@@ -8,15 +8,14 @@ use std::convert::Infallible;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use bytes::{Buf as _, Bytes};
-use comic_proto::Pieces;
+use bytes::Bytes;
 use comic_proto::v1::learner_server::LearnerServer;
 use futures::future::{BoxFuture, FutureExt as _};
 use futures::stream::{self, Stream, StreamExt as _};
 use http::header::CONTENT_TYPE;
 use http::{HeaderMap, HeaderValue, Request, Response};
 use http_body::Frame;
-use http_body_util::{BodyExt as _, StreamBody};
+use http_body_util::StreamBody;
 use tonic::Status;
 use tonic::body::Body;
 use tonic::server::NamedService;
@@ -31,8 +30,6 @@ const WATCH_PARAMETERS: &str = "/comic.v1.Learner/WatchParameters";
 const ENCODING: &str = "grpc-encoding";
 const ACCEPTED: &str = "grpc-accept-encoding";
 const IDENTITY: &str = "identity";
-/// "gRPC over HTTP2", Length-Prefixed-Message: whether it is compressed, and its length in four bytes, big end first.
-const PREFIX: usize = 5;
 
 /// The learner's calls, those two among them.
 #[derive(Clone, Debug)]
@@ -105,66 +102,4 @@ fn trailers(status: &Status) -> HeaderMap {
     // Its text is percent-encoded, and no status of ours has details: there is nothing a header could not hold.
     let _ = status.add_header(&mut trailers);
     trailers
-}
-
-/// Why no more messages come.
-#[derive(Debug)]
-pub(super) enum Broken {
-    /// The connection, or the call, ended in the middle.
-    Connection(Status),
-    /// What came is no gRPC, or too large.
-    Protocol(Status),
-}
-
-/// The messages of a request.
-#[derive(Debug)]
-pub(super) struct Messages {
-    body: Body,
-    arrived: Pieces,
-    /// Bytes of the message that is arriving, once its prefix has.
-    length: Option<usize>,
-    limit: usize,
-}
-
-impl Messages {
-    pub(super) fn new(body: Body, limit: usize) -> Self {
-        Self { body, arrived: Pieces::default(), length: None, limit }
-    }
-
-    /// The next message; `None` after the last. Cancel-safe: what has arrived is kept.
-    pub(super) async fn next(&mut self) -> Result<Option<Pieces>, Broken> {
-        loop {
-            if let Some(message) = self.whole().map_err(Broken::Protocol)? {
-                return Ok(Some(message));
-            }
-            match self.body.frame().await {
-                Some(Ok(frame)) => frame.into_data().into_iter().for_each(|data| self.arrived.push(data)),
-                Some(Err(error)) => return Err(Broken::Connection(error)),
-                None if self.arrived.is_empty() && self.length.is_none() => return Ok(None),
-                None => return Err(Broken::Protocol(Status::internal("the stream ended inside a message"))),
-            }
-        }
-    }
-
-    fn whole(&mut self) -> Result<Option<Pieces>, Status> {
-        let length = match self.length {
-            Some(length) => length,
-            None => {
-                let Some(mut prefix) = self.arrived.split_to(PREFIX) else { return Ok(None) };
-                if prefix.get_u8() != 0 {
-                    return Err(Status::internal("a compressed message, and no encoding was named"));
-                }
-                let (length, limit) = (prefix.get_u32() as usize, self.limit);
-                if length > limit {
-                    return Err(Status::out_of_range(format!("a message of {length} bytes, the limit is {limit}")));
-                }
-                *self.length.insert(length)
-            }
-        };
-        let message = self.arrived.split_to(length);
-        if message.is_some() {
-            self.length = None;
-        }
-        Ok(message)
-    }
 }

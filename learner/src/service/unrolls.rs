@@ -12,7 +12,7 @@ use tonic::body::Body;
 use tracing::{Instrument as _, Span};
 
 use super::calls::superseded;
-use super::streams::{Broken, Messages};
+use super::messages::{Broken, Messages};
 use super::{Closing, Shared};
 
 /// One actor's stream. The next unroll is read when the acknowledgement of the last one is on its way, and that comes when
@@ -26,7 +26,7 @@ pub(super) struct UnrollStream {
 
 impl UnrollStream {
     pub(super) fn new(shared: Arc<Shared>, request: Body) -> Self {
-        let incoming = Messages::new(request, shared.message_limit);
+        let incoming = Messages::new(request, shared.message_limit, &shared.room);
         Self { closing: shared.closing(), shared, incoming, over: false }
     }
 
@@ -48,14 +48,16 @@ impl UnrollStream {
 }
 
 async fn answer(shared: &Shared, incoming: &mut Messages) -> Option<Result<UnrollAck, Status>> {
-    let received = match incoming.next().await {
-        Ok(Some(message)) => {
-            ReceivedUnroll::decode(message).map_err(|malformed| Status::internal(malformed.to_string()))
+    // The room is the message's until its numbers are in a batch.
+    let (received, _room) = match incoming.next().await {
+        Ok(Some((message, room))) => {
+            let received = ReceivedUnroll::decode(message);
+            (received.map_err(|malformed| Status::internal(malformed.to_string())), room)
         }
         Ok(None) => return None,
         // A connection that broke costs nothing.
         Err(Broken::Connection(status)) => return Some(Err(status)),
-        Err(Broken::Protocol(status)) => Err(status),
+        Err(Broken::Protocol(status)) => (Err(status), None),
     };
     match received {
         Ok(unroll) => {

@@ -194,6 +194,17 @@ fn every_life_has_a_larger_epoch_than_the_one_before() {
 }
 
 #[test]
+fn a_run_has_one_number_for_all_its_lives_and_every_other_run_another() {
+    let (run, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let number = |directory: &tempfile::TempDir| Store::open(directory.path(), 1).unwrap().run();
+    let drawn = number(&run).unwrap();
+    assert_eq!(number(&run).unwrap(), drawn);
+    assert_ne!(number(&other).unwrap(), drawn);
+    std::fs::write(run.path().join("checkpoints/run"), "the best").unwrap();
+    assert!(format!("{:#}", number(&run).unwrap_err()).contains("checkpoints/run is damaged"));
+}
+
+#[test]
 fn a_damaged_epoch_is_an_error_that_names_the_file() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 1).unwrap();

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use crate::support::{EPOCH, World, joining};
+use crate::support::{EPOCH, RUN, World, joining};
 use comic_experiment::{Experiment, TaskSpec};
 use comic_learner::publish::Publisher;
 use comic_learner::quarantine::QuarantineOptions;
@@ -67,6 +67,19 @@ async fn what_an_earlier_life_acknowledged_is_counted_as_lost_as_soon_as_its_act
 }
 
 #[tokio::test]
+async fn who_was_of_another_run_is_sent_away_and_charged_with_nothing() {
+    let world = World::start().await;
+    let mut client = world.client().await;
+    assert_eq!(client.join(joining(70)).await.unwrap().into_inner().run, RUN);
+    let back = JoinRequest { actor: Some(0), acknowledged: 7, ..joining(71) };
+    let refused = client.join(JoinRequest { run: Some(RUN + 1), ..back.clone() }).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition, "{refused}");
+    assert_eq!(world.batcher.books().produced, 0);
+    client.join(JoinRequest { run: Some(RUN), ..back }).await.unwrap();
+    assert_eq!(world.batcher.books().dropped.lost_at_restart, 7);
+}
+
+#[tokio::test]
 async fn a_newer_process_of_a_name_takes_the_older_ones_place() {
     let world = World::start().await;
     let named = |incarnation| JoinRequest { name: "comic-actor-0".into(), ..joining(incarnation) };
@@ -124,6 +137,7 @@ async fn in_lockstep_an_actor_of_an_earlier_life_has_to_start_again() {
 async fn a_service_whose_parts_disagree_does_not_start() {
     let world = World::start().await;
     let setup = || Setup {
+        id: RUN,
         run: "runs/test".into(),
         security: Security::default(),
         limits: Limits::default(),

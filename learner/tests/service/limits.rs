@@ -105,17 +105,23 @@ async fn bytes_of_a_message() {
 #[tokio::test]
 async fn a_limit_through_which_no_unroll_fits_is_a_wrong_configuration() {
     let world = World::start().await;
-    let setup = Setup {
-        run: "runs/test".into(),
-        security: Security::default(),
-        limits: Limits { max_message_bytes: Some(10), ..Limits::default() },
-        experiment: world.experiment.clone(),
-        spec: world.spec.clone(),
-        assets: Vec::new(),
-        batcher: world.batcher.clone(),
-        publisher: Publisher::new(EPOCH),
-        quarantine: QuarantineOptions::default(),
-    };
-    let refused = Shared::new(setup).unwrap_err();
-    assert!(refused.is::<Misuse>() && refused.to_string().contains("--max-message-bytes"), "{refused}");
+    for (limits, option) in [
+        (Limits { max_message_bytes: Some(10), ..Limits::default() }, "--max-message-bytes"),
+        (Limits { max_ingest_bytes: 10, ..Limits::default() }, "--max-ingest-bytes"),
+    ] {
+        let setup = Setup {
+            run: "runs/test".into(),
+            id: 1,
+            security: Security::default(),
+            limits,
+            experiment: world.experiment.clone(),
+            spec: world.spec.clone(),
+            assets: Vec::new(),
+            batcher: world.batcher.clone(),
+            publisher: Publisher::new(EPOCH),
+            quarantine: QuarantineOptions::default(),
+        };
+        let refused = Shared::new(setup).unwrap_err();
+        assert!(refused.is::<Misuse>() && refused.to_string().contains(option), "{refused}");
+    }
 }

@@ -11,6 +11,7 @@ mod join;
 mod limits;
 mod metrics_page;
 mod parameters;
+mod room;
 mod shutdown;
 mod status;
 mod support;

@@ -17,6 +17,8 @@ use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
 use tonic::{Request, Response, Status, Streaming};
 
 pub(super) const ACTOR: u64 = 3;
+/// Which run it is.
+pub(super) const RUN: u64 = 8;
 /// Bytes of parameters or assets in a message.
 const PIECE: usize = 7;
 
@@ -164,6 +166,7 @@ impl Learner for FakeLearner {
             layout_hash,
             next_sequence: 0,
             environments: self.inner.script.environments,
+            run: RUN,
         }))
     }
 

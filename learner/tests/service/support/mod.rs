@@ -23,6 +23,8 @@ use tonic::transport::Channel;
 use tonic::{Status, Streaming};
 
 pub(crate) const EPOCH: u64 = 3;
+/// Which run it is.
+pub(crate) const RUN: u64 = 0x5eed;
 /// Unrolls a batch.
 pub(crate) const BATCH: usize = 2;
 
@@ -105,6 +107,7 @@ impl World {
         let publisher = Publisher::new(EPOCH);
         let setup = Setup {
             run: "runs/test".into(),
+            id: RUN,
             security,
             limits,
             experiment: experiment.clone(),

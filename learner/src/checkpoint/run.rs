@@ -1,0 +1,32 @@
+//! What tells a run from every other.
+
+use std::fs;
+use std::io::ErrorKind;
+
+use anyhow::{Context as _, Result};
+
+use super::Store;
+use super::steps::{carry_out, replace};
+
+const RUN: &str = "run";
+
+impl Store {
+    /// A number that was drawn when the run began. Epochs and versions begin anew with every run: actors that come back to the
+    /// same address are told by it that theirs is over.
+    ///
+    /// # Errors
+    /// When its file is damaged, or cannot be read or written.
+    pub fn run(&self) -> Result<u64> {
+        let path = self.directory.join(RUN);
+        match fs::read_to_string(&path) {
+            Ok(text) => u64::from_str_radix(text.trim(), 16)
+                .with_context(|| format!("{} is damaged: remove it, and start the actors again", path.display())),
+            Err(error) if error.kind() == ErrorKind::NotFound => {
+                let run = rand::random();
+                carry_out(&replace(&path, format!("{run:016x}").into_bytes()))?;
+                Ok(run)
+            }
+            Err(error) => Err(error).with_context(|| format!("cannot read {}", path.display())),
+        }
+    }
+}

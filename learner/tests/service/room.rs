@@ -1,0 +1,115 @@
+//! Messages are read as there is room for them, and nobody keeps room that he does not use.
+
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use std::convert::Infallible;
+use std::future::poll_fn;
+use std::time::Duration;
+
+use bytes::Bytes;
+use comic_learner::security::Limits;
+use comic_proto::frame;
+use comic_proto::v1::{Queue, StatusRequest, Verdict};
+use comic_replay::Next;
+use futures::{StreamExt as _, stream};
+use http::Request;
+use http_body::Frame;
+use http_body_util::{BodyExt as _, StreamBody};
+use tokio::task::JoinHandle;
+use tonic::body::Body;
+use tonic::{Code, Status};
+use tower::Service as _;
+
+use crate::support::{Actor, BATCH, World, within};
+
+const MESSAGE: usize = 64 * 1024;
+const LIMIT: Duration = Duration::from_secs(30);
+
+/// A learner that has room for one message.
+async fn cramped() -> World {
+    World::limited(Limits { max_message_bytes: Some(MESSAGE), max_ingest_bytes: MESSAGE, ..Limits::default() }).await
+}
+
+/// A stream that falls silent after these bytes; what it ends with.
+async fn silent_after(world: &World, bytes: Bytes) -> JoinHandle<Code> {
+    let body = stream::iter([Ok::<_, Infallible>(Frame::data(bytes))]).chain(stream::pending());
+    let request = Request::post(format!("{}/comic.v1.Learner/SendUnrolls", world.address))
+        .header("content-type", "application/grpc")
+        .header("te", "trailers")
+        .body(Body::new(StreamBody::new(body)))
+        .unwrap();
+    let mut channel = world.channel().await;
+    poll_fn(|context| channel.poll_ready(context)).await.unwrap();
+    let response = channel.call(request).await.unwrap();
+    tokio::spawn(async move {
+        let answer = response.into_body().collect().await.unwrap();
+        Status::from_header_map(answer.trailers().expect("trailers")).expect("a status").code()
+    })
+}
+
+async fn status(actor: &mut Actor) -> Queue {
+    actor.client.get_status(StatusRequest {}).await.unwrap().into_inner().queue.unwrap()
+}
+
+#[tokio::test]
+async fn half_a_message_keeps_its_room_for_ten_seconds_and_not_longer() {
+    let world = cramped().await;
+    let half = {
+        let stalled = world.actor(70).await;
+        let whole = frame(&stalled.unroll(0));
+        whole.slice(..whole.len() / 2)
+    };
+    let stalled = silent_after(&world, half).await;
+    let mut other = world.actor(71).await;
+    let mut unrolls = other.stream().await;
+    unrolls.sender.send(other.unroll(0)).await.unwrap();
+    assert_eq!(within(LIMIT, stalled).await.unwrap(), Code::DeadlineExceeded);
+    let ack = within(LIMIT, unrolls.acks.message()).await.unwrap().unwrap();
+    assert_eq!(ack.verdict(), Verdict::Taken);
+    let books = other.books().await;
+    assert_eq!((books.produced, books.unattributed), (1, 0), "it is that actor's to send again");
+}
+
+#[tokio::test]
+async fn a_stream_without_a_word_keeps_no_room() {
+    let world = cramped().await;
+    let _silent = [world.actor(70).await.stream().await, world.actor(71).await.stream().await];
+    let mut other = world.actor(72).await;
+    let mut unrolls = other.stream().await;
+    assert_eq!(unrolls.verdict(other.unroll(0)).await, Verdict::Taken);
+}
+
+#[tokio::test]
+async fn what_waits_for_a_batch_keeps_others_unread_and_all_have_their_turn() {
+    let world = cramped().await;
+    let mut filling = world.actor(70).await;
+    let mut unrolls = filling.stream().await;
+    for sequence in 0..2 * BATCH as u64 {
+        assert_eq!(unrolls.verdict(filling.unroll(sequence)).await, Verdict::Taken);
+    }
+    let mut waiting = Vec::new();
+    for incarnation in 71..75 {
+        let mut actor = world.actor(incarnation).await;
+        let unrolls = actor.stream().await;
+        unrolls.sender.send(actor.unroll(0)).await.unwrap();
+        waiting.push((actor, unrolls));
+    }
+    let waits = async { while status(&mut filling).await.waiting == 0 {} };
+    within(LIMIT, waits).await;
+    // As many calls as it takes for the others to be read, if they are going to be.
+    for _ in 0..300 {
+        assert_eq!(status(&mut filling).await.waiting, 1, "there is room for one");
+    }
+    for _ in 0..3 {
+        let batch = world.batcher.clone();
+        let batch = tokio::task::spawn_blocking(move || batch.next_batch_within(LIMIT)).await.unwrap();
+        let Next::Batch(batch) = batch else { panic!("no batch") };
+        world.batcher.trained(batch);
+    }
+    for (_, unrolls) in &mut waiting {
+        let ack = within(LIMIT, unrolls.acks.message()).await.unwrap().unwrap();
+        assert_eq!(ack.verdict(), Verdict::Taken);
+    }
+    let books = filling.books().await;
+    assert_eq!((books.produced, books.trained, books.in_flight), (8, 6, 2));
+}
