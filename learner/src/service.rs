@@ -309,8 +309,8 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 /// Bytes that a stream may have under way unread, unless an operator says otherwise: one unroll's message, so that it comes
-/// in one frame, as good as whole, or waits at its actor. What is cut, where a window ends, has to be copied to be joined, keeps the buffers
-/// of both its halves, and costs twice the processor time.
+/// in one frame, as good as whole, or waits at its actor. What is cut, where a window ends, has to be copied to be joined,
+/// keeps the buffers of both its halves, and costs twice the processor time.
 pub(crate) fn window(layout: &UnrollLayout) -> u32 {
     u32::try_from(layout.size().saturating_add(HEADER)).unwrap_or(u32::MAX).clamp(SMALLEST_WINDOW, LARGEST_WINDOW)
 }

@@ -1,7 +1,7 @@
 //! The messages of a stream of unrolls, and the room that they take.
 //!
-//! What a peer has sent lies in its window until there is room for it here. That is the whole of what unrolls on their way
-//! into a batch can take: a window for each connection, and [`Room`] for all of them together.
+//! What a peer has sent lies in its window until there is room for it here. Unrolls on their way into a batch can take a
+//! window for each connection, [`Room`] for all of them together, and for each stream the frame that a message ended in.
 
 use std::future::poll_fn;
 use std::pin::Pin;

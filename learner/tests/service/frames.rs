@@ -2,8 +2,6 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use std::convert::Infallible;
-use std::future::poll_fn;
 use std::time::Duration;
 
 use bytes::{Buf as _, Bytes};
@@ -11,28 +9,16 @@ use comic_proto::v1::{UnrollAck, Verdict};
 use comic_proto::{Field, frame};
 use comic_replay::Next;
 use futures::stream;
-use http::Request;
-use http_body::Frame;
-use http_body_util::{BodyExt as _, StreamBody};
-use tonic::body::Body;
+use http_body_util::BodyExt as _;
 use tonic::{Code, Status};
 use tonic_prost::prost::Message as _;
-use tower::Service as _;
 
 use crate::support::{World, within};
 
 /// The acknowledgements of what these frames carry, and the status after them.
 async fn send(world: &World, frames: Vec<Bytes>) -> (Vec<UnrollAck>, Code) {
-    let body = stream::iter(frames.into_iter().map(|data| Ok::<_, Infallible>(Frame::data(data))));
-    let request = Request::post(format!("{}/comic.v1.Learner/SendUnrolls", world.address))
-        .header("content-type", "application/grpc")
-        .header("te", "trailers")
-        .body(Body::new(StreamBody::new(body)))
-        .unwrap();
-    let mut channel = world.channel().await;
-    poll_fn(|context| channel.poll_ready(context)).await.unwrap();
     let answer = within(Duration::from_secs(10), async {
-        channel.call(request).await.unwrap().into_body().collect().await.unwrap()
+        world.send_frames(stream::iter(frames)).await.into_body().collect().await.unwrap()
     })
     .await;
     let status = answer.trailers().cloned().unwrap_or_default();

@@ -2,8 +2,6 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use std::convert::Infallible;
-use std::future::poll_fn;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -12,13 +10,9 @@ use comic_proto::frame;
 use comic_proto::v1::{Queue, StatusRequest, Verdict};
 use comic_replay::Next;
 use futures::{StreamExt as _, stream};
-use http::Request;
-use http_body::Frame;
-use http_body_util::{BodyExt as _, StreamBody};
+use http_body_util::BodyExt as _;
 use tokio::task::JoinHandle;
-use tonic::body::Body;
 use tonic::{Code, Status};
-use tower::Service as _;
 
 use crate::support::{Actor, BATCH, World, within};
 
@@ -32,15 +26,7 @@ async fn cramped() -> World {
 
 /// A stream that falls silent after these bytes; what it ends with.
 async fn silent_after(world: &World, bytes: Bytes) -> JoinHandle<Code> {
-    let body = stream::iter([Ok::<_, Infallible>(Frame::data(bytes))]).chain(stream::pending());
-    let request = Request::post(format!("{}/comic.v1.Learner/SendUnrolls", world.address))
-        .header("content-type", "application/grpc")
-        .header("te", "trailers")
-        .body(Body::new(StreamBody::new(body)))
-        .unwrap();
-    let mut channel = world.channel().await;
-    poll_fn(|context| channel.poll_ready(context)).await.unwrap();
-    let response = channel.call(request).await.unwrap();
+    let response = world.send_frames(stream::iter([bytes]).chain(stream::pending())).await;
     tokio::spawn(async move {
         let answer = response.into_body().collect().await.unwrap();
         Status::from_header_map(answer.trailers().expect("trailers")).expect("a status").code()

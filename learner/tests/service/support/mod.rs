@@ -1,6 +1,8 @@
 //! A learner's service on a loopback port, and a real client of it.
 #![allow(dead_code, clippy::unwrap_used, clippy::expect_used)]
 
+use std::convert::Infallible;
+use std::future::poll_fn;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -16,11 +18,17 @@ use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{JoinReply, JoinRequest, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict};
 use comic_proto::{Access, Client, Field, PROTOCOL_VERSION, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{Batcher, Config, Ledger, Order, Phase};
+use futures::{Stream, StreamExt as _};
+use http::{Request, Response};
+use http_body::Frame;
+use http_body_util::StreamBody;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
+use tonic::body::Body;
 use tonic::transport::Channel;
 use tonic::{Status, Streaming};
+use tower::Service as _;
 
 pub(crate) const EPOCH: u64 = 3;
 /// Which run it is.
@@ -130,6 +138,19 @@ impl World {
     /// A connection, for clients of other services than the learner's own.
     pub(crate) async fn channel(&self) -> Channel {
         Channel::from_shared(self.address.clone()).unwrap().connect().await.unwrap()
+    }
+
+    /// The answer to a stream of unrolls of these frames, whatever they hold.
+    pub(crate) async fn send_frames(&self, frames: impl Stream<Item = Bytes> + Send + 'static) -> Response<Body> {
+        let body = StreamBody::new(frames.map(|data| Ok::<_, Infallible>(Frame::data(data))));
+        let request = Request::post(format!("{}/comic.v1.Learner/SendUnrolls", self.address))
+            .header("content-type", "application/grpc")
+            .header("te", "trailers")
+            .body(Body::new(body))
+            .unwrap();
+        let mut channel = self.channel().await;
+        poll_fn(|context| channel.poll_ready(context)).await.unwrap();
+        channel.call(request).await.unwrap()
     }
 
     /// A client on a connection of its own.
