@@ -35,7 +35,19 @@ pub struct Certs {
     /// A token for both, too, in DIR/token, unless there is one already.
     #[arg(long)]
     pub token: bool,
+    /// Where what the learner needs is put as well, without the authority's key.
+    #[arg(long, value_name = "DIR")]
+    pub copy_for_learner: Option<PathBuf>,
+    /// Where what actors need is put as well, with neither the authority's key nor the learner's.
+    #[arg(long, value_name = "DIR")]
+    pub copy_for_actors: Option<PathBuf>,
 }
+
+/// What actors show and trust. Keys come before certificates: whoever looks in between finds two that do not fit, and keeps
+/// what it has.
+const ACTORS: [&str; 4] = ["token", "client-key.pem", "client.pem", "ca.pem"];
+/// What the learner shows, beside what its own health checks do.
+const LEARNER: [&str; 2] = ["server-key.pem", "server.pem"];
 
 /// Days for which an authority holds.
 const AUTHORITY_DAYS: i64 = 3650;
@@ -67,9 +79,26 @@ impl Certs {
         }
         if self.token && !self.out.join("token").exists() {
             let token: String = rand::rng().random_iter::<u8>().take(32).map(|byte| format!("{byte:02x}")).collect();
-            self.put("token", 0o600, &format!("{token}\n"))?;
+            put(&self.out, "token", 0o600, &format!("{token}\n"))?;
+        }
+        if let Some(place) = &self.copy_for_learner {
+            LEARNER.iter().chain(&ACTORS).try_for_each(|file| self.copy(file, place))?;
+        }
+        if let Some(place) = &self.copy_for_actors {
+            ACTORS.iter().try_for_each(|file| self.copy(file, place))?;
         }
         Ok(())
+    }
+
+    fn copy(&self, file: &str, place: &Path) -> Result<()> {
+        let from = self.out.join(file);
+        if !from.exists() {
+            return Ok(());
+        }
+        let text = fs::read_to_string(&from).with_context(|| format!("cannot read {}", from.display()))?;
+        fs::create_dir_all(place).with_context(|| format!("cannot make {}", place.display()))?;
+        let mode = fs::metadata(&from)?.permissions().mode() & 0o777;
+        put(place, file, mode, &text)
     }
 
     /// The authority in the directory, or a new one.
@@ -98,22 +127,22 @@ impl Certs {
 
     fn write(&self, name: &str, certificate: &str, key: &KeyPair) -> Result<()> {
         // The key first: a learner that looks in between finds two that do not fit, and keeps what it has.
-        self.put(&format!("{name}-key.pem"), 0o600, &key.serialize_pem())?;
-        self.put(&format!("{name}.pem"), 0o644, certificate)?;
+        put(&self.out, &format!("{name}-key.pem"), 0o600, &key.serialize_pem())?;
+        put(&self.out, &format!("{name}.pem"), 0o644, certificate)?;
         // Nobody has to read it.
         let _ = writeln!(std::io::stdout(), "{}", self.out.join(format!("{name}.pem")).display());
         Ok(())
     }
+}
 
-    fn put(&self, file: &str, mode: u32, text: &str) -> Result<()> {
-        let path = self.out.join(file);
-        let mut open = OpenOptions::new();
-        let file = open.create(true).write(true).truncate(true).mode(mode).open(&path);
-        let mut file = file.with_context(|| format!("cannot write {}", path.display()))?;
-        // A file that was there keeps its own mode.
-        file.set_permissions(fs::Permissions::from_mode(mode))?;
-        file.write_all(text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
-    }
+fn put(directory: &Path, file: &str, mode: u32, text: &str) -> Result<()> {
+    let path = directory.join(file);
+    let mut open = OpenOptions::new();
+    let file = open.create(true).write(true).truncate(true).mode(mode).open(&path);
+    let mut file = file.with_context(|| format!("cannot write {}", path.display()))?;
+    // A file that was there keeps its own mode.
+    file.set_permissions(fs::Permissions::from_mode(mode))?;
+    file.write_all(text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
 }
 
 #[cfg(test)]
@@ -122,7 +151,30 @@ mod tests {
     use crate::security::Tls;
 
     fn certs(out: &Path) -> Certs {
-        Certs { out: out.into(), names: vec!["localhost".into()], days: 1, token: true }
+        let names = vec!["localhost".into()];
+        Certs { out: out.into(), names, days: 1, token: true, copy_for_learner: None, copy_for_actors: None }
+    }
+
+    #[test]
+    fn each_side_gets_what_it_needs_and_nobody_the_authoritys_key() {
+        let directory = tempfile::tempdir().unwrap();
+        let place = |name: &str| directory.path().join(name);
+        let apart = Certs {
+            copy_for_learner: Some(place("learner")),
+            copy_for_actors: Some(place("actors")),
+            ..certs(&place("authority"))
+        };
+        apart.run().unwrap();
+        let file = |name: &str| place("learner").join(name);
+        Tls::new(&file("server.pem"), &file("server-key.pem"), Some(&file("ca.pem"))).unwrap();
+        let names = |of: &str| {
+            let names = fs::read_dir(place(of)).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+            names.collect::<std::collections::BTreeSet<_>>()
+        };
+        let actors = ["ca.pem", "client-key.pem", "client.pem", "token"].map(String::from);
+        assert!(names("actors").iter().eq(&actors), "{:?}", names("actors"));
+        assert!(!names("learner").contains("ca-key.pem"));
+        assert_eq!(fs::metadata(place("actors").join("client-key.pem")).unwrap().permissions().mode() & 0o777, 0o600);
     }
 
     #[test]

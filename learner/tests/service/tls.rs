@@ -11,7 +11,9 @@ use comic_proto::v1::StatusRequest;
 use comic_proto::{Access, distrusted};
 
 fn certificates(directory: &Path) {
-    Certs { out: directory.into(), names: vec!["localhost".into()], days: 1, token: false }.run().unwrap();
+    let (out, names) = (directory.into(), vec!["localhost".into()]);
+    let certs = Certs { out, names, days: 1, token: false, copy_for_learner: None, copy_for_actors: None };
+    certs.run().unwrap();
 }
 
 /// A learner that asks for certificates if `mutual`.
