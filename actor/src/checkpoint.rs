@@ -9,7 +9,7 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use comic_experiment::Experiment;
-use comic_networks::export::{Exported, Part};
+use comic_networks::export::{Exported, Part, Source};
 use sha2::{Digest as _, Sha256};
 
 use crate::Error;
@@ -34,9 +34,11 @@ pub struct Checkpoint {
     pub position: Position,
 }
 
-/// The life of the learner that wrote a checkpoint, and the newest version it had published.
+/// The run and the life of the learner that wrote a checkpoint, and the newest version it had published.
 #[derive(Clone, Copy, Debug, Default, serde::Deserialize)]
 pub struct Position {
+    /// The run's number; `None` of learners that had none, and of exported files.
+    pub run: Option<u64>,
     /// Which life.
     pub epoch: u64,
     /// Which version.
@@ -79,7 +81,8 @@ fn read_exported(path: &Path) -> Result<Checkpoint, Error> {
         let part = spec.part;
         return Err(refuse(path, format!("{part} does not act for itself: export a policy, with --part policy")));
     }
-    let position = Position { epoch: spec.source.epoch, version: spec.source.version, updates: spec.source.updates };
+    let Source { epoch, version, updates, .. } = spec.source;
+    let position = Position { run: None, epoch, version, updates };
     Ok(Checkpoint { path: path.to_path_buf(), experiment, policy: bytes, position })
 }
 

@@ -5,6 +5,7 @@
 //! synced, so that a crash leaves either the whole checkpoint or none. Two more, `initial` and `warm-started`, are kept
 //! for comparison. `best.json` says which one was evaluated best; it is kept, too, and the link `best` leads to it.
 
+mod best;
 #[cfg(test)]
 mod crash;
 mod run;
@@ -15,17 +16,16 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail};
-use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
+use best::Best;
+pub use best::{Evaluated, Judgement};
 use steps::{Step, carry_out, hidden, is_damage, put, replace};
 
 use crate::options::Misuse;
 
 const MANIFEST: &str = "MANIFEST.json";
 const EPOCH: &str = "epoch";
-const BEST: &str = "best";
-const BEST_RECORD: &str = "best.json";
 /// Of a checkpoint that another one of the same name takes the place of.
 const FORMER: &str = "former-";
 /// Of a checkpoint that does not verify.
@@ -94,45 +94,6 @@ impl std::fmt::Display for Name {
     }
 }
 
-/// The checkpoint that an evaluation is about, as its report names it, and how good it is.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Evaluated {
-    /// The life of the learner.
-    pub epoch: u64,
-    /// Updates until then.
-    pub updates: u64,
-    /// Mean over the episodes of return / the most they could have paid.
-    pub normalised_reward: f64,
-}
-
-/// What an evaluation says of a checkpoint.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Judgement {
-    /// None was better: this one is kept from now on.
-    Best(Name),
-    /// A better one is kept already.
-    NotBetter,
-    /// It is not here any more.
-    Gone,
-}
-
-/// `best.json`.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Best {
-    /// The number of updates, by which checkpoints are named.
-    updates: u64,
-    learner_epoch: u64,
-    version: u64,
-    normalised_reward: f64,
-}
-
-impl Best {
-    fn name(self) -> Name {
-        Name::Updates(self.updates)
-    }
-}
-
 /// A run's checkpoint directory.
 #[derive(Debug)]
 pub struct Store {
@@ -147,7 +108,12 @@ impl Store {
     /// When the directory cannot be made.
     pub fn open(run: &Path, kept: usize) -> Result<Self> {
         let directory = run.join("checkpoints");
-        fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
+        if !directory.is_dir() {
+            fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
+            // What is synced in a directory that nobody finds is lost with it.
+            let places = [Some(run), run.parent().filter(|parent| *parent != Path::new(""))];
+            places.into_iter().flatten().try_for_each(|place| Step::SyncDirectory(place.to_path_buf()).carry_out())?;
+        }
         Ok(Self { directory, kept: kept.max(1) })
     }
 
@@ -167,12 +133,13 @@ impl Store {
     /// Begins a new life of the learner: an epoch larger than every earlier one, on disk before it is returned.
     ///
     /// # Errors
-    /// When the epoch file is unreadable or cannot be written.
+    /// [`Misuse`] when the epoch file is damaged; otherwise when it cannot be read or written.
     pub fn begin_life(&self) -> Result<u64> {
         let path = self.directory.join(EPOCH);
         let last = match fs::read_to_string(&path) {
-            Ok(text) => text.trim().parse::<u64>().with_context(|| {
-                format!("{} is damaged: write the number of earlier starts into it", path.display())
+            Ok(text) => text.trim().parse::<u64>().map_err(|_| {
+                let remedy = "write the number of earlier starts into it";
+                Misuse::new(format!("{} is damaged: {remedy}", path.display()))
             })?,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => 0,
             Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),
@@ -207,64 +174,6 @@ impl Store {
             repairs.insert(0, Step::SyncDirectory(self.directory.clone()));
         }
         Ok(repairs)
-    }
-
-    /// Keeps the checkpoint that was evaluated, besides the newest few, if none was better.
-    ///
-    /// # Errors
-    /// When the disk refuses.
-    pub fn judge(&self, evaluated: Evaluated) -> Result<Judgement> {
-        let Evaluated { epoch: learner_epoch, updates, normalised_reward } = evaluated;
-        let position = position(&self.path(Name::Updates(updates)));
-        // An earlier life may have come as far, and left another checkpoint of this name.
-        let Some(Position { version, .. }) = position.filter(|found| found.epoch == learner_epoch) else {
-            return Ok(Judgement::Gone);
-        };
-        if self.best().is_some_and(|best| best.normalised_reward >= normalised_reward) {
-            return Ok(Judgement::NotBetter);
-        }
-        let best = Best { updates, learner_epoch, version, normalised_reward };
-        carry_out(&replace(&self.directory.join(BEST_RECORD), serde_json::to_vec_pretty(&best)?))?;
-        self.lead_to(best.name())?;
-        Ok(Judgement::Best(best.name()))
-    }
-
-    /// What `best.json` says. A damaged one is complained about, and the next evaluation replaces it.
-    fn best(&self) -> Option<Best> {
-        let path = self.directory.join(BEST_RECORD);
-        let text = match fs::read(&path) {
-            Ok(text) => text,
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return None,
-            Err(error) => {
-                tracing::warn!("{} cannot be read and is ignored: {error}", path.display());
-                return None;
-            }
-        };
-        let best = serde_json::from_slice::<Best>(&text);
-        match best {
-            Ok(best) if self.has(best.name()) => Some(best),
-            Ok(best) => {
-                tracing::warn!("{} names {}, which is not there, and is ignored", path.display(), best.name());
-                None
-            }
-            Err(error) => {
-                tracing::warn!("{} is damaged and is ignored: {error}", path.display());
-                None
-            }
-        }
-    }
-
-    /// Has the link `best` lead to a checkpoint.
-    fn lead_to(&self, name: Name) -> Result<()> {
-        let link = self.directory.join(BEST);
-        let target = name.to_string();
-        if fs::read_link(&link).is_ok_and(|found| found == Path::new(&target)) {
-            return Ok(());
-        }
-        let temporary = hidden("", &link);
-        let made = [Step::Remove(temporary.clone()), Step::Link(temporary.clone(), target)];
-        carry_out(&made)?;
-        carry_out(&put(temporary, &link))
     }
 
     fn path(&self, name: Name) -> PathBuf {
@@ -369,15 +278,9 @@ impl Store {
     }
 }
 
-/// Where a run stood when a checkpoint was made.
-#[derive(Deserialize)]
-struct Position {
-    epoch: u64,
-    version: u64,
-}
-
-fn position(checkpoint: &Path) -> Option<Position> {
-    serde_json::from_slice(&fs::read(checkpoint.join(PROGRESS)).ok()?).ok()
+/// What to say of a run whose checkpoint verifies and cannot be gone on with: the next start would find the same.
+pub(crate) fn unfit(run: &Path, error: &anyhow::Error) -> Misuse {
+    Misuse::new(format!("{} cannot be resumed: {error:#}", run.display()))
 }
 
 fn entries(directory: &Path) -> Result<Vec<PathBuf>> {

@@ -249,6 +249,7 @@ fn lag(connections: usize, parameters: u64, target_period: usize, every: f64) ->
     let everybody = connections.to_string();
     let mut crowd = Process::crowd(&host, &["--actors", &everybody, "--watch"])?;
     crowd.wait_for("versions", connections as f64, PATIENCE)?;
+    let connected = host.usage()?.resident;
     let (start, began, read) = (Instant::now(), host.usage()?, crowd.number("bytes")?);
     crowd.ask("forget")?;
     sleep(Duration::from_secs_f64(SECONDS));
@@ -260,7 +261,8 @@ fn lag(connections: usize, parameters: u64, target_period: usize, every: f64) ->
         json!({
             "figure": format!("publish.{connections}.period_{target_period}"), "value": round.megabytes_per_second,
             "unit": "MB/s", "cpu_s_per_gb": round.cpu_seconds_per_gigabyte,
-            "peak_growth_mb": (host.usage()?.peak - before.resident) / MEGABYTE,
+            "peak_growth_mb": (host.usage()?.peak - connected) / MEGABYTE,
+            "connections_mb": (connected - before.resident) / MEGABYTE,
             "lag_versions": stats["lag_versions"], "lag_seconds": stats["lag_seconds"],
             "longest_without_a_version_s": stats["longest_without_a_version"],
         })

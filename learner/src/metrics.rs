@@ -191,7 +191,7 @@ impl Metrics {
     fn append_evaluation(&self, evaluation: &Evaluation) -> Result<()> {
         let path = self.run.join("evaluations.jsonl");
         let report: Value = serde_json::from_str(&evaluation.json).unwrap_or(Value::Null);
-        let line = json!({ "learner_epoch": evaluation.epoch, "version": evaluation.version,
+        let line = json!({ "run": evaluation.run, "learner_epoch": evaluation.epoch, "version": evaluation.version,
             "updates": evaluation.updates, "evaluation": report });
         let mut file = append(&path)?;
         writeln!(file, "{line}").with_context(|| format!("cannot write {}", path.display()))
@@ -350,6 +350,6 @@ mod tests {
             let line = metrics.write(position, BooksByTask::default(), Map::new());
             assert!(line.contains("\"updates\":3"), "{line}");
         }
-        metrics.keep_evaluation(&Evaluation { epoch: 5, version: 4, updates: 3, json: "{}".into() });
+        metrics.keep_evaluation(&Evaluation { run: None, epoch: 5, version: 4, updates: 3, json: "{}".into() });
     }
 }

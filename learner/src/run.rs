@@ -19,7 +19,7 @@ use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
 
-use crate::checkpoint::{Snapshot, Store};
+use crate::checkpoint::{Snapshot, Store, unfit};
 use crate::device::Backend;
 use crate::options::{Misuse, Options};
 use crate::probes;
@@ -181,7 +181,7 @@ fn prepare(
     let resume = store.newest()?;
     if let Some((path, snapshot)) = &resume {
         check_same_experiment(&experiment, &spec, snapshot, options.allow_changed)
-            .with_context(|| format!("{} cannot be resumed", options.run.display()))?;
+            .map_err(|error| unfit(&options.run, &error))?;
         tracing::info!(checkpoint = %path.display(), "resuming");
     }
     let resume = resume.map(|(_, snapshot)| snapshot);
@@ -189,7 +189,7 @@ fn prepare(
     std::fs::write(options.run.join("experiment.toml"), experiment.to_toml()?)
         .with_context(|| format!("cannot write into {}", options.run.display()))?;
     let ledger = match &resume {
-        Some(snapshot) => Ledger::restore(&serde_json::from_slice(snapshot.part("books.json")?)?)?,
+        Some(snapshot) => books(snapshot).map_err(|error| unfit(&options.run, &error))?,
         None => Ledger::new(),
     };
     let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));
@@ -215,6 +215,12 @@ fn prepare(
     Ok((setup, shared))
 }
 
+/// What a checkpoint says of every unroll so far.
+fn books(snapshot: &Snapshot) -> Result<Ledger> {
+    let books = serde_json::from_slice(snapshot.part("books.json")?).context("books.json of the checkpoint")?;
+    Ledger::restore(&books).context("books.json of the checkpoint")
+}
+
 /// How unrolls become batches.
 fn batches(unroll: &Unroll) -> Config {
     let Unroll { batch, max_staleness, ahead, lockstep, .. } = *unroll;
@@ -232,7 +238,7 @@ fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot,
     now.actor = then.actor.clone();
     let changed = |Difference { field, ours, theirs }| format!("{field} was {ours} and is {theirs}");
     let mut changes: Vec<String> = then.differences(&now)?.into_iter().map(changed).collect();
-    let task: TaskSpec = serde_json::from_slice(snapshot.part("task.json")?)?;
+    let task: TaskSpec = serde_json::from_slice(snapshot.part("task.json")?).context("task.json of the checkpoint")?;
     if changes.is_empty() && task != *spec {
         changes.push("the clips, or what the task observes and pays, are others".into());
     }

@@ -116,7 +116,9 @@ pub struct Setup {
 /// An evaluation that an actor reported.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Evaluation {
-    /// The life of the learner whose parameters were evaluated.
+    /// The run whose parameters were evaluated, where the actor knows.
+    pub run: Option<u64>,
+    /// The life of the learner.
     pub epoch: u64,
     /// Their version.
     pub version: u64,
@@ -131,7 +133,7 @@ impl Evaluation {
     pub(crate) fn evaluated(&self) -> Option<Evaluated> {
         let report: serde_json::Value = serde_json::from_str(&self.json).ok()?;
         let normalised_reward = report["overall"]["normalised_reward"].as_f64()?;
-        Some(Evaluated { epoch: self.epoch, updates: self.updates, normalised_reward })
+        Some(Evaluated { run: self.run, epoch: self.epoch, updates: self.updates, normalised_reward })
     }
 }
 
@@ -212,7 +214,7 @@ impl Shared {
             tokens: security.tokens.map(Arc::new),
             message_limit,
             window: limits.max_unread_bytes.unwrap_or_else(|| window(batcher.layout())),
-            room: Room::new(limits.max_ingest_bytes),
+            room: Room::new(limits.max_ingest_bytes, telemetry.unrolls_late.clone()),
             roster: Arc::new(Roster::new(limits.max_actors)),
             shares: experiment.unroll.lockstep.then(|| Shares::new(experiment.unroll.batch)),
             actor: (experiment.actor.threads as u64, experiment.actor.environments as u64),
@@ -237,6 +239,11 @@ impl Shared {
     /// Replaces the metrics that `GetStatus` answers with, JSON.
     pub fn set_metrics(&self, json: String) {
         *lock(&self.metrics) = json;
+    }
+
+    /// What tells this run from every other.
+    pub(crate) fn id(&self) -> u64 {
+        self.id
     }
 
     /// Takes the evaluations reported since the last time, oldest first.

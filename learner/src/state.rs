@@ -53,7 +53,8 @@ impl Trainer {
     pub(crate) fn snapshot(&self) -> Result<Snapshot> {
         let mut tensors = self.learner.state();
         tensors.extend(self.statistics.state());
-        let progress = Progress { epoch: self.epoch, seconds: self.seconds(), ..self.progress.clone() };
+        let run = Some(self.shared.id());
+        let progress = Progress { run, epoch: self.epoch, seconds: self.seconds(), ..self.progress.clone() };
         let mut snapshot = Snapshot::default();
         for (name, bytes) in [
             ("experiment.toml", self.experiment.to_toml()?.into_bytes()),

@@ -15,7 +15,7 @@ use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::checkpoint::{Name, Snapshot, Store};
+use crate::checkpoint::{Name, Snapshot, Store, unfit};
 use crate::device::Backend;
 use crate::metrics::{Metrics, Position};
 use crate::minibatches::tasks_of_unrolls;
@@ -67,6 +67,9 @@ pub enum Ending {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Progress {
+    /// The run's number; absent from checkpoints of learners that had none.
+    #[serde(default)]
+    pub(crate) run: Option<u64>,
     /// The life of the learner that made it, without which the version means nothing.
     pub(crate) epoch: u64,
     pub(crate) updates: u64,
@@ -123,6 +126,7 @@ impl Trainer {
             statistics: ObservationStatistics::new(&spec),
             target: Bytes::from(to_safetensors(learner.policy_store())?),
             progress: Progress {
+                run: Some(shared.id()),
                 epoch,
                 updates: 0,
                 environment_steps: 0,
@@ -151,7 +155,7 @@ impl Trainer {
         };
         match resume {
             Some(snapshot) => {
-                trainer.restore(&snapshot)?;
+                trainer.restore(&snapshot).map_err(|error| unfit(&run, &error))?;
                 trainer.good = Arc::new(snapshot);
             }
             None => trainer.keep(Name::Initial)?,

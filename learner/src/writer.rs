@@ -99,7 +99,7 @@ fn obey(store: &Store, queue: &Receiver<Order>, pending: &AtomicUsize, telemetry
 }
 
 fn judge(store: &Store, evaluated: Evaluated) {
-    let Evaluated { epoch, updates, normalised_reward } = evaluated;
+    let Evaluated { epoch, updates, normalised_reward, .. } = evaluated;
     match store.judge(evaluated) {
         Ok(Judgement::Best(name)) => {
             tracing::info!(checkpoint = %name, normalised_reward, "the best checkpoint so far")

@@ -207,13 +207,13 @@ fn last_checkpoint(run: &Path) -> Snapshot {
     Store::open(run, 3).unwrap().newest().unwrap().unwrap().1
 }
 
-/// Everything but the clock, the count of lives and the budget.
+/// Everything but the clock, the count of lives, the run's number and the budget.
 fn comparable(snapshot: &Snapshot) -> Vec<(String, Vec<u8>)> {
     let mut parts: Vec<_> = snapshot.parts.clone().into_iter().filter(|(name, _)| name != "experiment.toml").collect();
     for (name, bytes) in &mut parts {
         if name == "progress.json" {
             let mut progress: serde_json::Value = serde_json::from_slice(bytes).unwrap();
-            for passing in ["seconds", "epoch"] {
+            for passing in ["seconds", "epoch", "run"] {
                 progress.as_object_mut().unwrap().remove(passing);
             }
             *bytes = progress.to_string().into_bytes();
@@ -257,7 +257,8 @@ fn the_checkpoint_of_the_best_evaluation_outlives_the_newest_few() {
     let life = |updates: u64, report: &str| {
         let experiment = experiment("tracking-mlp", updates);
         // One version in the first life, which begins with epoch 1.
-        let evaluation = Evaluation { epoch: 1, version: 2, updates: 1, json: report.into() };
+        let number = Store::open(run.path(), 3).unwrap().run().unwrap();
+        let evaluation = Evaluation { run: Some(number), epoch: 1, version: 2, updates: 1, json: report.into() };
         let unrolls = (updates + 1) * BATCH;
         live_evaluated(&experiment, run.path(), unrolls, |_, _| {}, &[evaluation]).ended.unwrap();
     };

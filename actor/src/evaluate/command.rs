@@ -111,8 +111,8 @@ impl Evaluate {
         let text = if self.json { format!("{json}\n") } else { report.to_string() };
         std::io::stdout().write_all(text.as_bytes()).map_err(Error::file("standard output"))?;
         if let Some(learner) = &self.learner {
-            let Position { epoch: learner_epoch, version, updates } = position;
-            deliver(learner, &self.access, EvaluationReport { learner_epoch, version, updates, json })?;
+            let Position { run, epoch: learner_epoch, version, updates } = position;
+            deliver(learner, &self.access, EvaluationReport { run, learner_epoch, version, updates, json })?;
         }
         film
     }

@@ -7,6 +7,7 @@ use anyhow::{Context as _, Result};
 
 use super::Store;
 use super::steps::{carry_out, replace};
+use crate::options::Misuse;
 
 const RUN: &str = "run";
 
@@ -15,12 +16,14 @@ impl Store {
     /// same address are told by it that theirs is over.
     ///
     /// # Errors
-    /// When its file is damaged, or cannot be read or written.
+    /// [`Misuse`] when its file is damaged; otherwise when it cannot be read or written.
     pub fn run(&self) -> Result<u64> {
         let path = self.directory.join(RUN);
         match fs::read_to_string(&path) {
-            Ok(text) => u64::from_str_radix(text.trim(), 16)
-                .with_context(|| format!("{} is damaged: remove it, and start the actors again", path.display())),
+            Ok(text) => u64::from_str_radix(text.trim(), 16).map_err(|_| {
+                let remedy = "remove it, and start the actors again";
+                Misuse::new(format!("{} is damaged: {remedy}", path.display())).into()
+            }),
             Err(error) if error.kind() == ErrorKind::NotFound => {
                 let run = rand::random();
                 carry_out(&replace(&path, format!("{run:016x}").into_bytes()))?;

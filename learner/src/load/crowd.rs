@@ -228,7 +228,7 @@ impl Crowd {
         loop {
             let lived = match self.options.kind {
                 Kind::Sockets => self.read_socket().await,
-                Kind::Readers => self.read_frames().await,
+                Kind::Readers => self.read_frames(index as u64).await,
                 Kind::Grpc | Kind::BareGrpc => self.live(index, &mut identity, &mut rng).await,
             };
             self.wait_from(index, [NEVER; 2]);
@@ -261,11 +261,20 @@ impl Crowd {
         Ok(TcpStream::connect(&self.options.host).await?)
     }
 
-    async fn read_frames(&self) -> Result<()> {
+    async fn read_frames(&self, incarnation: u64) -> Result<()> {
+        self.join(incarnation).await?;
         let socket = self.connect().await?;
         let _present = Present::new(&self.connected);
         let mut read = 0;
-        reader::read(socket, |more| self.count(&mut read, more)).await
+        reader::read(socket, incarnation, |more| self.count(&mut read, more)).await
+    }
+
+    /// Joins by a connection that is not needed any more then.
+    async fn join(&self, incarnation: u64) -> Result<()> {
+        let _door = self.doors.acquire().await?;
+        let mut client = LearnerClient::connect(format!("http://{}", self.options.host)).await?;
+        client.join(JoinRequest { incarnation, protocol: PROTOCOL_VERSION, ..JoinRequest::default() }).await?;
+        Ok(())
     }
 
     /// Counts bytes, and the versions they make.

@@ -22,10 +22,10 @@ const END_HEADERS: u8 = 4;
 const LARGEST_WINDOW: u32 = 0x7fff_ffff;
 const FIRST_WINDOW: u32 = 65_535;
 
-/// Reads what the learner broadcasts and gives `count` the bytes of parameters, until the connection ends.
-pub(super) async fn read(mut socket: TcpStream, mut count: impl FnMut(u64)) -> Result<()> {
+/// Reads what the learner broadcasts to an actor that has joined, and gives `count` the bytes of parameters, until the connection ends.
+pub(super) async fn read(mut socket: TcpStream, incarnation: u64, mut count: impl FnMut(u64)) -> Result<()> {
     socket.set_nodelay(true)?;
-    socket.write_all(&opening()).await?;
+    socket.write_all(&opening(incarnation)).await?;
     let (mut buffer, mut filled) = (vec![0; BUFFER], 0);
     // Of the frame that is being passed over.
     let mut left = 0;
@@ -58,14 +58,14 @@ pub(super) async fn read(mut socket: TcpStream, mut count: impl FnMut(u64)) -> R
 }
 
 /// The preface, windows that never close, and the call.
-fn opening() -> Vec<u8> {
+fn opening(incarnation: u64) -> Vec<u8> {
     let mut opening = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec();
     let setting = |name: u16, value: u32| [&name.to_be_bytes()[..], &value.to_be_bytes()].concat();
     // RFC 9113, 6.5.2: initial window size and largest frame.
     opening.extend(encoded(SETTINGS, 0, 0, &[setting(4, LARGEST_WINDOW), setting(5, BUFFER as u32)].concat()));
     opening.extend(encoded(WINDOW_UPDATE, 0, 0, &(LARGEST_WINDOW - FIRST_WINDOW).to_be_bytes()));
     opening.extend(encoded(HEADERS, END_HEADERS, 1, &headers()));
-    opening.extend(encoded(DATA, END_STREAM, 1, &frame(&WatchRequest::default())));
+    opening.extend(encoded(DATA, END_STREAM, 1, &frame(&WatchRequest { incarnation, ..WatchRequest::default() })));
     opening
 }
 

@@ -30,7 +30,8 @@ pub(super) async fn watch(shared: &Arc<Shared>, request: Body) -> Result<Respons
     if shared.roster.is_superseded(request.incarnation) {
         return Err(superseded());
     }
-    let present = shared.roster.watch(request.incarnation);
+    let stranger = || Status::failed_precondition("parameters are for actors that have joined: join first");
+    let present = shared.roster.watch(request.incarnation).ok_or_else(stranger)?;
     let (parameters, closing) = (shared.publisher.subscribe(), shared.closing());
     let reader = Reader { shared: shared.clone(), parameters, closing, over: false, _present: present };
     Ok(respond(stream::unfold(reader, Reader::next)))

@@ -82,7 +82,8 @@ impl Learner for Calls {
                 return Err(superseded());
             }
         }
-        let environments = environments_of(shared, &request)?;
+        let turned_away = |_: &Status| shared.roster.turn_away(incarnation);
+        let environments = environments_of(shared, &request).inspect_err(turned_away)?;
         let joined = shared.batcher.join(incarnation, actor).map_err(|refused| {
             joins.of("refused").inc();
             Status::failed_precondition(refused.to_string())
@@ -129,11 +130,11 @@ impl Learner for Calls {
     }
 
     async fn report_evaluation(&self, request: Request<EvaluationReport>) -> Result<Response<EvaluationAck>, Status> {
-        let EvaluationReport { learner_epoch: epoch, version, updates, json } = request.into_inner();
+        let EvaluationReport { learner_epoch: epoch, version, updates, json, run } = request.into_inner();
         if let Err(error) = serde_json::from_str::<IgnoredAny>(&json) {
             return Err(Status::invalid_argument(format!("the report is no JSON: {error}")));
         }
-        if !self.shared.keep_evaluation(Evaluation { epoch, version, updates, json }) {
+        if !self.shared.keep_evaluation(Evaluation { run, epoch, version, updates, json }) {
             return Err(Status::resource_exhausted("too many evaluations wait for the trainer: report this one later"));
         }
         self.shared.telemetry.evaluations.inc();

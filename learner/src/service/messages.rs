@@ -13,6 +13,7 @@ use bytes::{Buf as _, Bytes};
 use comic_proto::Pieces;
 use http_body::{Body as _, Frame};
 use http_body_util::BodyExt as _;
+use prometheus_client::metrics::counter::Counter;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, timeout_at};
 use tokio_util::sync::PollSemaphore;
@@ -26,11 +27,22 @@ const WHOLE: Duration = Duration::from_secs(10);
 
 /// Room for messages that were read and are not in a batch yet, of all streams together, in bytes.
 #[derive(Clone, Debug)]
-pub(super) struct Room(Arc<Semaphore>);
+pub(super) struct Room {
+    free: Arc<Semaphore>,
+    bytes: usize,
+    /// Messages that had to give theirs up.
+    late: Counter,
+}
 
 impl Room {
-    pub(super) fn new(bytes: usize) -> Self {
-        Self(Arc::new(Semaphore::new(bytes.min(Semaphore::MAX_PERMITS))))
+    pub(super) fn new(bytes: usize, late: Counter) -> Self {
+        let bytes = bytes.min(Semaphore::MAX_PERMITS);
+        Self { free: Arc::new(Semaphore::new(bytes)), bytes, late }
+    }
+
+    /// Bytes that somebody has.
+    pub(super) fn taken(&self) -> u64 {
+        self.bytes.saturating_sub(self.free.available_permits()) as u64
     }
 }
 
@@ -56,6 +68,7 @@ pub(super) struct Messages {
     /// Bytes of the largest message; so much room is taken before it is known how many there are.
     limit: u32,
     room: PollSemaphore,
+    late: Counter,
     /// What the message that is arriving has, and until when it may arrive.
     taken: Option<(Taken, Instant)>,
 }
@@ -63,8 +76,8 @@ pub(super) struct Messages {
 impl Messages {
     pub(super) fn new(body: Body, limit: usize, room: &Room) -> Self {
         let limit = u32::try_from(limit).unwrap_or(u32::MAX);
-        let room = PollSemaphore::new(room.0.clone());
-        Self { body, arrived: Pieces::default(), length: None, limit, room, taken: None }
+        let (room, late) = (PollSemaphore::new(room.free.clone()), room.late.clone());
+        Self { body, arrived: Pieces::default(), length: None, limit, room, late, taken: None }
     }
 
     /// The next message and its room; `None` after the last. One that came in the last frame of another has no room: of
@@ -127,6 +140,7 @@ impl Messages {
                 Ok(frame) => return Ok(frame),
                 Err(_) if self.room.available_permits() >= self.limit as usize => *deadline = Instant::now() + WHOLE,
                 Err(_) => {
+                    self.late.inc();
                     let late = format!("others wait for the room of a message that is not whole after {WHOLE:?}");
                     return Err(Broken::Connection(Status::deadline_exceeded(late)));
                 }

@@ -130,6 +130,14 @@ impl Roster {
         Admission::Welcome
     }
 
+    /// Forgets an actor that came in and finds nothing to do, unless it was there before.
+    pub(super) fn turn_away(&self, incarnation: u64) {
+        let mut actors = lock(&self.actors);
+        if actors.get(&incarnation).is_some_and(|actor| actor.streams == 0 && !actor.superseded) {
+            actors.remove(&incarnation);
+        }
+    }
+
     /// Notes the index that an actor got, unless it had one before.
     pub(super) fn number(&self, incarnation: u64, index: u64) {
         if let Some(actor) = lock(&self.actors).get_mut(&incarnation) {
@@ -159,9 +167,10 @@ impl Roster {
         !actor.superseded
     }
 
-    /// Notes a stream of parameters, until what is returned is dropped. Who has not joined is not counted.
-    pub(super) fn watch(self: &Arc<Self>, incarnation: u64) -> Presence {
-        Presence::new(self, incarnation, Kind::Stream)
+    /// Notes a stream of parameters, until what is returned is dropped. `None` of an actor that has not joined.
+    pub(super) fn watch(self: &Arc<Self>, incarnation: u64) -> Option<Presence> {
+        let joined = lock(&self.actors).contains_key(&incarnation);
+        joined.then(|| Presence::new(self, incarnation, Kind::Stream))
     }
 
     /// Notes an unroll that waits for a place, until what is returned is dropped.

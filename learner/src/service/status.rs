@@ -44,6 +44,7 @@ impl Shared {
             books: self.batcher.books_by_task(),
             capacity: self.capacity,
             waiting,
+            ingest: self.room.taken(),
             actors: [("alive", alive), ("slow", slow), ("lost", lost)],
             version: self.publisher.newest_version(),
             epoch: self.publisher.epoch(),

@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
+use crate::support::RUN;
 use comic_learner::checkpoint::{Evaluated, Judgement, Name, Snapshot, Store, find, read};
 use comic_learner::options::Misuse;
 use proptest::prelude::*;
@@ -201,7 +202,8 @@ fn a_run_has_one_number_for_all_its_lives_and_every_other_run_another() {
     assert_eq!(number(&run).unwrap(), drawn);
     assert_ne!(number(&other).unwrap(), drawn);
     std::fs::write(run.path().join("checkpoints/run"), "the best").unwrap();
-    assert!(format!("{:#}", number(&run).unwrap_err()).contains("checkpoints/run is damaged"));
+    let damaged = number(&run).unwrap_err();
+    assert!(damaged.is::<Misuse>() && damaged.to_string().contains("checkpoints/run is damaged"), "{damaged}");
 }
 
 #[test]
@@ -209,7 +211,8 @@ fn a_damaged_epoch_is_an_error_that_names_the_file() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 1).unwrap();
     std::fs::write(run.path().join("checkpoints/epoch"), "many").unwrap();
-    assert!(format!("{:#}", store.begin_life().unwrap_err()).contains("epoch"));
+    let damaged = store.begin_life().unwrap_err();
+    assert!(damaged.is::<Misuse>() && damaged.to_string().contains("checkpoints/epoch is damaged"), "{damaged}");
 }
 
 /// A run with these checkpoints, all of one life.
@@ -222,13 +225,13 @@ fn evaluated_run(updates: &[u64]) -> (tempfile::TempDir, Store) {
 
 fn write_evaluated(store: &Store, updates: u64) {
     let mut snapshot = snapshot("policy");
-    let progress = format!("{{\"epoch\": 3, \"version\": 1, \"updates\": {updates}}}");
+    let progress = format!("{{\"run\": {RUN}, \"epoch\": 3, \"version\": 1, \"updates\": {updates}}}");
     snapshot.parts.insert("progress.json".into(), progress.into_bytes());
     store.write(Name::Updates(updates), &snapshot).unwrap();
 }
 
 fn judge(store: &Store, updates: u64, normalised_reward: f64) -> Judgement {
-    store.judge(Evaluated { epoch: 3, updates, normalised_reward }).unwrap()
+    store.judge(Evaluated { run: Some(RUN), epoch: 3, updates, normalised_reward }).unwrap()
 }
 
 #[test]
@@ -267,11 +270,17 @@ fn which_one_is_the_best_survives_a_restart_in_the_middle_of_noting_it() {
 }
 
 #[test]
-fn an_evaluation_of_a_checkpoint_that_is_gone_or_of_another_life_changes_nothing() {
+fn an_evaluation_of_a_checkpoint_that_is_gone_or_of_another_life_or_run_changes_nothing() {
     let (run, store) = evaluated_run(&[10, 20, 30]);
     assert_eq!(judge(&store, 10, 0.9), Judgement::Gone);
-    assert_eq!(store.judge(Evaluated { epoch: 2, updates: 30, normalised_reward: 0.9 }).unwrap(), Judgement::Gone);
+    for (run, epoch) in [(None, 2), (Some(RUN), 2), (Some(RUN + 1), 3)] {
+        let evaluated = Evaluated { run, epoch, updates: 30, normalised_reward: 0.9 };
+        assert_eq!(store.judge(evaluated).unwrap(), Judgement::Gone, "{evaluated:?}");
+    }
     assert!(!run.path().join("checkpoints/best.json").exists());
+    // Of an actor that does not know of runs.
+    let evaluated = Evaluated { run: None, epoch: 3, updates: 30, normalised_reward: 0.9 };
+    assert_eq!(store.judge(evaluated).unwrap(), Judgement::Best(Name::Updates(30)));
 }
 
 #[test]

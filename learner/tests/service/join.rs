@@ -2,13 +2,13 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use crate::support::{EPOCH, RUN, World, joining};
+use crate::support::{EPOCH, RUN, World, joining, parameters};
 use comic_experiment::{Experiment, TaskSpec};
 use comic_learner::publish::Publisher;
 use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
-use comic_proto::v1::{Environments, JoinRequest, Verdict, WatchRequest};
+use comic_proto::v1::{Behaviour, Environments, JoinRequest, StatusRequest, Verdict, WatchRequest};
 use comic_proto::{PROTOCOL_VERSION, UnrollLayout, UnrollShape};
 use tonic::Code;
 
@@ -80,6 +80,17 @@ async fn who_was_of_another_run_is_sent_away_and_charged_with_nothing() {
 }
 
 #[tokio::test]
+async fn parameters_are_for_those_who_have_joined() {
+    let world = World::start().await;
+    let stranger = WatchRequest { incarnation: 71, ..WatchRequest::default() };
+    let refused = world.client().await.watch_parameters(stranger).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition, "{refused}");
+    world.publisher.publish(1, Behaviour::Policy, &parameters(1, 10));
+    let mut watch = world.actor(70).await.watch().await;
+    assert_eq!(watch.message().await.unwrap().unwrap().version, 1);
+}
+
+#[tokio::test]
 async fn a_newer_process_of_a_name_takes_the_older_ones_place() {
     let world = World::start().await;
     let named = |incarnation| JoinRequest { name: "comic-actor-0".into(), ..joining(incarnation) };
@@ -123,6 +134,8 @@ async fn in_lockstep_actors_share_the_environments_and_one_seed_and_one_too_many
     let refused = client.join(joining(73)).await.unwrap_err();
     assert_eq!(refused.code(), Code::ResourceExhausted, "an actor tries again: {refused}");
     assert_eq!(world.batcher.snapshot().accounts.len(), 3, "no account was opened for the one that stands by");
+    let actors = client.get_status(StatusRequest {}).await.unwrap().into_inner().actors.unwrap();
+    assert_eq!(actors.alive, 3, "nor is it one of those who are there");
 }
 
 #[tokio::test]

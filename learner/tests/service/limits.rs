@@ -12,7 +12,7 @@ use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
 use comic_proto::v1::learner_client::LearnerClient;
-use comic_proto::v1::{EvaluationReport, StatusRequest, WatchRequest};
+use comic_proto::v1::{EvaluationReport, StatusRequest};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 use tonic::Code;
@@ -77,13 +77,12 @@ async fn actors_in_all() {
 #[tokio::test]
 async fn calls_in_flight() {
     let world = World::limited(Limits { max_requests: 2, ..Limits::default() }).await;
-    let mut client = world.client().await;
-    let watch = |mut client: LearnerClient<_>| async move { client.watch_parameters(WatchRequest::default()).await };
-    let first = watch(client.clone()).await.unwrap();
-    let second = watch(client.clone()).await.unwrap();
+    let mut actor = world.actor(70).await;
+    let streams = (actor.watch().await, actor.watch().await);
+    let mut client = actor.client;
     let refused = client.get_status(StatusRequest {}).await.unwrap_err();
     assert_eq!(refused.code(), Code::ResourceExhausted);
-    drop((first, second));
+    drop(streams);
     // The places are free when the server has seen the streams' end.
     within(LIMIT, async { while client.get_status(StatusRequest {}).await.is_err() {} }).await;
 }
@@ -93,6 +92,7 @@ async fn bytes_of_a_message() {
     let world = World::limited(Limits { max_message_bytes: Some(64 * 1024), ..Limits::default() }).await;
     let mut client = world.client().await;
     let report = |bytes| EvaluationReport {
+        run: None,
         learner_epoch: EPOCH,
         version: 1,
         updates: 1,

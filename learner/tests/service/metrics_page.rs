@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use crate::support::World;
 use comic_learner::probes;
 use comic_learner::telemetry::Telemetry;
-use comic_proto::v1::{Verdict, WatchRequest};
+use comic_proto::v1::Verdict;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 
@@ -39,8 +39,7 @@ async fn what_happens_is_counted() {
     let world = World::start().await;
     let address = observed(&world).await;
     let mut actor = world.actor(70).await;
-    let request = WatchRequest { actor: actor.reply.actor, incarnation: 70 };
-    let _watch = actor.client.watch_parameters(request).await.unwrap();
+    let _watch = actor.watch().await;
     let mut unrolls = actor.stream().await;
     assert_eq!(unrolls.verdict(actor.unroll(0)).await, Verdict::Taken);
     assert_eq!(unrolls.verdict(actor.unroll_with(1, |header| header.layout_hash.clear())).await, Verdict::Invalid);
@@ -56,6 +55,8 @@ async fn what_happens_is_counted() {
         ("comic_actors{state=\"lost\"}", 0.0),
         ("comic_connections", 1.0),
         ("comic_requests", 2.0),
+        ("comic_ingest_bytes", 0.0),
+        ("comic_unrolls_late_total", 0.0),
         ("comic_updates_total", 0.0),
         ("comic_learner_epoch", 3.0),
     ] {

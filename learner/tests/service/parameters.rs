@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use crate::support::{EPOCH, World, parameters, within};
 use comic_learner::publish::{Holding, Publisher};
-use comic_proto::v1::{Behaviour, ParametersChunk, WatchRequest};
+use comic_proto::v1::{Behaviour, ParametersChunk};
 use tonic::Streaming;
 
 const MEGABYTE: usize = 1024 * 1024;
@@ -31,21 +31,21 @@ async fn version(stream: &mut Streaming<ParametersChunk>) -> (u64, Vec<u8>) {
 #[tokio::test]
 async fn each_version_arrives_whole_and_an_actor_that_comes_late_gets_the_newest() {
     let world = World::start().await;
-    let mut client = world.client().await;
-    let mut early = client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
+    let mut actor = world.actor(70).await;
+    let mut early = actor.watch().await;
     for number in 1..4 {
         world.publisher.publish(number, Behaviour::Policy, &parameters(number, MEGABYTE + 1));
         assert_eq!(version(&mut early).await, (number, vec![number as u8; MEGABYTE + 1]));
     }
-    let mut late = client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
+    let mut late = actor.watch().await;
     assert_eq!(version(&mut late).await.0, 3);
 }
 
 #[tokio::test]
 async fn a_slow_reader_skips_the_versions_in_between() {
     let world = World::start().await;
-    let mut client = world.client().await;
-    let mut slow = client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
+    let mut actor = world.actor(70).await;
+    let mut slow = actor.watch().await;
     // Far more than windows and buffers hold, so the reader is still in the first one when the others come.
     world.publisher.publish(1, Behaviour::Policy, &parameters(1, 16 * MEGABYTE));
     let begun = slow.message().await.unwrap().unwrap();
@@ -159,8 +159,8 @@ async fn a_piece_on_its_way_keeps_no_other_alive() {
 #[tokio::test]
 async fn the_end_of_the_run_is_told_and_ends_the_stream() {
     let world = World::start().await;
-    let mut client = world.client().await;
-    let mut stream = client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
+    let mut actor = world.actor(70).await;
+    let mut stream = actor.watch().await;
     world.publisher.publish(1, Behaviour::Demonstrate, &parameters(1, 10));
     assert_eq!(stream.message().await.unwrap().unwrap().behaviour(), Behaviour::Demonstrate);
     world.publisher.publish(1, Behaviour::Leave, &parameters(1, 0));

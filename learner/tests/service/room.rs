@@ -11,7 +11,7 @@ use comic_proto::v1::{Queue, StatusRequest, Verdict};
 use comic_replay::Next;
 use futures::{StreamExt as _, stream};
 use http_body_util::BodyExt as _;
-use tokio::task::JoinHandle;
+use tokio::task::{JoinHandle, yield_now};
 use tonic::{Code, Status};
 
 use crate::support::{Actor, BATCH, World, within};
@@ -33,6 +33,13 @@ async fn silent_after(world: &World, bytes: Bytes) -> JoinHandle<Code> {
     })
 }
 
+/// A metric.
+fn read(world: &World, name: &str) -> u64 {
+    let page = world.shared.metrics_page();
+    let line = page.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
+    line.expect("a metric of this name").parse().unwrap()
+}
+
 async fn status(actor: &mut Actor) -> Queue {
     actor.client.get_status(StatusRequest {}).await.unwrap().into_inner().queue.unwrap()
 }
@@ -46,14 +53,25 @@ async fn half_a_message_keeps_its_room_for_ten_seconds_and_not_longer() {
         whole.slice(..whole.len() / 2)
     };
     let stalled = silent_after(&world, half).await;
+    within(LIMIT, async {
+        while read(&world, "comic_ingest_bytes") == 0 {
+            yield_now().await
+        }
+    })
+    .await;
     let mut other = world.actor(71).await;
     let mut unrolls = other.stream().await;
     unrolls.sender.send(other.unroll(0)).await.unwrap();
+    // As many calls as it takes for the other to be read, if it is going to be.
+    for _ in 0..300 {
+        assert_eq!(other.books().await.produced, 0, "there is no room for it");
+    }
     assert_eq!(within(LIMIT, stalled).await.unwrap(), Code::DeadlineExceeded);
     let ack = within(LIMIT, unrolls.acks.message()).await.unwrap().unwrap();
     assert_eq!(ack.verdict(), Verdict::Taken);
     let books = other.books().await;
     assert_eq!((books.produced, books.unattributed), (1, 0), "it is that actor's to send again");
+    assert_eq!(read(&world, "comic_unrolls_late_total"), 1);
 }
 
 #[tokio::test]

@@ -5,7 +5,7 @@
 use std::time::{Duration, Instant};
 
 use crate::support::{BATCH, World, joining, parameters, within};
-use comic_proto::v1::{Behaviour, StatusRequest, Verdict, WatchRequest};
+use comic_proto::v1::{Behaviour, StatusRequest, Verdict};
 use tonic::{Code, Status};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
@@ -35,7 +35,7 @@ async fn who_asks_while_the_learner_drains_is_told_to_come_back() {
     // The update that was under way was the last one: who was sent away may come and hear that.
     world.publisher.publish(1, Behaviour::Leave, &parameters(1, 0));
     let mut late = world.actor(71).await;
-    let mut watch = late.client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
+    let mut watch = late.watch().await;
     assert_eq!(within(LIMIT, watch.message()).await.unwrap().unwrap().behaviour(), Behaviour::Leave);
 }
 
@@ -45,7 +45,7 @@ async fn idle_streams_end_within_a_second_and_say_why() {
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;
     assert_eq!(unrolls.verdict(actor.unroll(0)).await, Verdict::Taken);
-    let mut watch = actor.client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
+    let mut watch = actor.watch().await;
     world.begin_shutdown();
     drains(within(LIMIT, unrolls.acks.message()).await.unwrap_err());
     drains(within(LIMIT, watch.message()).await.unwrap_err());
@@ -84,8 +84,8 @@ async fn a_closed_batcher_ends_the_streams_of_unrolls_too() {
 #[tokio::test]
 async fn the_farewell_is_still_delivered() {
     let mut world = World::start().await;
-    let mut client = world.client().await;
-    let mut watch = client.watch_parameters(WatchRequest::default()).await.unwrap().into_inner();
+    let mut actor = world.actor(70).await;
+    let mut watch = actor.watch().await;
     world.publisher.publish(1, Behaviour::Policy, &parameters(1, 10));
     assert_eq!(watch.message().await.unwrap().unwrap().behaviour(), Behaviour::Policy);
     world.publisher.publish(1, Behaviour::Leave, &parameters(1, 0));
@@ -98,9 +98,9 @@ async fn the_farewell_is_still_delivered() {
 #[tokio::test]
 async fn an_actor_that_does_not_read_cannot_hold_up_the_end() {
     let mut world = World::start().await;
-    let mut client = world.client().await;
+    let mut actor = world.actor(70).await;
     world.publisher.publish(1, Behaviour::Policy, &parameters(1, 64 * 1024 * 1024));
-    let unread = client.watch_parameters(WatchRequest::default()).await.unwrap();
+    let unread = actor.watch().await;
     let begun = Instant::now();
     world.begin_shutdown();
     world.ended().await.unwrap();

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use crate::support::{EPOCH, World};
+use crate::support::{EPOCH, RUN, World};
 use comic_learner::service::Evaluation;
 use comic_proto::v1::{EvaluationReport, StatusRequest};
 use tonic::Code;
@@ -22,13 +22,15 @@ async fn the_newest_metrics_are_what_is_answered() {
 async fn reported_evaluations_wait_for_the_trainer_in_order_and_in_limited_number() {
     let world = World::start().await;
     let mut client = world.client().await;
-    let report = |version| EvaluationReport { learner_epoch: EPOCH, version, updates: 7, json: "{}".into() };
+    let report =
+        |version| EvaluationReport { run: Some(RUN), learner_epoch: EPOCH, version, updates: 7, json: "{}".into() };
     for version in 0..16 {
         client.report_evaluation(report(version)).await.unwrap();
     }
     assert_eq!(client.report_evaluation(report(16)).await.unwrap_err().code(), Code::ResourceExhausted);
-    let expected: Vec<_> =
-        (0..16).map(|version| Evaluation { epoch: EPOCH, version, updates: 7, json: "{}".into() }).collect();
+    let expected: Vec<_> = (0..16)
+        .map(|version| Evaluation { run: Some(RUN), epoch: EPOCH, version, updates: 7, json: "{}".into() })
+        .collect();
     assert_eq!(world.shared.take_evaluations(), expected);
     assert!(client.report_evaluation(report(17)).await.is_ok());
 }
@@ -36,7 +38,8 @@ async fn reported_evaluations_wait_for_the_trainer_in_order_and_in_limited_numbe
 #[tokio::test]
 async fn a_report_that_is_no_json_is_refused() {
     let world = World::start().await;
-    let report = EvaluationReport { learner_epoch: EPOCH, version: 1, updates: 1, json: "{broken".into() };
+    let json = "{broken".into();
+    let report = EvaluationReport { run: None, learner_epoch: EPOCH, version: 1, updates: 1, json };
     let refused = world.client().await.report_evaluation(report).await.unwrap_err();
     assert_eq!(refused.code(), Code::InvalidArgument);
     assert!(world.shared.take_evaluations().is_empty());

@@ -15,7 +15,10 @@ use comic_learner::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared, serve};
 use comic_proto::v1::learner_client::LearnerClient;
-use comic_proto::v1::{JoinReply, JoinRequest, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict};
+use comic_proto::v1::{
+    JoinReply, JoinRequest, ParametersChunk, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict,
+    WatchRequest,
+};
 use comic_proto::{Access, Client, Field, PROTOCOL_VERSION, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{Batcher, Config, Ledger, Order, Phase};
 use futures::{Stream, StreamExt as _};
@@ -246,6 +249,12 @@ impl Actor {
         let (sender, receiver) = mpsc::channel(1);
         let acks = self.client.send_unrolls(ReceiverStream::new(receiver)).await.unwrap().into_inner();
         Unrolls { sender, acks }
+    }
+
+    /// Opens the stream of parameters.
+    pub(crate) async fn watch(&mut self) -> Streaming<ParametersChunk> {
+        let request = WatchRequest { actor: self.reply.actor, incarnation: self.incarnation };
+        self.client.watch_parameters(request).await.unwrap().into_inner()
     }
 
     pub(crate) async fn books(&mut self) -> comic_proto::v1::Books {
