@@ -115,15 +115,23 @@ impl Process {
     /// # Errors
     /// When it ends or `limit` is over before that, with the log.
     pub async fn until_log_holds(&mut self, text: &str, limit: Duration) -> Result<()> {
+        self.until_log(text, limit, |log| log.contains(text)).await
+    }
+
+    /// Waits until its log satisfies a condition.
+    ///
+    /// # Errors
+    /// When it ends or `limit` is over before that, with the log.
+    pub async fn until_log(&mut self, what: &str, limit: Duration, condition: impl Fn(&str) -> bool) -> Result<()> {
         let deadline = Instant::now() + limit;
         loop {
             // Asked first: what it wrote before it ended is there then.
             let ended = self.ended()?;
-            if self.log().contains(text) {
+            if condition(&self.log()) {
                 return Ok(());
             }
             if ended.is_some() || Instant::now() > deadline {
-                bail!("`{text}` is not in the log ({ended:?}): {}", self.log());
+                bail!("`{what}` is not in the log ({ended:?}): {}", self.log());
             }
             tokio::time::sleep(POLL).await;
         }

@@ -8,12 +8,17 @@ use anyhow::{Context, Result, ensure};
 use comic_proto::v1::{Books, Status};
 
 use crate::process::Process;
-use crate::system::{System, balance, metric};
+use crate::system::{Answered, System, balance, metric};
 
 /// Long enough for the slowest machine; no step waits longer than it needs.
 pub const LIMIT: Duration = Duration::from_secs(120);
-/// An actor promises to leave within five seconds.
-const ACTOR_LEAVES: Duration = Duration::from_secs(6);
+/// What an actor promises.
+const ACTOR_LEAVES: Duration = Duration::from_secs(5);
+/// What a learner promises.
+const LEARNER_LEAVES: Duration = Duration::from_secs(30);
+/// Bytes that a learner of the smallest experiment takes at most for training and a handful of actors, with what an
+/// allocator keeps.
+const MEMORY: u64 = 300_000_000;
 /// More unrolls than a dead actor can have left behind: two batches in the batcher, one in training, its window.
 const BEYOND_WHAT_IS_LEFT: u64 = 200;
 /// More versions than actors may lag behind.
@@ -104,16 +109,23 @@ pub async fn leaves(actor: Process) -> Result<()> {
     Ok(())
 }
 
-/// Nobody produces any more: what was produced is trained on, dropped for a counted reason, or in an open batch.
+/// Nobody produces any more: what was produced is trained on once, dropped for a counted reason, or in an open batch. Nothing
+/// that an actor was answered about is missing there, and nothing is there that none made. The learner gave back what memory
+/// it took.
 ///
 /// # Errors
-/// When they do not.
+/// When it is not so.
 pub async fn the_books_balance_at_the_end(mut system: System) -> Result<()> {
     let books = books(&now(&mut system).await?);
     ensure!(balance(&books), "{books:?}");
     ensure!(books.dropped_invalid == 0, "no actor sends what is invalid: {books:?}");
+    let Answered { unrolls, all } = system.answered()?;
+    ensure!(unrolls <= books.produced, "actors were answered about {unrolls} unrolls: {books:?}");
+    ensure!(!all || unrolls == books.produced, "actors made no more than {unrolls} unrolls: {books:?}");
+    let grown = system.grown()?;
+    ensure!(grown < MEMORY, "the learner has {grown} bytes more than before anybody came");
     let learner = system.learner.take().context("no learner")?;
-    let status = learner.terminate(LIMIT).await?;
+    let status = learner.terminate(LEARNER_LEAVES).await?;
     ensure!(status.success(), "a learner that is asked to leave leaves with {status}");
     Ok(())
 }

@@ -2,7 +2,8 @@
 
 use std::ffi::OsString;
 use std::fs::{self, OpenOptions};
-use std::net::{TcpListener, UdpSocket};
+use std::io::{Read as _, Write as _};
+use std::net::{TcpListener, TcpStream, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -115,7 +116,20 @@ pub struct System {
     pub clock: Option<(PathBuf, PathBuf)>,
     /// The learner's process, while there is one.
     pub learner: Option<Process>,
+    /// Bytes that it had before anybody came.
+    alone: u64,
+    /// What the actors log, and the crowds, which count nothing there.
+    actors: Vec<PathBuf>,
     started: usize,
+}
+
+/// Unrolls that actors were answered about, by their own count.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Answered {
+    /// How many.
+    pub unrolls: u64,
+    /// That is all that were ever sent: every actor left in order, with nothing unanswered.
+    pub all: bool,
 }
 
 impl System {
@@ -136,6 +150,8 @@ impl System {
             disk: None,
             clock: None,
             learner: None,
+            alone: 0,
+            actors: Vec::new(),
             started: 0,
         })
     }
@@ -176,7 +192,40 @@ impl System {
             command.env("RUST_LOG", level);
         }
         self.learner = Some(self.spawn("learner", command)?);
-        self.until("the learner serves", limit, |status| Some(status.clone())).await
+        let status = self.until("the learner serves", limit, |status| Some(status.clone())).await?;
+        self.alone = self.learner.as_ref().context("no learner")?.resident()?;
+        Ok(status)
+    }
+
+    /// Bytes that the learner has more than before anybody came.
+    ///
+    /// # Errors
+    /// When there is none, or the system does not say.
+    pub fn grown(&self) -> Result<u64> {
+        Ok(self.learner.as_ref().context("no learner")?.resident()?.saturating_sub(self.alone))
+    }
+
+    /// What the actors' logs say of the answers they got.
+    ///
+    /// # Errors
+    /// When one is not what an actor writes.
+    pub fn answered(&self) -> Result<Answered> {
+        let mut answered = Answered { unrolls: 0, all: true };
+        for log in &self.actors {
+            let text = fs::read_to_string(log).context("no log")?;
+            let Some((_, last)) = text.rsplit_once("settled=Settled {") else {
+                answered.all = false;
+                continue;
+            };
+            answered.all &= !text.contains("left with unrolls that were not acknowledged");
+            for verdict in ["taken", "duplicate", "stale", "invalid"] {
+                let rest = last.split_once(&format!("{verdict}: ")).map(|(_, rest)| rest);
+                let digits = rest.and_then(|rest| rest.split(|letter: char| !letter.is_ascii_digit()).next());
+                let count: u64 = digits.context("no count")?.parse().with_context(|| format!("{verdict} of {last}"))?;
+                answered.unrolls += count;
+            }
+        }
+        Ok(answered)
     }
 
     /// Starts an actor, which is told nothing but where the learner is.
@@ -197,6 +246,31 @@ impl System {
         command.args(["--learner", &self.url()]).args(flags(access));
         change(&mut command);
         self.spawn("actor", command)
+    }
+
+    /// Starts `comic-learner status --watch`.
+    ///
+    /// # Errors
+    /// When it cannot be started.
+    pub fn start_watching(&mut self) -> Result<Process> {
+        let mut command = Command::new(program("comic-learner")?);
+        command.args(["status", "--watch", "--learner", &self.url()]).args(flags(&self.access));
+        self.spawn("watch", command)
+    }
+
+    /// The page at the address for metrics that the learner prints when it serves.
+    ///
+    /// # Errors
+    /// When it has none, or does not answer.
+    pub fn metrics_page(&self) -> Result<String> {
+        let log = self.learner.as_ref().context("no learner")?.log();
+        let mut lines = log.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+        let address = lines.find_map(|line| Some(line["metrics"].as_str()?.to_owned())).context("no address")?;
+        let mut stream = TcpStream::connect(address)?;
+        stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: learner\r\n\r\n")?;
+        let mut page = String::new();
+        stream.read_to_string(&mut page)?;
+        Ok(page)
     }
 
     /// Starts an actor in this network namespace.
@@ -264,6 +338,9 @@ impl System {
         // A crowd goes on until its input ends, which is when the test lets go of it.
         let child = command.stdin(Stdio::piped()).stdout(output.try_clone()?).stderr(output).spawn();
         let child = child.with_context(|| format!("cannot start the {kind}"))?;
+        if matches!(kind, "actor" | "crowd") {
+            self.actors.push(log.clone());
+        }
         Ok(Process { child, log })
     }
 

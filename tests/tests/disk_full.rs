@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result, ensure};
 use comic_tests::steps::{LIMIT, checkpoint_in, half_written, leaves, the_books_balance_at_the_end, trains_on};
-use comic_tests::system::{SMALL, System, metric};
+use comic_tests::system::{SMALL, System, metric, python};
 use comic_tests::tensorboard::curves;
 
 /// Room for a few dozen checkpoints.
@@ -18,7 +18,9 @@ const DISK: u64 = 64 << 20;
 
 #[tokio::test]
 async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
-    let mut system = System::new(&SMALL)?;
+    // Without it nobody could read what is written below, whatever it is.
+    python()?;
+    let mut system = System::new(&[&SMALL[..], &["--metrics-port", "0"]].concat())?;
     system.disk = Some(DISK);
     system.start_learner(LIMIT).await?;
     let actor = system.start_actor()?;
@@ -37,6 +39,9 @@ async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
         ensure!(Instant::now() < deadline, "no checkpoint was refused");
         tokio::time::sleep(std::time::Duration::from_millis(50)).await;
     }
+    let page = system.metrics_page()?;
+    let failed = page.lines().find_map(|line| line.strip_prefix("comic_checkpoints_total{result=\"failed\"} "));
+    ensure!(failed.context("no metric")?.parse::<u64>()? >= 2, "{page}");
     trains_on(&mut system, "training goes on").await?;
     system.until("what is half-written goes away", LIMIT, |_| (half_written(&run)? == 0).then_some(())).await?;
 

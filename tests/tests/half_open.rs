@@ -8,8 +8,8 @@ use comic_tests::steps::{LIMIT, leaves, the_books_balance_at_the_end, trains_on}
 use comic_tests::system::{SMALL, System};
 use tokio::time::{Instant, sleep_until};
 
-/// Thirty seconds are promised; the rest is for a busy machine.
-const NOTICED: Duration = Duration::from_secs(60);
+/// What is promised.
+const NOTICED: Duration = Duration::from_secs(30);
 /// How long a peer is stopped.
 const STOPPED: Duration = Duration::from_secs(60);
 

@@ -2,18 +2,22 @@
 //! to them and to their connections on the way.
 
 use std::fs;
-use std::io::{self, Read as _};
+use std::io::{self, Read as _, Write as _};
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::thread;
+use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 use comic_tests::process::Process;
+use comic_tests::relay::Relay;
 use comic_tests::steps::{LIMIT, books, trains_on};
 use comic_tests::system::{SMALL, System};
 
 /// Environments in all: one for each unroll of a batch.
 const ALL: u32 = 8;
 const UPDATES: u64 = 6;
+/// A version of so small a policy takes seconds at this pace.
+const BYTES_PER_SECOND: f64 = 500_000.0;
 const MEMORY_AND_TWO_TASKS: [&str; 4] = [
     "network.low_level=lstm",
     "network.lstm.units=[12, 8]",
@@ -23,6 +27,11 @@ const MEMORY_AND_TWO_TASKS: [&str; 4] = [
 
 /// A run in lockstep with a warm start, a normaliser that is set twice, and updates that publish nothing new.
 fn lockstep(overrides: &[&str]) -> Result<System> {
+    lockstep_with(&[], overrides)
+}
+
+/// The same, of a learner with these options.
+fn lockstep_with(options: &[&str], overrides: &[&str]) -> Result<System> {
     let updates = format!("budget.updates={UPDATES}");
     let fields = [
         "warm_start.steps=10",
@@ -33,7 +42,9 @@ fn lockstep(overrides: &[&str]) -> Result<System> {
         updates.as_str(),
     ];
     let settings = fields.iter().chain(overrides).flat_map(|field| ["--set", *field]);
-    System::new(&SMALL.into_iter().chain(["--lockstep"]).chain(settings).collect::<Vec<_>>())
+    System::new(
+        &SMALL.into_iter().chain(["--lockstep"]).chain(options.iter().copied()).chain(settings).collect::<Vec<_>>(),
+    )
 }
 
 /// Trains with an actor for each number of environments, until the budget is used up.
@@ -102,6 +113,30 @@ async fn a_paused_actor_and_broken_connections_change_nothing() -> Result<()> {
 }
 
 #[tokio::test]
+async fn a_slow_line_strangers_and_nonsense_change_nothing() -> Result<()> {
+    let mut system = lockstep_with(&["--metrics-port", "0"], &[])?;
+    system.start_learner(LIMIT).await?;
+    let relay = Relay::start(system.address(), BYTES_PER_SECOND).await?;
+    let mut actors = vec![system.start_actor_of(5, &relay.url)?, system.start_actor_of(3, &system.url())?];
+    for actor in &mut actors {
+        actor.until_log_holds("joined the learner", LIMIT).await?;
+    }
+    // The line is still busy with the first parameters: nothing is learnt before they are through.
+    let strangers = system.start_crowd(20)?;
+    let nonsense = babble(system.address());
+    let stand_by = |page: &str| !page.contains("comic_joins_total{result=\"full\"} 0\n");
+    let deadline = Instant::now() + LIMIT;
+    while !stand_by(&system.metrics_page()?) {
+        ensure!(Instant::now() < deadline, "no stranger wanted to join");
+    }
+    is_over(&mut system, actors).await?;
+    drop(strangers);
+    ensure!(nonsense.join().is_ok_and(|said| said > 0), "nobody heard the nonsense");
+    ensure!(learnt(&system)? == learnt_by(&[ALL], &[]).await?, "somebody who is no actor changed something");
+    Ok(())
+}
+
+#[tokio::test]
 async fn a_resumed_run_hangs_on_where_it_was_interrupted_and_on_nothing_else() -> Result<()> {
     resumes_alike(&[]).await
 }
@@ -138,6 +173,23 @@ async fn actors_of_a_killed_learner_leave_and_new_ones_take_their_place() -> Res
     ensure!(actor.log().contains("start the actor again"), "{}", actor.log());
     let _actor = system.start_actor_of(ALL, &system.url())?;
     trains_on(&mut system, "a new actor's unrolls are trained on").await
+}
+
+/// Connections that speak no protocol, one after another until nobody listens any more; how many there were.
+fn babble(learner: String) -> thread::JoinHandle<u64> {
+    const SAYINGS: [&[u8]; 3] =
+        [b"GET / HTTP/1.1\r\n\r\n", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\xff\xff\xff\0", &[0x80; 4096]];
+    thread::spawn(move || {
+        let mut said = 0;
+        for saying in SAYINGS.iter().cycle() {
+            let Ok(mut learner) = TcpStream::connect(&learner) else { break };
+            let _ = learner.write_all(saying);
+            // Until the learner has had enough of it.
+            let _ = io::copy(&mut learner, &mut io::sink());
+            said += 1;
+        }
+        said
+    })
 }
 
 /// A way to the learner on which the first connections break in the middle of an unroll.

@@ -10,8 +10,8 @@ use anyhow::{Context as _, Result, ensure};
 use comic_tests::steps::{LIMIT, leaves, the_books_balance_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
 
-/// Thirty seconds are promised; the rest is for a busy machine.
-const NOTICED: Duration = Duration::from_secs(60);
+/// What is promised.
+const NOTICED: Duration = Duration::from_secs(30);
 
 /// The actor's host, at the other end of a cable.
 struct Host {

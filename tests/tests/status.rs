@@ -1,8 +1,6 @@
 //! `comic-learner status` and `comic-learner health` against a learner with TLS and tokens, and its metrics over HTTP.
 
 use std::fs;
-use std::io::{Read as _, Write as _};
-use std::net::TcpStream;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
@@ -45,7 +43,7 @@ async fn a_running_learner_is_asked_how_it_is() -> Result<()> {
         ensure!(text.contains(word), "no `{word}` in {text}");
     }
     ensure!(system.ask(&["health"])?.status.code() == Some(0), "it serves");
-    let page = metrics(&system)?;
+    let page = system.metrics_page()?;
     ensure!(
         page.contains("comic_actors{state=\"alive\"} 1\n") && page.contains("comic_update_seconds_count"),
         "{page}"
@@ -61,14 +59,18 @@ async fn a_running_learner_is_asked_how_it_is() -> Result<()> {
     Ok(())
 }
 
-/// The page at the address that the learner prints when it serves.
-fn metrics(system: &System) -> Result<String> {
-    let log = system.learner.as_ref().context("no learner")?.log();
-    let mut lines = log.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
-    let address = lines.find_map(|line| Some(line["metrics"].as_str()?.to_owned())).context("no address")?;
-    let mut stream = TcpStream::connect(address)?;
-    stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: learner\r\n\r\n")?;
-    let mut page = String::new();
-    stream.read_to_string(&mut page)?;
-    Ok(page)
+#[tokio::test]
+async fn who_watches_sees_how_it_goes_on_and_waits_for_a_learner_that_is_away() -> Result<()> {
+    let mut system = System::new(&SMALL)?;
+    let mut watching = system.start_watching()?;
+    watching.until_log_holds(&system.address(), LIMIT).await?;
+    ensure!(!watching.log().contains("books "), "nobody serves yet: {}", watching.log());
+    system.start_learner(LIMIT).await?;
+    let _actor = system.start_actor()?;
+    // On paper one state follows the other.
+    watching
+        .until_log("two states, and the actor in one of them", LIMIT, |log| {
+            log.matches("books ").count() >= 2 && log.contains("1 alive")
+        })
+        .await
 }
