@@ -96,6 +96,10 @@ impl Certs {
             return Ok(());
         }
         let text = fs::read_to_string(&from).with_context(|| format!("cannot read {}", from.display()))?;
+        // What is the same is left alone: an actor may read it just now.
+        if fs::read_to_string(place.join(file)).is_ok_and(|there| there == text) {
+            return Ok(());
+        }
         fs::create_dir_all(place).with_context(|| format!("cannot make {}", place.display()))?;
         let mode = fs::metadata(&from)?.permissions().mode() & 0o777;
         put(place, file, mode, &text)

@@ -108,11 +108,13 @@ impl Store {
     /// When the directory cannot be made.
     pub fn open(run: &Path, kept: usize) -> Result<Self> {
         let directory = run.join("checkpoints");
-        if !directory.is_dir() {
-            fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
-            // What is synced in a directory that nobody finds is lost with it.
-            let places = [Some(run), run.parent().filter(|parent| *parent != Path::new(""))];
-            places.into_iter().flatten().try_for_each(|place| Step::SyncDirectory(place.to_path_buf()).carry_out())?;
+        let made: Vec<_> =
+            directory.ancestors().take_while(|place| !place.as_os_str().is_empty() && !place.is_dir()).collect();
+        fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
+        // What is synced in a directory that nobody finds is lost with it.
+        for place in made.into_iter().rev() {
+            let above = place.parent().filter(|above| !above.as_os_str().is_empty());
+            Step::SyncDirectory(above.unwrap_or(Path::new(".")).to_path_buf()).carry_out()?;
         }
         Ok(Self { directory, kept: kept.max(1) })
     }
@@ -136,8 +138,8 @@ impl Store {
     /// [`Misuse`] when the epoch file is damaged; otherwise when it cannot be read or written.
     pub fn begin_life(&self) -> Result<u64> {
         let path = self.directory.join(EPOCH);
-        let last = match fs::read_to_string(&path) {
-            Ok(text) => text.trim().parse::<u64>().map_err(|_| {
+        let last = match fs::read(&path) {
+            Ok(bytes) => String::from_utf8_lossy(&bytes).trim().parse::<u64>().map_err(|_| {
                 let remedy = "write the number of earlier starts into it";
                 Misuse::new(format!("{} is damaged: {remedy}", path.display()))
             })?,
@@ -278,9 +280,14 @@ impl Store {
     }
 }
 
-/// What to say of a run whose checkpoint verifies and cannot be gone on with: the next start would find the same.
-pub(crate) fn unfit(run: &Path, error: &anyhow::Error) -> Misuse {
-    Misuse::new(format!("{} cannot be resumed: {error:#}", run.display()))
+/// What to say of a run whose checkpoint verifies and cannot be gone on with: the next start would find the same, unless it
+/// was the device that failed.
+pub(crate) fn unfit(run: &Path, error: anyhow::Error) -> anyhow::Error {
+    let what = format!("{} cannot be resumed", run.display());
+    if error.chain().any(|cause| cause.is::<tch::TchError>()) {
+        return error.context(what);
+    }
+    Misuse::new(format!("{what}: {error:#}")).into()
 }
 
 fn entries(directory: &Path) -> Result<Vec<PathBuf>> {

@@ -249,6 +249,7 @@ fn lag(connections: usize, parameters: u64, target_period: usize, every: f64) ->
     let everybody = connections.to_string();
     let mut crowd = Process::crowd(&host, &["--actors", &everybody, "--watch"])?;
     crowd.wait_for("versions", connections as f64, PATIENCE)?;
+    host.forget_peak();
     let connected = host.usage()?.resident;
     let (start, began, read) = (Instant::now(), host.usage()?, crowd.number("bytes")?);
     crowd.ask("forget")?;

@@ -181,7 +181,7 @@ fn prepare(
     let resume = store.newest()?;
     if let Some((path, snapshot)) = &resume {
         check_same_experiment(&experiment, &spec, snapshot, options.allow_changed)
-            .map_err(|error| unfit(&options.run, &error))?;
+            .map_err(|error| unfit(&options.run, error))?;
         tracing::info!(checkpoint = %path.display(), "resuming");
     }
     let resume = resume.map(|(_, snapshot)| snapshot);
@@ -189,7 +189,7 @@ fn prepare(
     std::fs::write(options.run.join("experiment.toml"), experiment.to_toml()?)
         .with_context(|| format!("cannot write into {}", options.run.display()))?;
     let ledger = match &resume {
-        Some(snapshot) => books(snapshot).map_err(|error| unfit(&options.run, &error))?,
+        Some(snapshot) => books(snapshot).map_err(|error| unfit(&options.run, error))?,
         None => Ledger::new(),
     };
     let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));

@@ -62,8 +62,9 @@ use roster::Roster;
 use shares::Shares;
 use streams::Streams;
 
-/// A peer that answers no ping for [`KEEPALIVE_TIMEOUT`] is gone; without pings a half-open one is never noticed.
-const KEEPALIVE: Duration = Duration::from_secs(15);
+/// A peer that answers no ping for [`KEEPALIVE_TIMEOUT`] is gone; without pings a half-open one is never noticed. Thirty
+/// seconds are promised, on a busy machine too.
+const KEEPALIVE: Duration = Duration::from_secs(10);
 /// See [`KEEPALIVE`].
 const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 /// A call has to be answered, or its stream begun, in this time. A stream that has begun is not limited.

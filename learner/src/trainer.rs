@@ -155,7 +155,7 @@ impl Trainer {
         };
         match resume {
             Some(snapshot) => {
-                trainer.restore(&snapshot).map_err(|error| unfit(&run, &error))?;
+                trainer.restore(&snapshot).map_err(|error| unfit(&run, error))?;
                 trainer.good = Arc::new(snapshot);
             }
             None => trainer.keep(Name::Initial)?,

@@ -28,14 +28,14 @@ impl Process {
         Ok(())
     }
 
-    /// Bytes of memory it has.
+    /// Bytes of memory it has for itself, without the files it maps.
     ///
     /// # Errors
     /// When the system does not say.
     pub fn resident(&self) -> Result<u64> {
         let status = fs::read_to_string(format!("/proc/{}/status", self.child.id())).context("no such process")?;
-        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).context("no VmRSS")?;
-        let kilobytes: u64 = line.trim().trim_end_matches(" kB").parse().context("VmRSS is no number")?;
+        let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).context("no RssAnon")?;
+        let kilobytes: u64 = line.trim().trim_end_matches(" kB").parse().context("RssAnon is no number")?;
         Ok(kilobytes * 1024)
     }
 

@@ -213,7 +213,8 @@ impl System {
         let mut answered = Answered { unrolls: 0, all: true };
         for log in &self.actors {
             let text = fs::read_to_string(log).context("no log")?;
-            let Some((_, last)) = text.rsplit_once("settled=Settled {") else {
+            let Some((_, last)) = text.rsplit_once("Settled {") else {
+                ensure!(!text.contains("leaving"), "an actor left without a word of its unrolls: {text}");
                 answered.all = false;
                 continue;
             };

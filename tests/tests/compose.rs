@@ -143,6 +143,12 @@ async fn containers_with_tls_and_a_token_make_both_themselves() -> Result<()> {
     project.up(2)?;
     trains_on_with(2, &project, "two actors train").await?;
     project.in_learner(&["comic-learner", "health"])?;
+    let shown = project.compose(&["exec", "-T", "actor", "ls", "/access"])?;
+    let shown: Vec<_> = shown.split_whitespace().collect();
+    ensure!(
+        shown == ["ca.pem", "client-key.pem", "client.pem", "token"],
+        "an actor has what is not its own: {shown:?}"
+    );
     let refused = project.in_learner(&["env", "--unset=COMIC_TOKEN_FILE", "comic-learner", "status"]);
     ensure!(refused.is_err_and(|error| format!("{error:#}").contains("token")), "it tells whoever asks");
     Ok(())

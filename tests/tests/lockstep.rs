@@ -5,7 +5,7 @@ use std::fs;
 use std::io::{self, Read as _, Write as _};
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::thread;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use comic_tests::process::Process;
@@ -124,10 +124,11 @@ async fn a_slow_line_strangers_and_nonsense_change_nothing() -> Result<()> {
     // The line is still busy with the first parameters: nothing is learnt before they are through.
     let strangers = system.start_crowd(20)?;
     let nonsense = babble(system.address());
-    let stand_by = |page: &str| !page.contains("comic_joins_total{result=\"full\"} 0\n");
     let deadline = Instant::now() + LIMIT;
-    while !stand_by(&system.metrics_page()?) {
+    while stand_by(&system.metrics_page()?)? == 0 {
         ensure!(Instant::now() < deadline, "no stranger wanted to join");
+        // The slow line is this thread's, too.
+        tokio::time::sleep(Duration::from_millis(20)).await;
     }
     is_over(&mut system, actors).await?;
     drop(strangers);
@@ -173,6 +174,12 @@ async fn actors_of_a_killed_learner_leave_and_new_ones_take_their_place() -> Res
     ensure!(actor.log().contains("start the actor again"), "{}", actor.log());
     let _actor = system.start_actor_of(ALL, &system.url())?;
     trains_on(&mut system, "a new actor's unrolls are trained on").await
+}
+
+/// How often somebody was told that there is nothing to do.
+fn stand_by(page: &str) -> Result<u64> {
+    let line = page.lines().find_map(|line| line.strip_prefix("comic_joins_total{result=\"full\"} "));
+    line.context("no such metric")?.parse().context("no number")
 }
 
 /// Connections that speak no protocol, one after another until nobody listens any more; how many there were.

@@ -4,7 +4,7 @@
 
 use std::net::Ipv4Addr;
 use std::process::Command;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use comic_tests::steps::{LIMIT, leaves, the_books_balance_at_the_end, trains_on};
@@ -90,9 +90,11 @@ async fn a_partition_heals(number: u8, cut: impl Fn(&Host, bool) -> Result<()>) 
     trains_on(&mut system, "the actor's unrolls are trained on").await?;
 
     cut(&host, true)?;
+    let deadline = Instant::now() + NOTICED;
     actor.until_log_holds("no connection to the learner", NOTICED).await?;
     let lost = |status: &comic_proto::v1::Status| status.actors.is_some_and(|actors| actors.lost == 1);
-    system.until("the learner gives the actor up", NOTICED, |status| lost(status).then_some(())).await?;
+    let left = deadline.saturating_duration_since(Instant::now());
+    system.until("the learner gives the actor up", left, |status| lost(status).then_some(())).await?;
     cut(&host, false)?;
 
     actor.until_log_holds("reconnected to the learner", LIMIT).await?;

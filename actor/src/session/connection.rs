@@ -85,7 +85,7 @@ impl Connector {
             .access
             .endpoint(&self.address)?
             .tcp_nodelay(true)
-            .http2_keep_alive_interval(Duration::from_secs(15))
+            .http2_keep_alive_interval(Duration::from_secs(10))
             .keep_alive_timeout(Duration::from_secs(10))
             .keep_alive_while_idle(true)
             .initial_stream_window_size(1 << 20)

@@ -19,8 +19,8 @@ impl Store {
     /// [`Misuse`] when its file is damaged; otherwise when it cannot be read or written.
     pub fn run(&self) -> Result<u64> {
         let path = self.directory.join(RUN);
-        match fs::read_to_string(&path) {
-            Ok(text) => u64::from_str_radix(text.trim(), 16).map_err(|_| {
+        match fs::read(&path) {
+            Ok(bytes) => u64::from_str_radix(String::from_utf8_lossy(&bytes).trim(), 16).map_err(|_| {
                 let remedy = "remove it, and start the actors again";
                 Misuse::new(format!("{} is damaged: {remedy}", path.display())).into()
             }),

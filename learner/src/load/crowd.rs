@@ -294,7 +294,7 @@ impl Crowd {
         let endpoint = Access { ca, ..Access::default() }
             .endpoint(&format!("{scheme}://{}", self.options.host))?
             .tcp_nodelay(true)
-            .http2_keep_alive_interval(Duration::from_secs(15))
+            .http2_keep_alive_interval(Duration::from_secs(10))
             .keep_alive_timeout(Duration::from_secs(10))
             .keep_alive_while_idle(true)
             .initial_stream_window_size(1 << 20)

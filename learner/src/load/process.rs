@@ -67,6 +67,11 @@ impl Process {
         serde_json::from_value(answer).context("unreadable usage")
     }
 
+    /// From now on the peak of its memory is that since now, where the system allows it.
+    pub(super) fn forget_peak(&self) {
+        let _ = std::fs::write(format!("/proc/{}/clear_refs", self.child.id()), "5");
+    }
+
     /// One of its numbers.
     pub(super) fn number(&mut self, name: &str) -> Result<f64> {
         let stats = self.ask("stats")?;

@@ -86,6 +86,7 @@ impl Learner for Calls {
         let environments = environments_of(shared, &request).inspect_err(turned_away)?;
         let joined = shared.batcher.join(incarnation, actor).map_err(|refused| {
             joins.of("refused").inc();
+            shared.roster.turn_away(incarnation);
             Status::failed_precondition(refused.to_string())
         })?;
         shared.roster.number(incarnation, joined.actor);

@@ -55,6 +55,8 @@ struct Actor {
     order: u64,
     /// A newer process of its name came.
     superseded: bool,
+    /// It came in and found nothing to do: it comes again, and is nobody until then.
+    standing_by: bool,
     /// Streams of parameters that are open.
     streams: u32,
     /// Unrolls of it that wait for a place in a batch.
@@ -67,7 +69,7 @@ struct Actor {
 impl Actor {
     fn is_present(&self, now: Instant) -> bool {
         let lately = self.gone.is_none() && now.duration_since(self.heard) < JOINING;
-        !self.superseded && (self.streams > 0 || lately)
+        !self.superseded && !self.standing_by && (self.streams > 0 || lately)
     }
 
     fn is_slow(&self, now: Instant) -> bool {
@@ -124,17 +126,25 @@ impl Roster {
             actors.retain(|_, actor| actor.is_remembered(now));
         }
         let name = name.to_owned();
-        let actor = Actor { name, order, superseded: false, streams: 0, waiting: 0, heard: now, gone: None };
+        let actor = Actor {
+            name,
+            order,
+            superseded: false,
+            standing_by: false,
+            streams: 0,
+            waiting: 0,
+            heard: now,
+            gone: None,
+        };
         let actor = actors.entry(incarnation).or_insert(actor);
-        (actor.heard, actor.gone) = (now, None);
+        (actor.heard, actor.gone, actor.standing_by) = (now, None, false);
         Admission::Welcome
     }
 
-    /// Forgets an actor that came in and finds nothing to do, unless it was there before.
+    /// Notes that an actor that came in finds nothing to do. It keeps its place among the processes of its name alone.
     pub(super) fn turn_away(&self, incarnation: u64) {
-        let mut actors = lock(&self.actors);
-        if actors.get(&incarnation).is_some_and(|actor| actor.streams == 0 && !actor.superseded) {
-            actors.remove(&incarnation);
+        if let Some(actor) = lock(&self.actors).get_mut(&incarnation) {
+            actor.standing_by = true;
         }
     }
 
@@ -169,18 +179,23 @@ impl Roster {
 
     /// Notes a stream of parameters, until what is returned is dropped. `None` of an actor that has not joined.
     pub(super) fn watch(self: &Arc<Self>, incarnation: u64) -> Option<Presence> {
-        let joined = lock(&self.actors).contains_key(&incarnation);
-        joined.then(|| Presence::new(self, incarnation, Kind::Stream))
+        let mut actors = lock(&self.actors);
+        let actor = actors.get_mut(&incarnation).filter(|actor| !actor.standing_by)?;
+        (actor.streams, actor.gone) = (actor.streams + 1, None);
+        Some(Presence { roster: self.clone(), incarnation, kind: Kind::Stream })
     }
 
     /// Notes an unroll that waits for a place, until what is returned is dropped.
     pub(super) fn wait(self: &Arc<Self>, incarnation: u64) -> Presence {
-        Presence::new(self, incarnation, Kind::Waiting)
+        if let Some(actor) = lock(&self.actors).get_mut(&incarnation) {
+            actor.waiting += 1;
+        }
+        Presence { roster: self.clone(), incarnation, kind: Kind::Waiting }
     }
 
     pub(super) fn census(&self, now: Instant) -> Census {
         let mut census = Census::default();
-        for actor in lock(&self.actors).values().filter(|actor| actor.is_remembered(now)) {
+        for actor in lock(&self.actors).values().filter(|actor| actor.is_remembered(now) && !actor.standing_by) {
             census.waiting += u64::from(actor.waiting);
             *match (actor.is_present(now), actor.is_slow(now)) {
                 (false, _) => &mut census.lost,
@@ -205,17 +220,6 @@ pub(super) struct Presence {
 enum Kind {
     Stream,
     Waiting,
-}
-
-impl Presence {
-    fn new(roster: &Arc<Roster>, incarnation: u64, kind: Kind) -> Self {
-        match (lock(&roster.actors).get_mut(&incarnation), kind) {
-            (Some(actor), Kind::Stream) => (actor.streams, actor.gone) = (actor.streams + 1, None),
-            (Some(actor), Kind::Waiting) => actor.waiting += 1,
-            (None, _) => {}
-        }
-        Self { roster: roster.clone(), incarnation, kind }
-    }
 }
 
 impl Drop for Presence {
@@ -330,6 +334,23 @@ mod tests {
         drop(watching);
         let gone = Instant::now();
         assert!(roster.expects(1, gone) && !roster.expects(1, gone + JOINING));
+    }
+
+    #[test]
+    fn who_stands_by_is_not_there_and_gives_way_to_a_newer_process_of_its_name() {
+        let (roster, start) = (Arc::new(Roster::new(1)), Instant::now());
+        let join = |incarnation| roster.join(incarnation, "comic-actor-0", None, start);
+        assert_eq!(join(1), Admission::Welcome);
+        roster.turn_away(1);
+        assert_eq!(census(&roster, start), (0, 0, 0, 0));
+        assert!(roster.watch(1).is_none() && !roster.expects(1, start));
+        assert!(joins(&roster, 2, start), "it takes nobody's place");
+        roster.turn_away(2);
+        assert_eq!(join(1), Admission::Welcome, "it comes again");
+        roster.turn_away(1);
+        assert_eq!(join(3), Admission::Welcome);
+        assert_eq!(join(1), Admission::Superseded);
+        assert!(roster.watch(3).is_some());
     }
 
     #[test]
