@@ -22,7 +22,8 @@ const END_HEADERS: u8 = 4;
 const LARGEST_WINDOW: u32 = 0x7fff_ffff;
 const FIRST_WINDOW: u32 = 65_535;
 
-/// Reads what the learner broadcasts to an actor that has joined, and gives `count` the bytes of parameters, until the connection ends.
+/// Reads what the learner broadcasts to an actor that has joined, and gives `count` the bytes of parameters, until the
+/// connection ends.
 pub(super) async fn read(mut socket: TcpStream, incarnation: u64, mut count: impl FnMut(u64)) -> Result<()> {
     socket.set_nodelay(true)?;
     socket.write_all(&opening(incarnation)).await?;
