@@ -86,10 +86,18 @@ impl Pieces {
     /// # Panics
     /// When there is less than `into` has room for.
     pub fn copy_to(&self, start: usize, into: &mut [u8]) {
+        self.copy_by(start, into, |from, into| into.copy_from_slice(from));
+    }
+
+    /// The same by another way of copying, which is called with two slices of one length.
+    ///
+    /// # Panics
+    /// When there is less than `into` has room for.
+    pub fn copy_by(&self, start: usize, into: &mut [u8], copy: impl Fn(&[u8], &mut [u8])) {
         let mut rest = into;
         for bytes in self.range(start..start + rest.len()) {
             let (place, after) = rest.split_at_mut(bytes.len());
-            place.copy_from_slice(bytes);
+            copy(bytes, place);
             rest = after;
         }
         assert!(rest.is_empty(), "{} bytes are missing from {start} on: there are {}", rest.len(), self.length);

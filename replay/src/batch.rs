@@ -7,8 +7,8 @@ use std::sync::Arc;
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, Invalid, Pieces, UnrollLayout};
 
-use crate::Batcher;
 use crate::ledger::Reason;
+use crate::{Batcher, streaming};
 
 /// The arrays of a batch: `[B, rows, width]` for each field. Made once and used again and again.
 #[derive(Debug)]
@@ -83,7 +83,7 @@ impl Buffer {
                 Field::Image => &mut self.images[place],
                 _ => bytemuck::cast_slice_mut(&mut self.floats[field as usize][place]),
             };
-            payload.copy_to(layout.range(field).start, bytes);
+            payload.copy_by(layout.range(field).start, bytes, streaming::copy);
         }
         self.headers[slot] = header;
         self.filled[slot] = true;

@@ -42,6 +42,7 @@ mod batch;
 mod batcher;
 mod ledger;
 mod snapshot;
+mod streaming;
 mod tasks;
 
 pub use batch::Batch;
