@@ -1,9 +1,11 @@
-//! What every crate's build script does, and with `--features xla` the few lines of C++ that XLA takes, and where Python
-//! and its packages are.
+//! What every crate's build script does, and the few lines of C++ that other devices take: CUDA where libtorch has it, XLA
+//! with `--features xla`, which also wants to know where Python and its packages are.
 
 #[allow(dead_code, reason = "its own `main` is for crates that need no more")]
 #[path = "../deploy/rpath.rs"]
 mod rpath;
+
+use std::path::{Path, PathBuf};
 
 fn main() {
     rpath::write_run_path();
@@ -14,34 +16,36 @@ fn main() {
 
 /// libtorch's CUDA registers itself when it is loaded, and nothing names what is in it: a linker would leave it out.
 fn cuda() {
-    let Some(libtorch) = std::env::var_os("LIBTORCH") else { return };
-    let library = std::path::Path::new(&libtorch).join("lib/libtorch_cuda.so");
-    println!("cargo:rerun-if-changed={}", library.display());
+    println!("cargo:rustc-check-cfg=cfg(cuda)");
+    let Some(libtorch) = std::env::var_os("LIBTORCH").map(PathBuf::from) else { return };
+    let libraries = libtorch.join("lib");
+    // The directory: of a file that is not there Cargo thinks that it has just gone, and builds everything anew each time.
+    println!("cargo:rerun-if-changed={}", libraries.display());
+    let library = libraries.join("libtorch_cuda.so");
     if library.exists() {
         println!("cargo:rustc-link-arg=-Wl,--allow-shlib-undefined,--no-as-needed,{},--as-needed", library.display());
+        println!("cargo:rustc-cfg=cuda");
+        cpp(&libtorch, "src/device/cuda.cpp").compile("comic_cuda");
     }
+}
+
+/// A file of C++ that sees libtorch.
+fn cpp(libtorch: &Path, file: &str) -> cc::Build {
+    println!("cargo:rerun-if-changed={file}");
+    let include = libtorch.join("include");
+    let mut build = cc::Build::new();
+    build.cpp(true).std("c++17").warnings(false).define("_GLIBCXX_USE_CXX11_ABI", "1");
+    build.include(&include).include(include.join("torch/csrc/api/include")).file(file);
+    build
 }
 
 #[cfg(feature = "xla")]
 fn xla() {
-    use std::path::PathBuf;
     use std::process::Command;
 
-    let shim = "src/device/xla.cpp";
-    println!("cargo:rerun-if-changed={shim}");
     let libtorch = PathBuf::from(std::env::var_os("LIBTORCH").expect("LIBTORCH is not set: `cargo xtask setup --xla`"));
-    let include = libtorch.join("include");
-    cc::Build::new()
-        .cpp(true)
-        .std("c++17")
-        .warnings(false)
-        .define("_GLIBCXX_USE_CXX11_ABI", "1")
-        .include(&include)
-        .include(include.join("torch/csrc/api/include"))
-        .file(shim)
-        // Nothing names what is in it: it registers itself, so all of it is linked.
-        .cargo_metadata(false)
-        .compile("comic_xla");
+    // Nothing names what is in it: it registers itself, so all of it is linked.
+    cpp(&libtorch, "src/device/xla.cpp").cargo_metadata(false).compile("comic_xla");
     println!("cargo:rustc-link-search=native={}", std::env::var("OUT_DIR").expect("cargo sets OUT_DIR"));
     println!("cargo:rustc-link-lib=static:+whole-archive,-bundle=comic_xla");
     println!("cargo:rustc-link-lib=stdc++");

@@ -1,14 +1,17 @@
 //! Where the learner computes: the one place that knows what devices there are.
 //!
 //! The update is written once, in [`vmpo`](crate::vmpo), for whatever [`Backend::device`] is. What differs is here: how a
-//! device is found, and that XLA is told where a gradient step ends.
+//! device is found, how a batch gets there, and that XLA is told where a gradient step ends.
 
+#[cfg(cuda)]
+mod cuda;
 #[cfg(feature = "xla")]
 mod xla;
 
 use anyhow::Result;
 use comic_experiment::{DeviceName, Learner};
-use tch::Device;
+use tch::kind::Element;
+use tch::{Device, TchError, Tensor};
 
 use crate::options::Misuse;
 
@@ -130,6 +133,19 @@ impl Backend {
         }
         Ok(0)
     }
+}
+
+/// Values of a batch as a tensor of this size, one copy of them all. On a card it comes while earlier updates are still
+/// computed: from pinned memory, on a stream of its own.
+///
+/// # Errors
+/// When there are not as many values as `size` says, or the device refuses.
+pub(crate) fn upload<T: Element>(values: &[T], size: &[i64], device: Device) -> Result<Tensor, TchError> {
+    #[cfg(cuda)]
+    if let Device::Cuda(card) = device {
+        return cuda::upload(values, size, card);
+    }
+    Tensor::from_slice(values).f_reshape(size)?.f_to_device(device)
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ use comic_proto::UnrollShape;
 use tch::{Device, Tensor};
 
 use super::Error;
+use crate::device::upload;
 
 /// Sizes of a minibatch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -95,8 +96,7 @@ impl MinibatchTensors {
         let tensor = |name, values: &[f32], rows: usize, width: usize| {
             let size = [unrolls, rows, width];
             check(name, values.len(), &size)?;
-            let tensor = Tensor::from_slice(values).f_reshape(size.map(|size| size as i64))?;
-            Ok::<Tensor, Error>(tensor.f_to_device(device)?)
+            Ok::<Tensor, Error>(upload(values, &size.map(|size| size as i64), device)?)
         };
         let flag = |name, values, rows| Ok::<Tensor, Error>(tensor(name, values, rows, 1)?.f_squeeze_dim(-1)?);
         let valid = flag("valid", source.valid, steps)?;
@@ -111,11 +111,8 @@ impl MinibatchTensors {
         }
         let size = [unrolls, observations, unroll.image];
         check("image", source.image.len(), &size)?;
-        let image = if unroll.image == 0 {
-            None
-        } else {
-            Some(Tensor::from_slice(source.image).f_reshape(size.map(|size| size as i64))?.f_to_device(device)?)
-        };
+        let image =
+            if unroll.image == 0 { None } else { Some(upload(source.image, &size.map(|size| size as i64), device)?) };
         let components = unroll.components;
         let (weights, even) = (if components > 1 { components } else { 0 }, -(components as f64).ln());
         let clip: Vec<i64> = source.clip.iter().map(|clip| i64::from(*clip)).collect();
@@ -132,7 +129,7 @@ impl MinibatchTensors {
             discount: flag("discount", source.discount, steps)? * &valid,
             first: flag("first", source.first, observations)?,
             state: tensor("state", source.state, 1, unroll.state)?.f_squeeze_dim(1)?,
-            clip: Tensor::from_slice(&clip).f_reshape([unrolls as i64, observations as i64])?.f_to_device(device)?,
+            clip: upload(&clip, &[unrolls as i64, observations as i64], device)?,
             image,
             clips: source.clip.iter().max().map_or(0, |clip| *clip as usize + 1),
             routing: Routing::blocked(source.tasks, task_count, device),

@@ -1,0 +1,75 @@
+//! Batches to a card from pinned memory, on a stream of their own: see `cuda.cpp`.
+
+#![allow(unsafe_code, reason = "a function of C++")]
+
+use std::ffi::{c_char, c_void};
+
+use tch::kind::Element;
+use tch::{Kind, TchError, Tensor};
+
+unsafe extern "C" {
+    fn comic_upload(
+        bytes: *const c_void,
+        size: *const i64,
+        dimensions: usize,
+        kind: i8,
+        card: i64,
+        message: *mut c_char,
+        room: usize,
+    ) -> *mut c_void;
+}
+
+/// A tensor on a card. Returns when the values were read, not when they are there: what the calling thread has computed from
+/// now on waits for them.
+///
+/// # Errors
+/// When there are not as many values as `size` says, or the card refuses.
+pub(super) fn upload<T: Element>(values: &[T], size: &[i64], card: usize) -> Result<Tensor, TchError> {
+    let elements = size.iter().try_fold(1_usize, |product, width| product.checked_mul(usize::try_from(*width).ok()?));
+    if elements != Some(values.len()) {
+        return Err(TchError::Shape(format!("{} values are no tensor of {size:?}", values.len())));
+    }
+    // c10/core/ScalarType.h.
+    let kind = match T::KIND {
+        Kind::Uint8 => 0,
+        Kind::Int64 => 4,
+        Kind::Float => 6,
+        other => return Err(TchError::Kind(format!("no batch has {other:?}"))),
+    };
+    let mut message = [0_u8; 1024];
+    // SAFETY: the pointers lead to as many bytes and sizes as they are said to, and the values are read before it returns. No
+    // exception passes it.
+    let made = unsafe {
+        let (room, message) = (message.len(), message.as_mut_ptr().cast());
+        comic_upload(values.as_ptr().cast(), size.as_ptr(), size.len(), kind, card as i64, message, room)
+    };
+    if made.is_null() {
+        let said = String::from_utf8_lossy(&message);
+        return Err(TchError::Torch(said.trim_end_matches('\0').to_owned()));
+    }
+    // SAFETY: it is a new tensor of libtorch's that is nobody else's, as those are that the bindings make.
+    Ok(unsafe { Tensor::from_ptr(made.cast()) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn without_a_card_a_copy_is_an_error_of_libtorchs() {
+        if tch::Cuda::device_count() > 0 {
+            let there = upload(&[1_i64, 2, 3, 4, 5, 6], &[2, 3], 0).unwrap();
+            assert_eq!(there.to_device(tch::Device::Cpu), Tensor::from_slice(&[1_i64, 2, 3, 4, 5, 6]).reshape([2, 3]));
+            return;
+        }
+        let refused = upload(&[1.0_f32], &[1], 0).unwrap_err();
+        assert!(matches!(&refused, TchError::Torch(said) if !said.is_empty()), "{refused}");
+    }
+
+    #[test]
+    fn a_size_that_is_not_the_values_is_refused() {
+        for size in [&[2_i64, 2][..], &[-3], &[i64::MAX, 3]] {
+            assert!(matches!(upload(&[0_u8; 3], size, 0), Err(TchError::Shape(_))), "{size:?}");
+        }
+    }
+}
