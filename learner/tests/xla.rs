@@ -57,3 +57,20 @@ fn a_device_that_is_not_there_is_a_configuration_that_is_wrong() {
     let log = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.code() == Some(2) && log.contains("setup --xla"), "{log}");
 }
+
+/// As of a torch_xla that was put together by hand.
+#[test]
+fn a_part_of_the_plugin_that_is_not_there_is_a_configuration_that_is_wrong() {
+    let directory = tempfile::tempdir().unwrap();
+    let packages = directory.path().join("packages");
+    std::fs::create_dir(&packages).unwrap();
+    for entry in std::fs::read_dir(env!("COMIC_PYTHON_PACKAGES")).unwrap().map(Result::unwrap) {
+        if !entry.file_name().to_string_lossy().starts_with("libtpu") {
+            std::os::unix::fs::symlink(entry.path(), packages.join(entry.file_name())).unwrap();
+        }
+    }
+    let mut without = learner(&directory.path().join("run"), &["--device", "xla"]);
+    let output = without.env("COMIC_PYTHON_PACKAGES", &packages).env("PJRT_DEVICE", "TPU").output().unwrap();
+    let log = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(2) && log.contains("libtpu") && log.contains("setup --xla"), "{log}");
+}

@@ -69,7 +69,8 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
     run(&mut command)
 }
 
-/// The tests of devices, and those of the learner's program with XLA in it. Built beside everything else, which has none.
+/// The tests of devices, of the learner's parts, and of its program with XLA in it. Built beside everything else, which has
+/// none.
 fn test_xla(arguments: &[String]) -> Result<()> {
     setup::run(&setup::Options::xla())?;
     let mut command = cargo();
@@ -78,7 +79,7 @@ fn test_xla(arguments: &[String]) -> Result<()> {
         false => command.arg("test"),
     };
     command.args(["--release", "--package", "comic-learner", "--features", "xla", "--target-dir", "target/xla"]);
-    command.args(["--test", "devices", "--test", "xla"]).args(arguments);
+    command.args(["--lib", "--test", "devices", "--test", "xla"]).args(arguments);
     // Where tests are threads of one process, a step's end is every test's.
     command.env("RUST_TEST_THREADS", "1");
     if std::env::var_os("PJRT_DEVICE").is_none() {

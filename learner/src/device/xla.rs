@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, anyhow};
 use comic_experiment::MatmulPrecision;
+use pyo3::exceptions::PyMemoryError;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
 use tch::Device;
@@ -36,7 +37,7 @@ if precision != 'default':
 try:
     devices, problem = torch_xla._XLAC._xla_get_devices(), ''
 except RuntimeError as error:
-    devices, problem = [], str(error).splitlines()[0]
+    devices, problem = [], (str(error).splitlines() or [''])[0]
 device = f'xla:{index}'
 found = index < len(devices)
 if found:
@@ -108,11 +109,7 @@ impl Plugin {
             if !of("found")?.extract::<bool>()? {
                 let devices: Vec<String> = of("devices")?.extract()?;
                 let problem: String = of("problem")?.extract()?;
-                return Err(Misuse::new(format!(
-                    "learner.device = \"xla:{index}\": PJRT has [{}] {problem}; PJRT_DEVICE chooses (TPU, CPU)",
-                    devices.join(", ")
-                ))
-                .into());
+                return Err(missing(index, &devices, &problem));
             }
             let kind: String = of("kind")?.extract()?;
             tracing::info!(device = index, kind, seconds = started.elapsed().as_secs(), "torch_xla is there");
@@ -125,8 +122,9 @@ impl Plugin {
                 busy: watched()?,
             })
         });
-        plugin.map_err(|error: anyhow::Error| {
-            if error.is::<Misuse>() { error } else { error.context(format!("cannot start torch_xla from {packages}")) }
+        plugin.map_err(|error: anyhow::Error| match error.downcast::<PyErr>() {
+            Ok(error) => not_started(&packages, &error),
+            Err(error) => error,
         })
     }
 
@@ -170,11 +168,52 @@ impl Plugin {
     }
 }
 
+/// What to say where torch_xla does not start. Whoever starts the learner again finds the same packages, unless it was the
+/// system that refused memory or a file.
+fn not_started(packages: &str, error: &PyErr) -> anyhow::Error {
+    let said = format!(
+        "cannot start torch_xla from {packages}: {error}; `cargo xtask setup --xla` fetches what it takes, and PJRT_DEVICE chooses \
+         (TPU, CPU)"
+    );
+    let refused = Python::attach(|python| {
+        let number = error.value(python).getattr("errno");
+        error.is_instance_of::<PyMemoryError>(python) || number.is_ok_and(|number| !number.is_none())
+    });
+    if refused { anyhow!(said) } else { Misuse::new(said).into() }
+}
+
+/// What to say where there is no device of this number.
+fn missing(index: usize, devices: &[String], problem: &str) -> anyhow::Error {
+    let found = devices.join(", ");
+    let said =
+        format!("learner.device = \"xla:{index}\": PJRT has [{found}] {problem}; PJRT_DEVICE chooses (TPU, CPU)");
+    // libtpu lets one process in: the learner before this one may still be on its way out. It says so in two ways.
+    let busy = ["in use", "resource busy"].iter().any(|sign| problem.contains(sign));
+    if busy { anyhow!(said) } else { Misuse::new(said).into() }
+}
+
 impl Drop for Plugin {
     /// Ends its threads while everything they use is still there. Python itself is not taken down.
     fn drop(&mut self) {
         if let Err(error) = Python::attach(|python| self.prepare_to_exit.call0(python).map(drop)) {
             tracing::warn!("torch_xla did not end well: {error}");
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_that_another_process_has_is_worth_another_start_and_none_at_all_is_not() {
+        for busy in [
+            "The TPU is already in use by process with pid 7. Not attempting to load libtpu.so in this process.",
+            "TPU initialization failed: open(/dev/vfio/0): Device or resource busy; Couldn't open iommu group /dev/vfio/0",
+        ] {
+            assert!(!missing(0, &[], busy).is::<Misuse>(), "{busy}");
+        }
+        assert!(missing(0, &[], "TPU initialization failed: no device found").is::<Misuse>());
+        assert!(missing(4, &["TPU:0".into()], "").is::<Misuse>());
     }
 }
