@@ -181,6 +181,22 @@ mod tests {
         assert_eq!(fs::metadata(place("actors").join("client-key.pem")).unwrap().permissions().mode() & 0o777, 0o600);
     }
 
+    /// An actor may read them just now.
+    #[test]
+    fn copies_of_what_did_not_change_are_left_alone() {
+        let directory = tempfile::tempdir().unwrap();
+        let place = directory.path().join("actors");
+        let apart = Certs { copy_for_actors: Some(place.clone()), ..certs(&directory.path().join("authority")) };
+        apart.run().unwrap();
+        let long_ago = std::time::SystemTime::UNIX_EPOCH;
+        let written = |name: &str| fs::metadata(place.join(name)).unwrap().modified().unwrap() != long_ago;
+        for name in ACTORS {
+            fs::File::options().write(true).open(place.join(name)).unwrap().set_modified(long_ago).unwrap();
+        }
+        apart.run().unwrap();
+        assert_eq!(ACTORS.map(written), ACTORS.map(|name| name.starts_with("client")), "{ACTORS:?}");
+    }
+
     #[test]
     fn what_is_made_can_be_served_and_the_keys_are_their_owners() {
         let directory = tempfile::tempdir().unwrap();

@@ -108,14 +108,7 @@ impl Store {
     /// When the directory cannot be made.
     pub fn open(run: &Path, kept: usize) -> Result<Self> {
         let directory = run.join("checkpoints");
-        let made: Vec<_> =
-            directory.ancestors().take_while(|place| !place.as_os_str().is_empty() && !place.is_dir()).collect();
-        fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
-        // What is synced in a directory that nobody finds is lost with it.
-        for place in made.into_iter().rev() {
-            let above = place.parent().filter(|above| !above.as_os_str().is_empty());
-            Step::SyncDirectory(above.unwrap_or(Path::new(".")).to_path_buf()).carry_out()?;
-        }
+        carry_out(&making(&directory))?;
         Ok(Self { directory, kept: kept.max(1) })
     }
 
@@ -290,6 +283,17 @@ pub(crate) fn unfit(run: &Path, error: anyhow::Error) -> anyhow::Error {
     Misuse::new(format!("{what}: {error:#}")).into()
 }
 
+/// How a directory comes to be, with those above it that are missing: what is synced in one that nobody finds is lost with it.
+fn making(directory: &Path) -> Vec<Step<'static>> {
+    let named = |place: &&Path| !place.as_os_str().is_empty();
+    let missing: Vec<_> = directory.ancestors().take_while(|place| named(place) && !place.is_dir()).collect();
+    let steps = missing.into_iter().rev().flat_map(|place| {
+        let above = place.parent().filter(named).unwrap_or(Path::new("."));
+        [Step::MakeDirectory(place.to_path_buf()), Step::SyncDirectory(above.to_path_buf())]
+    });
+    steps.collect()
+}
+
 fn entries(directory: &Path) -> Result<Vec<PathBuf>> {
     let listed = || fs::read_dir(directory)?.map(|entry| entry.map(|entry| entry.path())).collect();
     std::io::Result::with_context(listed(), || format!("cannot list {}", directory.display()))
@@ -357,4 +361,28 @@ pub fn read(path: &Path) -> Result<Snapshot> {
 
 fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_that_fails_is_no_wrong_checkpoint() {
+        let failed = |error: anyhow::Error| unfit(Path::new("runs/a"), error.context("cannot be restored"));
+        assert!(!failed(tch::TchError::Torch("out of memory".into()).into()).is::<Misuse>());
+        assert!(!failed(crate::vmpo::Error::from(tch::TchError::Torch("out of memory".into())).into()).is::<Misuse>());
+        assert!(failed(anyhow::anyhow!("the checkpoint does not fit")).is::<Misuse>());
+    }
+
+    #[test]
+    fn what_is_no_text_in_its_small_files_is_damage_with_a_remedy() {
+        let directory = tempfile::tempdir().unwrap();
+        let store = Store::open(directory.path(), 1).unwrap();
+        for (name, remedy) in [(EPOCH, "earlier starts"), ("run", "start the actors again")] {
+            fs::write(store.directory.join(name), b"\xff\xfe1").unwrap();
+            let refused = if name == EPOCH { store.begin_life() } else { store.run() }.unwrap_err();
+            assert!(refused.is::<Misuse>() && refused.to_string().contains(remedy), "{refused:#}");
+        }
+    }
 }

@@ -9,7 +9,7 @@ use proptest::prelude::*;
 use tempfile::TempDir;
 
 use super::steps::{Step, carry_out};
-use super::{Name, Snapshot, Store};
+use super::{Name, Snapshot, Store, making};
 
 const KEPT: usize = 1;
 
@@ -174,6 +174,28 @@ proptest! {
         drop(store);
         let (one, two) = (snapshot("one"), snapshot("two"));
         survives(run.path(), &[&one, &two])?;
+    }
+}
+
+/// A crash right after takes what it can.
+#[test]
+fn a_new_runs_directories_stay() {
+    let place = tempfile::tempdir().unwrap();
+    let directory = place.path().join("runs/first/checkpoints");
+    let steps = making(&directory);
+    crash(&steps, u128::MAX);
+    assert!(directory.is_dir());
+    assert!(making(&directory).is_empty(), "what is there is not made again");
+    carry_out(&steps).expect("two learners that make it at once do not get into each other's way");
+    let syncs: Vec<_> = (0..steps.len()).filter(|step| matches!(steps[*step], Step::SyncDirectory(_))).collect();
+    assert_eq!(syncs.len(), 3);
+    for sync in syncs {
+        let place = tempfile::tempdir().unwrap();
+        let directory = place.path().join("runs/first/checkpoints");
+        let mut steps = making(&directory);
+        steps.remove(sync);
+        crash(&steps, u128::MAX);
+        assert!(!directory.is_dir(), "a sync could be left out");
     }
 }
 

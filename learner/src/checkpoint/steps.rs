@@ -32,9 +32,10 @@ impl Step<'_> {
     /// When the disk refuses, with the path.
     pub(super) fn carry_out(&self) -> Result<()> {
         match self {
-            Self::MakeDirectory(path) => {
-                fs::create_dir(path).with_context(|| format!("cannot make {}", path.display()))
-            }
+            // Another learner may make the directories of the same run just now: whose it is, the lock decides.
+            Self::MakeDirectory(path) => fs::create_dir(path)
+                .or_else(|error| if path.is_dir() { Ok(()) } else { Err(error) })
+                .with_context(|| format!("cannot make {}", path.display())),
             Self::Write(path, bytes) => File::create(path)
                 .and_then(|mut file| file.write_all(bytes))
                 .with_context(|| format!("cannot write {}", path.display())),

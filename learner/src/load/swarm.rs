@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
 use clap::Args;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::process::Process;
 use super::{MEGABYTE, PATIENCE};
@@ -74,7 +74,7 @@ impl Options {
         let (usage, state, stats) = (host.usage()?, host.ask("stats")?, crowd.ask("stats")?);
         let Some((since, cpu, trained, bytes)) = warm else { anyhow::bail!("--minutes is too short to measure") };
         let seconds = since.elapsed().as_secs_f64();
-        let per_second = |now: &serde_json::Value, then: f64| (now.as_f64().unwrap_or_default() - then) / seconds;
+        let per_second = |now: &Value, then: f64| (now.as_f64().unwrap_or_default() - then) / seconds;
         ensure!(state["balanced"] == true, "the books do not balance: {state}");
         let rest = json!({
             "actors": self.actors, "minutes": self.minutes, "unrolls_per_s": per_second(&state["trained"], trained),
@@ -88,17 +88,23 @@ impl Options {
         let mut line = json!({
             "figure": "swarm.rss_peak", "value": peak, "unit": "MB", "bound": bound, "of_bound": peak / bound,
         });
-        if let (Some(line), serde_json::Value::Object(rest)) = (line.as_object_mut(), rest) {
+        if let (Some(line), Value::Object(rest)) = (line.as_object_mut(), rest) {
             line.extend(rest);
         }
         println!("{line}");
-        ensure!(peak <= bound, "the learner had more memory than it may have: {peak:.0} MB");
-        for promise in ["longest_without_an_acknowledgement", "longest_without_a_version"] {
-            let seconds = line["crowd"][promise].as_f64().unwrap_or(f64::INFINITY);
-            ensure!(seconds <= STARVED, "an actor was starved: {promise}, {seconds:.1} s");
-        }
-        Ok(())
+        keeps_its_promises(&line)
     }
+}
+
+/// What is promised of memory and patience held, by the figure's line.
+fn keeps_its_promises(line: &Value) -> Result<()> {
+    let of_bound = line["of_bound"].as_f64().unwrap_or(f64::INFINITY);
+    ensure!(of_bound <= 1.0, "the learner had more memory than it may have: {of_bound:.2} of its bound");
+    for promise in ["longest_without_an_acknowledgement", "longest_without_a_version"] {
+        let seconds = line["crowd"][promise].as_f64().unwrap_or(f64::INFINITY);
+        ensure!(seconds <= STARVED, "an actor was starved: {promise}, {seconds:.1} s");
+    }
+    Ok(())
 }
 
 /// Least squares.
@@ -112,7 +118,20 @@ fn slope(points: &[(f64, f64)]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::slope;
+    use super::*;
+
+    #[test]
+    fn a_starved_actor_too_much_memory_or_nothing_measured_fails() {
+        let line = |of_bound: f64, acknowledgement: f64, version: f64| {
+            let waits =
+                json!({ "longest_without_an_acknowledgement": acknowledgement, "longest_without_a_version": version });
+            json!({ "of_bound": of_bound, "crowd": waits })
+        };
+        keeps_its_promises(&line(0.7, 8.5, 24.0)).unwrap();
+        for broken in [line(1.01, 8.5, 24.0), line(0.7, 30.1, 24.0), line(0.7, 8.5, 30.1), json!({ "of_bound": 0.7 })] {
+            assert!(keeps_its_promises(&broken).is_err(), "{broken}");
+        }
+    }
 
     #[test]
     fn the_slope_of_a_line_is_its_own() {

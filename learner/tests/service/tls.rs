@@ -2,13 +2,22 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
+use std::io::ErrorKind;
 use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
 
-use crate::support::World;
+use crate::support::{World, within};
 use comic_learner::certs::Certs;
 use comic_learner::security::{Security, Tls};
 use comic_proto::v1::StatusRequest;
 use comic_proto::{Access, distrusted};
+use rustls::pki_types::CertificateDer;
+use rustls::pki_types::pem::PemObject as _;
+use rustls::{ClientConfig, RootCertStore};
+use tokio::io::AsyncReadExt as _;
+use tokio::net::TcpStream;
+use tokio_rustls::TlsConnector;
 
 fn certificates(directory: &Path) {
     let (out, names) = (directory.into(), vec!["localhost".into()]);
@@ -81,13 +90,34 @@ async fn who_does_not_speak_tls_gets_nowhere_and_delays_nobody() {
     certificates(own.path());
     let world = world(own.path(), false).await;
     let address = world.address.trim_start_matches("http://").to_owned();
-    let _silent = tokio::net::TcpStream::connect(&address).await.unwrap();
+    let _silent = TcpStream::connect(&address).await.unwrap();
     let answered = match world.client_with(&Access::default()).await {
         Ok(mut client) => client.get_status(StatusRequest {}).await.is_ok(),
         Err(_) => false,
     };
     assert!(!answered);
     assert!(gets_through(&world, &access(own.path(), None)).await);
+}
+
+/// It would keep a place that somebody else wants.
+#[tokio::test]
+async fn who_agrees_on_tls_and_says_nothing_more_is_let_go() {
+    let own = tempfile::tempdir().unwrap();
+    certificates(own.path());
+    let world = world(own.path(), false).await;
+    let mut roots = RootCertStore::empty();
+    roots.add(CertificateDer::from_pem_file(own.path().join("ca.pem")).unwrap()).unwrap();
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let versions = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions().unwrap();
+    let mut trusting = versions.with_root_certificates(roots).with_no_client_auth();
+    trusting.alpn_protocols = vec![b"h2".to_vec()];
+    let stream = TcpStream::connect(world.address.trim_start_matches("http://")).await.unwrap();
+    let connector = TlsConnector::from(Arc::new(trusting));
+    let mut silent = connector.connect("localhost".try_into().unwrap(), stream).await.unwrap();
+    let ended = within(Duration::from_secs(30), silent.read_to_end(&mut Vec::new())).await;
+    // Whether the learner says goodbye or just goes.
+    let gone = |error: std::io::Error| matches!(error.kind(), ErrorKind::ConnectionReset | ErrorKind::UnexpectedEof);
+    assert!(ended.is_ok() || ended.is_err_and(gone));
 }
 
 #[tokio::test]
