@@ -15,6 +15,7 @@ use comic_actor::render::view::View;
 use comic_actor::{Error, bench, policy, run};
 use comic_proto::Access;
 use tracing_subscriber::EnvFilter;
+use tracing_subscriber::fmt::format::FmtSpan;
 
 const EXIT_CODES: &str = "\
 Exit codes: 0 when the run is over, 2 when the configuration is wrong and starting again cannot help (a token or a
@@ -134,6 +135,7 @@ fn start_logging(format: LogFormat, level: &str) {
     let builder = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
+        .with_span_events(FmtSpan::CLOSE)
         .with_ansi(std::io::stderr().is_terminal());
     match format {
         LogFormat::Text => builder.with_target(false).init(),

@@ -121,7 +121,10 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     ) -> Result<(), Error> {
         while let Some(directive) = mailbox.wait_from(self.oldest_wanted(pace)) {
             self.adopt(&directive)?;
-            let Some(finished) = self.unroll(&|| mailbox.is_closed(), progress)? else { return Ok(()) };
+            let finished =
+                tracing::debug_span!("rollout", environments = self.lanes.len(), version = directive.version)
+                    .in_scope(|| self.unroll(&|| mailbox.is_closed(), progress))?;
+            let Some(finished) = finished else { return Ok(()) };
             let round = Round::default();
             for mut unroll in finished {
                 unroll.ticket = Some(round.ticket());

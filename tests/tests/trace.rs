@@ -22,16 +22,18 @@ async fn one_unroll_can_be_followed_from_its_actor_to_the_gradient() -> Result<(
     ensure!(trained["span"]["name"] == "update", "the learner does not say in which update: {trained}");
     let name = ["actor", "incarnation", "sequence"].map(|part| trained["fields"][part].clone());
     let sequence = &name[2];
-    let sent = lines(&actor).any(|line| said(&line) == "sent" && is(&line["fields"], &name));
-    ensure!(sent, "the actor does not say when {sequence} was sent");
-    for step in ["made", "acknowledged"] {
-        let found = lines(&actor).any(|line| said(&line) == step && line["fields"]["sequence"] == *sequence);
-        ensure!(found, "the actor does not say when {sequence} was {step}");
+    for step in ["made", "sent", "acknowledged", "close"] {
+        let of = |line: &Value| line["span"]["name"] == "unroll" && is(&line["span"], &name);
+        let found = lines(&actor).find(|line| said(line) == step && of(line));
+        let line = found.with_context(|| format!("the actor does not say when {sequence} was {step}"))?;
+        ensure!(step != "close" || takes(&line, "time.idle"), "the actor does not say how long it waited: {line}");
     }
+    let acted = lines(&actor).any(|line| line["span"]["name"] == "rollout" && takes(&line, "time.busy"));
+    ensure!(acted, "the actor does not say how long it takes to make unrolls");
     for step in ["validate", "insert"] {
         let found = lines(learner).any(|line| {
             let unroll = line["spans"].as_array().and_then(|spans| spans.iter().find(|span| span["name"] == "unroll"));
-            line["span"]["name"] == step && unroll.is_some_and(|unroll| is(unroll, &name)) && takes_time(&line)
+            line["span"]["name"] == step && unroll.is_some_and(|unroll| is(unroll, &name)) && takes(&line, "time.busy")
         });
         ensure!(found, "the learner does not say how long it took to {step} {sequence}");
     }
@@ -53,6 +55,6 @@ fn is(found: &Value, name: &[Value; 3]) -> bool {
     ["actor", "incarnation", "sequence"].iter().zip(name).all(|(part, value)| found[*part] == *value)
 }
 
-fn takes_time(line: &Value) -> bool {
-    line["fields"]["time.busy"].is_string()
+fn takes(line: &Value, time: &str) -> bool {
+    line["fields"][time].is_string()
 }

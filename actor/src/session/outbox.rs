@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use comic_proto::v1::{UnrollAck, UnrollHeader, UnrollMessage, Verdict};
+use tracing::Span;
 
 use crate::worker::FinishedUnroll;
 
@@ -25,12 +26,21 @@ pub struct Settled {
     pub over: bool,
 }
 
+/// An unroll that has a number, and no answer.
+#[derive(Debug)]
+struct Waiting {
+    sequence: u64,
+    unroll: FinishedUnroll,
+    /// From its number to its answer, or to the session's end. The learner's log calls it by the same three numbers.
+    span: Span,
+}
+
 /// A bounded queue in the order of sequence numbers; the front part has been sent on the current connection.
 #[derive(Debug)]
 pub(super) struct Outbox {
     window: usize,
     layout_hash: Vec<u8>,
-    waiting: VecDeque<(u64, FinishedUnroll)>,
+    waiting: VecDeque<Waiting>,
     sent: usize,
     next_sequence: u64,
     settled: Settled,
@@ -72,7 +82,7 @@ impl Outbox {
 
     /// One past the last number before which everything was acknowledged.
     pub(super) fn acknowledged(&self) -> u64 {
-        self.waiting.front().map_or(self.next_sequence, |(sequence, _)| *sequence)
+        self.waiting.front().map_or(self.next_sequence, |waiting| waiting.sequence)
     }
 
     /// A new connection: everything is to be sent again.
@@ -81,15 +91,18 @@ impl Outbox {
     }
 
     /// Gives the unroll its sequence number.
-    pub(super) fn push(&mut self, unroll: FinishedUnroll) {
-        tracing::debug!(sequence = self.next_sequence, environment = unroll.environment, "made");
-        self.waiting.push_back((self.next_sequence, unroll));
+    pub(super) fn push(&mut self, unroll: FinishedUnroll, actor: u64, incarnation: u64) {
+        let (sequence, version, environment) = (self.next_sequence, unroll.version, unroll.environment);
+        let incarnation = format_args!("{incarnation:016x}");
+        let span = tracing::debug_span!("unroll", actor, incarnation, sequence, version, environment);
+        span.in_scope(|| tracing::debug!("made"));
+        self.waiting.push_back(Waiting { sequence, unroll, span });
         self.next_sequence += 1;
     }
 
     /// The next unroll to send, or none.
     pub(super) fn send(&mut self, actor: u64, incarnation: u64) -> Option<UnrollMessage> {
-        let (sequence, unroll) = self.waiting.get(self.sent)?;
+        let Waiting { sequence, unroll, span } = self.waiting.get(self.sent)?;
         self.sent += 1;
         let header = UnrollHeader {
             actor,
@@ -102,19 +115,13 @@ impl Outbox {
             episodes: unroll.episodes.clone(),
             environment: unroll.environment,
         };
-        tracing::debug!(
-            actor,
-            incarnation = format_args!("{incarnation:016x}"),
-            sequence,
-            version = unroll.version,
-            "sent"
-        );
+        span.in_scope(|| tracing::debug!("sent"));
         Some(UnrollMessage { header: Some(header), payload: unroll.payload.clone() })
     }
 
     /// Forgets an acknowledged unroll, whatever the verdict: a refused one is not made better by sending it again.
     pub(super) fn settle(&mut self, ack: &UnrollAck) {
-        let Ok(place) = self.waiting.binary_search_by_key(&ack.sequence, |(sequence, _)| *sequence) else {
+        let Ok(place) = self.waiting.binary_search_by_key(&ack.sequence, |waiting| waiting.sequence) else {
             tracing::debug!(sequence = ack.sequence, "an acknowledgement of what is not waiting for one");
             return;
         };
@@ -122,8 +129,9 @@ impl Outbox {
             tracing::warn!(sequence = ack.sequence, "an acknowledgement of what was not sent");
             return;
         }
-        tracing::debug!(sequence = ack.sequence, verdict = ?ack.verdict(), "acknowledged");
-        self.waiting.remove(place);
+        if let Some(waiting) = self.waiting.remove(place) {
+            waiting.span.in_scope(|| tracing::debug!(verdict = ?ack.verdict(), "acknowledged"));
+        }
         self.sent -= 1;
         match Verdict::try_from(ack.verdict) {
             Ok(Verdict::Taken) => self.settled.taken += 1,
@@ -174,11 +182,11 @@ mod tests {
     #[test]
     fn what_was_not_acknowledged_is_sent_again_in_order() {
         let mut outbox = Outbox::new(8, [0; 32]);
-        (0..4).for_each(|_| outbox.push(unroll()));
+        (0..4).for_each(|_| outbox.push(unroll(), 0, 0));
         assert_eq!(sent(&mut outbox), [0, 1, 2, 3]);
         outbox.settle(&ack(1, Verdict::Taken));
         outbox.settle(&ack(0, Verdict::Stale));
-        outbox.push(unroll());
+        outbox.push(unroll(), 0, 0);
         outbox.rewind();
         assert_eq!(sent(&mut outbox), [2, 3, 4]);
         outbox.settle(&ack(2, Verdict::Duplicate));
@@ -188,7 +196,7 @@ mod tests {
     #[test]
     fn acknowledgements_of_the_unknown_and_the_unsent_change_nothing() {
         let mut outbox = Outbox::new(2, [0; 32]);
-        outbox.push(unroll());
+        outbox.push(unroll(), 0, 0);
         outbox.settle(&ack(0, Verdict::Taken));
         outbox.settle(&ack(7, Verdict::Taken));
         assert_eq!(outbox.settled(), Settled::default());
@@ -198,7 +206,7 @@ mod tests {
     #[test]
     fn the_window_bounds_it() {
         let mut outbox = Outbox::new(2, [0; 32]);
-        (0..2).for_each(|_| outbox.push(unroll()));
+        (0..2).for_each(|_| outbox.push(unroll(), 0, 0));
         assert!(!outbox.has_room());
         sent(&mut outbox);
         outbox.settle(&ack(0, Verdict::Taken));
