@@ -4,6 +4,7 @@
 //! - [`certificates`] makes certificates, expired ones too.
 //! - [`compose`] runs a learner and actors in containers.
 //! - [`kubernetes`] renders the manifests and reads them.
+//! - [`lockstep`] is runs of which the seed decides every parameter.
 //! - [`process`] is one program that runs.
 //! - [`relay`] is a slow way to the learner.
 //! - [`repository`] looks at the workspace's own files and dependencies.
@@ -14,6 +15,7 @@
 pub mod certificates;
 pub mod compose;
 pub mod kubernetes;
+pub mod lockstep;
 pub mod process;
 pub mod relay;
 pub mod repository;

@@ -1,15 +1,17 @@
 //! Somebody sets the clock on the wall: nothing that waits, expires or is measured goes by it.
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::{Context as _, Result, ensure};
 use comic_proto::v1::Status;
+use comic_tests::lockstep::{ALL, SLOW, UPDATES, is_over, learnt, learnt_by, lockstep};
 use comic_tests::process::Process;
+use comic_tests::relay::Relay;
 use comic_tests::repository::root;
 use comic_tests::steps::{LIMIT, leaves, now, parameters_arrive, the_books_balance_at_the_end, trains_on};
-use comic_tests::system::{SMALL, System};
+use comic_tests::system::{SMALL, System, metric};
 
 /// Far enough for another year in every line of a log.
 const JUMP: i64 = 400 * 86_400;
@@ -17,11 +19,8 @@ const JUMP: i64 = 400 * 86_400;
 #[tokio::test]
 async fn nothing_is_lost_when_the_clock_is_set() -> Result<()> {
     let directory = tempfile::tempdir()?;
-    let (library, clock) = (directory.path().join("clock.so"), directory.path().join("clock"));
-    compile(&library)?;
-    fs::write(&clock, "0")?;
     let mut system = System::new(&SMALL)?;
-    system.clock = Some((library, clock.clone()));
+    let clock = clock_of(&mut system, directory.path())?;
     system.start_learner(LIMIT).await?;
     let mut actor = system.start_actor()?;
     actor.until_log_holds("acting", LIMIT).await?;
@@ -42,10 +41,44 @@ async fn nothing_is_lost_when_the_clock_is_set() -> Result<()> {
     the_books_balance_at_the_end(system).await
 }
 
+#[tokio::test]
+async fn nor_is_anything_else_learnt() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let mut system = lockstep(&[])?;
+    let clock = clock_of(&mut system, directory.path())?;
+    system.start_learner(LIMIT).await?;
+    let relay = Relay::start(system.address(), SLOW).await?;
+    let mut actors = [system.start_actor_of(ALL, &relay.url)?];
+    for (updates, jump) in [(1.0, JUMP), (3.0, -JUMP)] {
+        let what = format!("{updates} updates");
+        let done = |status: &Status| Some(metric(status, "updates")).filter(|done| *done >= updates);
+        let done = system.until(&what, LIMIT, done).await?;
+        ensure!(done < UPDATES as f64, "the clock is set in the middle of the run, not after {done} updates");
+        fs::write(&clock, jump.to_string())?;
+    }
+    is_over(&mut system, &mut actors).await?;
+    ensure!(says_year_after(&actors[0].log(), -JUMP), "{}", actors[0].log());
+    ensure!(learnt(&system)? == learnt_by(&[ALL], &[]).await?, "a clock that was set changed something");
+    Ok(())
+}
+
+/// Gives the programs of a system a clock of their own; the file that says how many seconds it is off.
+fn clock_of(system: &mut System, directory: &Path) -> Result<PathBuf> {
+    let (library, clock) = (directory.join("clock.so"), directory.join("clock"));
+    compile(&library)?;
+    fs::write(&clock, "0")?;
+    system.clock = Some((library, clock.clone()));
+    Ok(clock)
+}
+
 /// That the jump was seen at all: lines of the log bear the new year.
 async fn says_another_year(actor: &mut Process, jump: i64) -> Result<()> {
+    actor.until_log("another year", LIMIT, |log| says_year_after(log, jump)).await
+}
+
+fn says_year_after(log: &str, jump: i64) -> bool {
     let year = (time::OffsetDateTime::now_utc() + time::Duration::seconds(jump)).year();
-    actor.until_log_holds(&format!("\n{year}-"), LIMIT).await
+    log.contains(&format!("\n{year}-"))
 }
 
 /// With the compiler that Rust links with.

@@ -3,12 +3,15 @@
 //! The learner gets a disk of its own, which takes root: where that cannot be made, `cargo xtask test` says so and leaves
 //! this out.
 
-use std::fs::{self, OpenOptions};
+use std::fs::{self, File, OpenOptions};
 use std::io::Write as _;
-use std::path::Path;
+use std::os::fd::AsRawFd as _;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context as _, Result, ensure};
+use comic_tests::lockstep::{ALL, SLOW, is_over, learnt_by, learnt_in, lockstep};
+use comic_tests::relay::Relay;
 use comic_tests::steps::{LIMIT, checkpoint_in, half_written, leaves, the_books_balance_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System, metric, python};
 use comic_tests::tensorboard::curves;
@@ -30,15 +33,7 @@ async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
     system.until("a checkpoint is written", LIMIT, |_| checkpoint_in(&run)).await?;
 
     let filler = run.join("filler");
-    let deadline = Instant::now() + LIMIT;
-    let refused = |system: &System| {
-        system.learner.as_ref().map_or(0, |learner| learner.log().matches("checkpoint not written").count())
-    };
-    while refused(&system) < 2 {
-        fill(&filler)?;
-        ensure!(Instant::now() < deadline, "no checkpoint was refused");
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-    }
+    fill_until_refused(&mut system, &filler, 2).await?;
     let page = system.metrics_page()?;
     let failed = page.lines().find_map(|line| line.strip_prefix("comic_checkpoints_total{result=\"failed\"} "));
     ensure!(failed.context("no metric")?.parse::<u64>()? >= 2, "{page}");
@@ -54,6 +49,39 @@ async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
     system.until("TensorBoard sees what is learnt since", LIMIT, |_| (last(&run)? > step).then_some(())).await?;
     leaves(actor).await?;
     the_books_balance_at_the_end(system).await
+}
+
+#[tokio::test]
+async fn a_full_disk_changes_nothing_that_is_learnt() -> Result<()> {
+    let mut system = lockstep(&[])?;
+    system.disk = Some(DISK);
+    system.start_learner(LIMIT).await?;
+    let seen = system.learner.as_ref().context("no learner")?.sees(&system.run());
+    // As long as somebody has it open the disk stays, also when the learner is gone.
+    let disk = File::open(&seen)?;
+    let run = PathBuf::from(format!("/proc/self/fd/{}", disk.as_raw_fd()));
+    let filler = run.join("filler");
+    fill(&filler)?;
+    let relay = Relay::start(system.address(), SLOW).await?;
+    let actor = system.start_actor_of(ALL, &relay.url)?;
+    fill_until_refused(&mut system, &filler, 1).await?;
+    fs::remove_file(&filler)?;
+    is_over(&mut system, &mut [actor]).await?;
+    ensure!(learnt_in(&run)? == learnt_by(&[ALL], &[]).await?, "a disk without room changed something");
+    Ok(())
+}
+
+/// Takes what room there is, again and again, until so many checkpoints were refused.
+async fn fill_until_refused(system: &mut System, filler: &Path, checkpoints: usize) -> Result<()> {
+    let learner = system.learner.as_mut().context("no learner")?;
+    let deadline = Instant::now() + LIMIT;
+    while learner.log().matches("checkpoint not written").count() < checkpoints {
+        fill(filler)?;
+        ensure!(learner.ended()?.is_none(), "a full disk ended the learner: {}", learner.log());
+        ensure!(Instant::now() < deadline, "no checkpoint was refused: {}", learner.log());
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    Ok(())
 }
 
 /// Takes what room there is.

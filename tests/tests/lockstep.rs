@@ -1,84 +1,22 @@
 //! In lockstep the seed decides every parameter, bit for bit, whatever actors share the environments and whatever happens
 //! to them and to their connections on the way.
 
-use std::fs;
 use std::io::{self, Read as _, Write as _};
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use comic_tests::process::Process;
+use comic_tests::lockstep::{ALL, SLOW, UPDATES, is_over, learnt, learnt_by, lockstep, lockstep_with, train};
 use comic_tests::relay::Relay;
 use comic_tests::steps::{LIMIT, books, trains_on};
-use comic_tests::system::{SMALL, System};
 
-/// Environments in all: one for each unroll of a batch.
-const ALL: u32 = 8;
-const UPDATES: u64 = 6;
-/// A version of so small a policy takes seconds at this pace.
-const BYTES_PER_SECOND: f64 = 500_000.0;
 const MEMORY_AND_TWO_TASKS: [&str; 4] = [
     "network.low_level=lstm",
     "network.lstm.units=[12, 8]",
     r#"joint=[{task="get-up", probability=0.3}]"#,
     "get_up.lying_share=0",
 ];
-
-/// A run in lockstep with a warm start, a normaliser that is set twice, and updates that publish nothing new.
-fn lockstep(overrides: &[&str]) -> Result<System> {
-    lockstep_with(&[], overrides)
-}
-
-/// The same, of a learner with these options.
-fn lockstep_with(options: &[&str], overrides: &[&str]) -> Result<System> {
-    let updates = format!("budget.updates={UPDATES}");
-    let fields = [
-        "warm_start.steps=10",
-        "warm_start.demonstration_steps=128",
-        "vmpo.target_period=2",
-        "vmpo.gradient_steps=2",
-        "vmpo.minibatch_unrolls=4",
-        updates.as_str(),
-    ];
-    let settings = fields.iter().chain(overrides).flat_map(|field| ["--set", *field]);
-    System::new(
-        &SMALL.into_iter().chain(["--lockstep"]).chain(options.iter().copied()).chain(settings).collect::<Vec<_>>(),
-    )
-}
-
-/// Trains with an actor for each number of environments, until the budget is used up.
-async fn train(system: &mut System, actors: &[u32]) -> Result<()> {
-    system.start_learner(LIMIT).await?;
-    let url = system.url();
-    let actors = actors.iter().map(|environments| system.start_actor_of(*environments, &url)).collect::<Result<_>>()?;
-    is_over(system, actors).await
-}
-
-async fn is_over(system: &mut System, actors: Vec<Process>) -> Result<()> {
-    for mut actor in actors {
-        let status = actor.until_it_ends(LIMIT).await?;
-        ensure!(status.success(), "an actor ended with {status}: {}", actor.log());
-    }
-    let mut learner = system.learner.take().context("no learner")?;
-    let status = learner.until_it_ends(LIMIT).await?;
-    ensure!(status.success(), "the learner ended with {status}: {}", learner.log());
-    Ok(())
-}
-
-/// What the run's last checkpoint says of networks, optimiser and statistics.
-fn learnt(system: &System) -> Result<[Vec<u8>; 3]> {
-    let checkpoint = system.run().join(format!("checkpoints/checkpoint-{UPDATES:010}"));
-    let part = |name: &str| fs::read(checkpoint.join(name)).with_context(|| format!("no {name}"));
-    Ok([part("policy.safetensors")?, part("target.safetensors")?, part("learner.safetensors")?])
-}
-
-/// What is learnt by an actor for each number of environments.
-async fn learnt_by(actors: &[u32], overrides: &[&str]) -> Result<[Vec<u8>; 3]> {
-    let mut system = lockstep(overrides)?;
-    train(&mut system, actors).await?;
-    learnt(&system)
-}
 
 #[tokio::test]
 async fn one_actor_or_two_learn_the_same_and_another_seed_something_else() -> Result<()> {
@@ -107,7 +45,7 @@ async fn a_paused_actor_and_broken_connections_change_nothing() -> Result<()> {
     system.until(what, LIMIT, |status| (books(status).in_flight >= 3).then_some(())).await?;
     paused.resume()?;
     cut.until_log_holds("reconnected to the learner", LIMIT).await?;
-    is_over(&mut system, vec![paused, cut]).await?;
+    is_over(&mut system, &mut [paused, cut]).await?;
     ensure!(learnt(&system)? == learnt_by(&[ALL], &[]).await?, "a pause or a broken connection changed something");
     Ok(())
 }
@@ -116,8 +54,8 @@ async fn a_paused_actor_and_broken_connections_change_nothing() -> Result<()> {
 async fn a_slow_line_strangers_and_nonsense_change_nothing() -> Result<()> {
     let mut system = lockstep_with(&["--metrics-port", "0"], &[])?;
     system.start_learner(LIMIT).await?;
-    let relay = Relay::start(system.address(), BYTES_PER_SECOND).await?;
-    let mut actors = vec![system.start_actor_of(5, &relay.url)?, system.start_actor_of(3, &system.url())?];
+    let relay = Relay::start(system.address(), SLOW).await?;
+    let mut actors = [system.start_actor_of(5, &relay.url)?, system.start_actor_of(3, &system.url())?];
     for actor in &mut actors {
         actor.until_log_holds("joined the learner", LIMIT).await?;
     }
@@ -130,7 +68,7 @@ async fn a_slow_line_strangers_and_nonsense_change_nothing() -> Result<()> {
         // The slow line is this thread's, too.
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
-    is_over(&mut system, actors).await?;
+    is_over(&mut system, &mut actors).await?;
     drop(strangers);
     ensure!(nonsense.join().is_ok_and(|said| said > 0), "nobody heard the nonsense");
     ensure!(learnt(&system)? == learnt_by(&[ALL], &[]).await?, "somebody who is no actor changed something");

@@ -1,0 +1,100 @@
+//! Runs in lockstep, of which the seed decides every parameter: what a fault changes can be seen in what was learnt.
+
+use std::fs;
+use std::path::Path;
+
+use anyhow::{Context, Result, ensure};
+
+use crate::process::Process;
+use crate::steps::LIMIT;
+use crate::system::{SMALL, System};
+
+/// Environments in all: one for each unroll of a batch.
+pub const ALL: u32 = 8;
+/// Updates of such a run.
+pub const UPDATES: u64 = 6;
+/// A version of so small a policy takes seconds at this pace, and the run long enough for a fault to come in the middle.
+pub const SLOW: f64 = 500_000.0;
+
+/// A run in lockstep with a warm start, a normaliser that is set twice, and updates that publish nothing new.
+///
+/// # Errors
+/// No directory or port to be had.
+pub fn lockstep(overrides: &[&str]) -> Result<System> {
+    lockstep_with(&[], overrides)
+}
+
+/// The same, of a learner with these options.
+///
+/// # Errors
+/// No directory or port to be had.
+pub fn lockstep_with(options: &[&str], overrides: &[&str]) -> Result<System> {
+    let updates = format!("budget.updates={UPDATES}");
+    let fields = [
+        "warm_start.steps=10",
+        "warm_start.demonstration_steps=128",
+        "vmpo.target_period=2",
+        "vmpo.gradient_steps=2",
+        "vmpo.minibatch_unrolls=4",
+        updates.as_str(),
+    ];
+    let settings = fields.iter().chain(overrides).flat_map(|field| ["--set", *field]);
+    System::new(
+        &SMALL.into_iter().chain(["--lockstep"]).chain(options.iter().copied()).chain(settings).collect::<Vec<_>>(),
+    )
+}
+
+/// Trains with an actor for each number of environments, until the budget is used up.
+///
+/// # Errors
+/// When anybody ends in another way.
+pub async fn train(system: &mut System, actors: &[u32]) -> Result<()> {
+    system.start_learner(LIMIT).await?;
+    let url = system.url();
+    let start = |environments: &u32| system.start_actor_of(*environments, &url);
+    let mut actors = actors.iter().map(start).collect::<Result<Vec<_>>>()?;
+    is_over(system, &mut actors).await
+}
+
+/// Waits until the budget is used up, and everybody has left.
+///
+/// # Errors
+/// When anybody ends in another way.
+pub async fn is_over(system: &mut System, actors: &mut [Process]) -> Result<()> {
+    for actor in actors {
+        let status = actor.until_it_ends(LIMIT).await?;
+        ensure!(status.success(), "an actor ended with {status}: {}", actor.log());
+    }
+    let mut learner = system.learner.take().context("no learner")?;
+    let status = learner.until_it_ends(LIMIT).await?;
+    ensure!(status.success(), "the learner ended with {status}: {}", learner.log());
+    Ok(())
+}
+
+/// What the run's last checkpoint says of networks, optimiser and statistics.
+///
+/// # Errors
+/// When it is not there.
+pub fn learnt(system: &System) -> Result<[Vec<u8>; 3]> {
+    learnt_in(&system.run())
+}
+
+/// The same of the run in a directory.
+///
+/// # Errors
+/// When it is not there.
+pub fn learnt_in(run: &Path) -> Result<[Vec<u8>; 3]> {
+    let checkpoint = run.join(format!("checkpoints/checkpoint-{UPDATES:010}"));
+    let part = |name: &str| fs::read(checkpoint.join(name)).with_context(|| format!("no {name}"));
+    Ok([part("policy.safetensors")?, part("target.safetensors")?, part("learner.safetensors")?])
+}
+
+/// What is learnt by an actor for each number of environments, undisturbed.
+///
+/// # Errors
+/// When anybody does not end as at a run's end.
+pub async fn learnt_by(actors: &[u32], overrides: &[&str]) -> Result<[Vec<u8>; 3]> {
+    let mut system = lockstep(overrides)?;
+    train(&mut system, actors).await?;
+    learnt(&system)
+}
