@@ -16,8 +16,9 @@ use comic_proto::v1::{Behaviour, ParametersChunk};
 use tokio::sync::{Notify, watch};
 
 /// Bytes of parameters in a piece. Each piece is memory of its own, so a reader that stalls for ever holds one or two
-/// pieces, or where its network is stuck as many as hyper buffers, and never the version they are of.
-pub(crate) const PIECE: usize = 40 * 1024;
+/// pieces, or where its network is stuck as many as hyper buffers, and never the version they are of. With 64 KiB a thousand
+/// readers cost a fifth more processor time at five sixths of the pace, and stalled ones the same memory.
+const PIECE: usize = 40 * 1024;
 /// Versions that readers can be in the middle of.
 const HELD: usize = 4;
 /// Versions in memory: those held, the newest, the one that is just being made, and what it is made of.

@@ -17,6 +17,8 @@ use crate::v1::learner_client::LearnerClient;
 
 /// TCP, and then TLS, have to be there in this time.
 const CONNECT: Duration = Duration::from_secs(5);
+/// A learner that answers nothing for twice as long is not there any more.
+const KEEP_ALIVE: Duration = Duration::from_secs(10);
 
 /// A client of the learner that sends its token, if it has one, with every call.
 pub type Client = LearnerClient<Authorised>;
@@ -66,6 +68,24 @@ impl Access {
             (false, Some(_)) => Err(AccessError::NotSecure { url: url.to_owned() }),
             (false, None) => Ok(endpoint),
         }
+    }
+
+    /// The same for an actor, whose connection lasts as long as it does. Keep-alive while idle: a learner that vanished without
+    /// a word is otherwise never noticed. The connection's window exceeds the parameter stream's, so that a version nobody has
+    /// read yet cannot stall the acknowledgements, and a frame holds a piece of parameters.
+    ///
+    /// # Errors
+    /// As of [`endpoint`](Self::endpoint).
+    pub fn lasting_endpoint(&self, url: &str) -> Result<Endpoint, AccessError> {
+        Ok(self
+            .endpoint(url)?
+            .tcp_nodelay(true)
+            .http2_keep_alive_interval(KEEP_ALIVE)
+            .keep_alive_timeout(KEEP_ALIVE)
+            .keep_alive_while_idle(true)
+            .initial_stream_window_size(1 << 20)
+            .initial_connection_window_size(4 << 20)
+            .max_frame_size(64 * 1024))
     }
 
     fn tls(&self, ca: &Path) -> Result<ClientTlsConfig, AccessError> {

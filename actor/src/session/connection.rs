@@ -78,18 +78,8 @@ impl Connector {
         Ok(connector)
     }
 
-    /// Keep-alive while idle: a peer that vanished without a word is otherwise never noticed. The connection's window
-    /// exceeds the parameter stream's, so an unread version cannot stall the acknowledgements.
     fn endpoint(&self) -> Result<Endpoint, AccessError> {
-        Ok(self
-            .access
-            .endpoint(&self.address)?
-            .tcp_nodelay(true)
-            .http2_keep_alive_interval(Duration::from_secs(10))
-            .keep_alive_timeout(Duration::from_secs(10))
-            .keep_alive_while_idle(true)
-            .initial_stream_window_size(1 << 20)
-            .initial_connection_window_size(4 << 20))
+        self.access.lasting_endpoint(&self.address)
     }
 
     pub(super) fn address(&self) -> &str {

@@ -291,15 +291,8 @@ impl Crowd {
         let Identity { actor, incarnation, .. } = *identity;
         let ca = self.options.tls.as_ref().map(|directory| directory.join("ca.pem"));
         let scheme = if ca.is_some() { "https" } else { "http" };
-        let endpoint = Access { ca, ..Access::default() }
-            .endpoint(&format!("{scheme}://{}", self.options.host))?
-            .tcp_nodelay(true)
-            .http2_keep_alive_interval(Duration::from_secs(10))
-            .keep_alive_timeout(Duration::from_secs(10))
-            .keep_alive_while_idle(true)
-            .initial_stream_window_size(1 << 20)
-            .initial_connection_window_size(4 << 20)
-            .max_frame_size(crate::publish::PIECE as u32 * 2);
+        let endpoint =
+            Access { ca, ..Access::default() }.lasting_endpoint(&format!("{scheme}://{}", self.options.host))?;
         let door = self.doors.acquire().await?;
         let mut client = LearnerClient::new(endpoint.connect().await?);
         let reply = match kind {
