@@ -4,12 +4,29 @@ use std::sync::Arc;
 
 use anyhow::Result;
 use comic_proto::v1::Behaviour;
-use rand::Rng as _;
+use rand::Rng;
 use rand::seq::index::sample;
 
 use crate::checkpoint::Name;
 use crate::trainer::{Trainer, Wait};
 use crate::vmpo::{Losses, MinibatchTensors};
+
+/// A batch of the servo's rollouts in which only those of tasks with a reference are seen, one unroll at least.
+struct Demonstrations {
+    unrolls: MinibatchTensors,
+    shown: Vec<usize>,
+    hidden: Vec<usize>,
+}
+
+impl Demonstrations {
+    /// `count` different unrolls, or all there are: shown ones at random, and hidden ones where these are too few, since
+    /// each size that the mix of tasks made would have to be compiled.
+    fn choose(&self, count: usize, random: &mut impl Rng) -> Vec<usize> {
+        let shown = sample(random, self.shown.len(), self.shown.len().min(count));
+        let shown = shown.into_iter().filter_map(|place| self.shown.get(place));
+        shown.chain(&self.hidden).copied().take(count).collect()
+    }
+}
 
 impl Trainer {
     /// Gathers demonstrations, regresses on them, and leaves the checkpoint `warm-started`. `None` when the learner was
@@ -55,7 +72,7 @@ impl Trainer {
     }
 
     /// At least `demonstration_steps` rows of the servo's rollouts, batch by batch.
-    fn gather(&mut self) -> Result<Option<Vec<MinibatchTensors>>> {
+    fn gather(&mut self) -> Result<Option<Vec<Demonstrations>>> {
         let unroll = &self.experiment.unroll;
         let rows = (unroll.batch * unroll.length) as u64;
         let wanted = self.experiment.warm_start.demonstration_steps.div_ceil(rows).max(1);
@@ -63,13 +80,16 @@ impl Trainer {
         while (demonstrations.len() as u64) < wanted {
             match self.next_batch()? {
                 Wait::Batch(batch) => {
-                    let tensors = self.tensors(&batch)?;
+                    let mut unrolls = self.tensors(&batch)?;
                     // What has no reference has nothing to demonstrate: holding still is no example.
-                    let shows = |task: &usize| self.spec.tasks.get(*task).is_some_and(|task| task.demonstrated);
-                    let shown: Vec<usize> =
-                        (0..batch.unrolls).filter(|unroll| tensors.tasks().get(*unroll).is_some_and(shows)).collect();
+                    let shows = |unroll: &usize| {
+                        let task = unrolls.tasks().get(*unroll).and_then(|task| self.spec.tasks.get(*task));
+                        task.is_some_and(|task| task.demonstrated)
+                    };
+                    let (shown, hidden): (Vec<usize>, Vec<usize>) = (0..batch.unrolls).partition(shows);
                     if !shown.is_empty() {
-                        demonstrations.push(tensors.select(&shown));
+                        unrolls.hide(|unroll| hidden.contains(&unroll));
+                        demonstrations.push(Demonstrations { unrolls, shown, hidden });
                     }
                     self.absorb(&batch);
                     self.metrics.absorb(batch.headers(), 0);
@@ -87,13 +107,12 @@ impl Trainer {
 
     /// One step on some unrolls of one batch. The demonstrator has no latent, so z_{t−1} is this encoder's own: what it
     /// gave when it last saw these unrolls.
-    fn regress(&mut self, demonstrations: &mut [MinibatchTensors], unrolls: usize) -> Result<Losses> {
+    fn regress(&mut self, demonstrations: &mut [Demonstrations], unrolls: usize) -> Result<Losses> {
         let random = &mut self.progress.random;
         let batch = &mut demonstrations[random.random_range(0..demonstrations.len())];
-        let of = batch.shape().unrolls;
-        let chosen = sample(random, of, unrolls.min(of)).into_vec();
-        let (losses, latents) = self.learner.regress(&batch.select(&chosen))?;
-        batch.refresh_previous_latent(&chosen, &latents);
+        let chosen = batch.choose(unrolls, random);
+        let (losses, latents) = self.learner.regress(&batch.unrolls.select(&chosen))?;
+        batch.unrolls.refresh_previous_latent(&chosen, &latents);
         Ok(losses)
     }
 }

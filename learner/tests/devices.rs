@@ -137,3 +137,27 @@ fn whatever_the_mix_of_tasks_and_ends_nothing_is_compiled_twice() {
         assert_eq!(backend().compilations().unwrap(), after_warm_up, "{name}: compiled after the warm-up");
     }
 }
+
+#[cfg(feature = "xla")]
+#[test]
+fn a_warm_start_compiles_nothing_twice_whatever_is_demonstrated() {
+    let of_two_tasks = |(_, _, spec): &(String, Experiment, TaskSpec)| spec.tasks.len() > 1;
+    for (name, experiment, spec) in experiments().into_iter().filter(of_two_tasks) {
+        let mut learner = learner_on(backend().device(), &spec, &experiment, 8);
+        let mut after_warm_up = 0;
+        for seed in 0..20 {
+            if seed == 3 {
+                after_warm_up = backend().compilations().unwrap();
+            }
+            let unrolls = Unrolls::recorded(&experiment, &spec, 2000 + seed, COUNT);
+            let mut demonstrations = unrolls.minibatch_on(learner.device());
+            demonstrations.hide(|unroll| unrolls.tasks[unroll] == 1);
+            let order: Vec<usize> = (0..COUNT).rev().collect();
+            let (losses, latents) = learner.regress(&demonstrations.select(&order)).unwrap();
+            demonstrations.refresh_previous_latent(&order, &latents);
+            backend().end_step().unwrap();
+            assert!(Losses::mean(&[losses]).unwrap().to_metrics().is_finite(), "{name}");
+        }
+        assert_eq!(backend().compilations().unwrap(), after_warm_up, "{name}: compiled after the warm-up");
+    }
+}
