@@ -266,7 +266,7 @@ impl Default for Actor {
 pub struct WarmStart {
     /// Gradient steps; 0 is no warm start.
     pub steps: u64,
-    /// Environment steps of demonstrations gathered first.
+    /// Environment steps of the servo gathered first, those of tasks without a reference among them.
     pub demonstration_steps: u64,
     /// Standard deviation of the noise added to the servo action.
     pub noise: f64,

@@ -18,6 +18,11 @@ pub(crate) fn tasks_of_unrolls(batch: &Batch, spec: &TaskSpec) -> Vec<usize> {
 impl Trainer {
     /// The batch on the device, `[B, T(+1), …]`.
     pub(crate) fn tensors(&self, batch: &Batch) -> Result<MinibatchTensors> {
+        self.masked_tensors(batch, batch.f32(Field::Valid))
+    }
+
+    /// The same, of which only those rows count, `[B, T]`, whose `valid` is 1.
+    pub(crate) fn masked_tensors(&self, batch: &Batch, valid: &[f32]) -> Result<MinibatchTensors> {
         let tasks = tasks_of_unrolls(batch, &self.spec);
         let shape =
             MinibatchShape { unrolls: batch.unrolls, tasks: self.spec.tasks.len(), unroll: *batch.layout.shape() };
@@ -32,7 +37,7 @@ impl Trainer {
             log_weights: batch.f32(Field::LogWeights),
             reward: batch.f32(Field::Reward),
             discount: batch.f32(Field::Discount),
-            valid: batch.f32(Field::Valid),
+            valid,
             first: batch.f32(Field::First),
             state: batch.f32(Field::State),
             clip: batch.clip(),

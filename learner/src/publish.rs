@@ -19,6 +19,7 @@ use tokio::sync::{Notify, watch};
 /// pieces, or where its network is stuck as many as hyper buffers, and never the version they are of. With 64 KiB a thousand
 /// readers cost a fifth more processor time at five sixths of the pace, and stalled ones the same memory.
 const PIECE: usize = 40 * 1024;
+const _: () = assert!(PIECE < comic_proto::FRAME_BYTES, "actors take a piece in one frame");
 /// Versions that readers can be in the middle of.
 const HELD: usize = 4;
 /// Versions in memory: those held, the newest, the one that is just being made, and what it is made of.

@@ -3,29 +3,54 @@
 use std::sync::Arc;
 
 use anyhow::Result;
+use comic_proto::Field;
 use comic_proto::v1::Behaviour;
 use rand::Rng;
 use rand::seq::index::sample;
 
 use crate::checkpoint::Name;
+use crate::minibatches::tasks_of_unrolls;
 use crate::trainer::{Trainer, Wait};
 use crate::vmpo::{Losses, MinibatchTensors};
 
-/// A batch of the servo's rollouts in which only those of tasks with a reference are seen, one unroll at least.
-struct Demonstrations {
-    unrolls: MinibatchTensors,
-    shown: Vec<usize>,
-    hidden: Vec<usize>,
+/// Which unrolls of a batch demonstrate something; the others are masked.
+#[derive(Debug)]
+struct Demonstrated {
+    unrolls: Vec<usize>,
+    masked: Vec<usize>,
 }
 
-impl Demonstrations {
-    /// `count` different unrolls, or all there are: shown ones at random, and hidden ones where these are too few, since
-    /// each size that the mix of tasks made would have to be compiled.
-    fn choose(&self, count: usize, random: &mut impl Rng) -> Vec<usize> {
-        let shown = sample(random, self.shown.len(), self.shown.len().min(count));
-        let shown = shown.into_iter().filter_map(|place| self.shown.get(place));
-        shown.chain(&self.hidden).copied().take(count).collect()
+impl Demonstrated {
+    /// Of unrolls of these tasks.
+    fn among(tasks: &[usize], demonstrated: impl Fn(usize) -> bool) -> Self {
+        let (unrolls, masked) =
+            (0..tasks.len()).partition(|unroll| tasks.get(*unroll).copied().is_some_and(&demonstrated));
+        Self { unrolls, masked }
     }
+
+    /// `valid`, `[B, T]`, as if every masked unroll were padding.
+    fn mask(&self, valid: &[f32]) -> Vec<f32> {
+        let mut valid = valid.to_vec();
+        let length = valid.len() / (self.unrolls.len() + self.masked.len()).max(1);
+        for unroll in &self.masked {
+            valid.iter_mut().skip(unroll * length).take(length).for_each(|valid| *valid = 0.0);
+        }
+        valid
+    }
+
+    /// `count` different unrolls, or all there are: demonstrated ones at random, and masked ones where these are too few,
+    /// since each size that the mix of tasks made would have to be compiled.
+    fn choose(&self, count: usize, random: &mut impl Rng) -> Vec<usize> {
+        let places = sample(random, self.unrolls.len(), self.unrolls.len().min(count));
+        let demonstrated = places.into_iter().filter_map(|place| self.unrolls.get(place));
+        demonstrated.chain(&self.masked).copied().take(count).collect()
+    }
+}
+
+/// A batch of the servo's rollouts.
+struct Demonstrations {
+    tensors: MinibatchTensors,
+    demonstrated: Demonstrated,
 }
 
 impl Trainer {
@@ -71,7 +96,7 @@ impl Trainer {
         Ok(Some(()))
     }
 
-    /// At least `demonstration_steps` rows of the servo's rollouts, batch by batch.
+    /// Batches of the servo's rollouts, of at least `demonstration_steps` rows in all.
     fn gather(&mut self) -> Result<Option<Vec<Demonstrations>>> {
         let unroll = &self.experiment.unroll;
         let rows = (unroll.batch * unroll.length) as u64;
@@ -80,16 +105,14 @@ impl Trainer {
         while (demonstrations.len() as u64) < wanted {
             match self.next_batch()? {
                 Wait::Batch(batch) => {
-                    let mut unrolls = self.tensors(&batch)?;
                     // What has no reference has nothing to demonstrate: holding still is no example.
-                    let shows = |unroll: &usize| {
-                        let task = unrolls.tasks().get(*unroll).and_then(|task| self.spec.tasks.get(*task));
-                        task.is_some_and(|task| task.demonstrated)
-                    };
-                    let (shown, hidden): (Vec<usize>, Vec<usize>) = (0..batch.unrolls).partition(shows);
-                    if !shown.is_empty() {
-                        unrolls.hide(|unroll| hidden.contains(&unroll));
-                        demonstrations.push(Demonstrations { unrolls, shown, hidden });
+                    let demonstrated = Demonstrated::among(&tasks_of_unrolls(&batch, &self.spec), |task| {
+                        self.spec.tasks.get(task).is_some_and(|task| task.demonstrated)
+                    });
+                    if !demonstrated.unrolls.is_empty() {
+                        let valid = demonstrated.mask(batch.f32(Field::Valid));
+                        let tensors = self.masked_tensors(&batch, &valid)?;
+                        demonstrations.push(Demonstrations { tensors, demonstrated });
                     }
                     self.absorb(&batch);
                     self.metrics.absorb(batch.headers(), 0);
@@ -110,9 +133,47 @@ impl Trainer {
     fn regress(&mut self, demonstrations: &mut [Demonstrations], unrolls: usize) -> Result<Losses> {
         let random = &mut self.progress.random;
         let batch = &mut demonstrations[random.random_range(0..demonstrations.len())];
-        let chosen = batch.choose(unrolls, random);
-        let (losses, latents) = self.learner.regress(&batch.unrolls.select(&chosen))?;
-        batch.unrolls.refresh_previous_latent(&chosen, &latents);
+        let chosen = batch.demonstrated.choose(unrolls, random);
+        let (losses, latents) = self.learner.regress(&batch.tensors.select(&chosen))?;
+        batch.tensors.refresh_previous_latent(&chosen, &latents);
         Ok(losses)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use proptest::prelude::*;
+    use rand::SeedableRng as _;
+    use rand_pcg::Pcg64;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn a_minibatch_has_one_size_whatever_the_mix_and_no_masked_unroll_without_need(
+            tasks in prop::collection::vec(0_usize..2, 1..40), count in 1_usize..50, seed in any::<u64>(),
+        ) {
+            let demonstrated = Demonstrated::among(&tasks, |task| task == 0);
+            let chosen = demonstrated.choose(count, &mut Pcg64::seed_from_u64(seed));
+            prop_assert_eq!(chosen.len(), count.min(tasks.len()));
+            prop_assert_eq!(chosen.iter().collect::<HashSet<_>>().len(), chosen.len(), "{:?} has one twice", &chosen);
+            let of_reference = chosen.iter().filter(|unroll| tasks[**unroll] == 0).count();
+            prop_assert_eq!(of_reference, count.min(tasks.iter().filter(|task| **task == 0).count()));
+        }
+
+        #[test]
+        fn what_demonstrates_nothing_is_masked_and_nothing_else(
+            unrolls in prop::collection::vec((0_usize..2, prop::collection::vec(0..=1_u8, 4)), 1..10),
+        ) {
+            let tasks: Vec<usize> = unrolls.iter().map(|(task, _)| *task).collect();
+            let valid: Vec<f32> = unrolls.iter().flat_map(|(_, valid)| valid.iter().map(|valid| f32::from(*valid))).collect();
+            let masked = Demonstrated::among(&tasks, |task| task == 0).mask(&valid);
+            prop_assert_eq!(masked.len(), valid.len());
+            for (row, (masked, valid)) in masked.iter().zip(valid).enumerate() {
+                prop_assert_eq!(*masked, if tasks[row / 4] == 0 { valid } else { 0.0 });
+            }
+        }
     }
 }

@@ -20,6 +20,9 @@ const CONNECT: Duration = Duration::from_secs(5);
 /// A learner that answers nothing for twice as long is not there any more.
 const KEEP_ALIVE: Duration = Duration::from_secs(10);
 
+/// Bytes of the largest HTTP/2 frame that an actor takes.
+pub const FRAME_BYTES: usize = 64 * 1024;
+
 /// A client of the learner that sends its token, if it has one, with every call.
 pub type Client = LearnerClient<Authorised>;
 
@@ -85,7 +88,7 @@ impl Access {
             .keep_alive_while_idle(true)
             .initial_stream_window_size(1 << 20)
             .initial_connection_window_size(4 << 20)
-            .max_frame_size(64 * 1024))
+            .max_frame_size(FRAME_BYTES as u32))
     }
 
     fn tls(&self, ca: &Path) -> Result<ClientTlsConfig, AccessError> {

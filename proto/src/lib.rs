@@ -32,7 +32,7 @@ pub mod v1 {
     tonic::include_proto!("comic.v1");
 }
 
-pub use access::{Access, AccessError, Authorised, Bearer, Client, chain, distrusted};
+pub use access::{Access, AccessError, Authorised, Bearer, Client, FRAME_BYTES, chain, distrusted};
 pub use buffer::UnrollBuffer;
 pub use frame::frame;
 pub use layout::{Field, UnrollLayout, UnrollShape};

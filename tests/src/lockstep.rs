@@ -14,7 +14,7 @@ pub const ALL: u32 = 8;
 /// Updates of such a run.
 pub const UPDATES: u64 = 6;
 /// A version of so small a policy takes seconds at this pace, and the run long enough for a fault to come in the middle.
-pub const SLOW: f64 = 500_000.0;
+pub const SLOW_BYTES_PER_SECOND: f64 = 500_000.0;
 
 /// A run in lockstep with a warm start, a normaliser that is set twice, and updates that publish nothing new.
 ///
@@ -53,14 +53,15 @@ pub async fn train(system: &mut System, actors: &[u32]) -> Result<()> {
     let url = system.url();
     let start = |environments: &u32| system.start_actor_of(*environments, &url);
     let mut actors = actors.iter().map(start).collect::<Result<Vec<_>>>()?;
-    is_over(system, &mut actors).await
+    is_over(system, &mut actors).await?;
+    Ok(())
 }
 
-/// Waits until the budget is used up, and everybody has left.
+/// Waits until the budget is used up, and everybody has left; the learner's log.
 ///
 /// # Errors
 /// When anybody ends in another way.
-pub async fn is_over(system: &mut System, actors: &mut [Process]) -> Result<()> {
+pub async fn is_over(system: &mut System, actors: &mut [Process]) -> Result<String> {
     for actor in actors {
         let status = actor.until_it_ends(LIMIT).await?;
         ensure!(status.success(), "an actor ended with {status}: {}", actor.log());
@@ -68,7 +69,7 @@ pub async fn is_over(system: &mut System, actors: &mut [Process]) -> Result<()> 
     let mut learner = system.learner.take().context("no learner")?;
     let status = learner.until_it_ends(LIMIT).await?;
     ensure!(status.success(), "the learner ended with {status}: {}", learner.log());
-    Ok(())
+    Ok(learner.log())
 }
 
 /// What the run's last checkpoint says of networks, optimiser and statistics.

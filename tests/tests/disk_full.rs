@@ -10,14 +10,17 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context as _, Result, ensure};
-use comic_tests::lockstep::{ALL, SLOW, is_over, learnt_by, learnt_in, lockstep};
+use comic_proto::v1::Status;
+use comic_tests::lockstep::{ALL, SLOW_BYTES_PER_SECOND, UPDATES, is_over, learnt_by, learnt_in, lockstep};
 use comic_tests::relay::Relay;
-use comic_tests::steps::{LIMIT, checkpoint_in, half_written, leaves, the_books_balance_at_the_end, trains_on};
+use comic_tests::steps::{LIMIT, checkpoint_in, half_written, leaves, now, the_books_balance_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System, metric, python};
 use comic_tests::tensorboard::curves;
 
 /// Room for a few dozen checkpoints.
 const DISK: u64 = 64 << 20;
+/// What the learner's log says of every checkpoint that was refused.
+const REFUSED: &str = "checkpoint not written";
 
 #[tokio::test]
 async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
@@ -60,11 +63,21 @@ async fn a_full_disk_changes_nothing_that_is_learnt() -> Result<()> {
     // As long as somebody has it open the disk stays, also when the learner is gone.
     let disk = File::open(&seen)?;
     let run = PathBuf::from(format!("/proc/self/fd/{}", disk.as_raw_fd()));
+    system
+        .until("the first checkpoint is written", LIMIT, |_| run.join("checkpoints/initial").exists().then_some(()))
+        .await?;
     let filler = run.join("filler");
     fill(&filler)?;
-    let relay = Relay::start(system.address(), SLOW).await?;
+    let relay = Relay::start(system.address(), SLOW_BYTES_PER_SECOND).await?;
     let actor = system.start_actor_of(ALL, &relay.url)?;
+    // The warm start's checkpoint, and one in the middle of training.
     fill_until_refused(&mut system, &filler, 1).await?;
+    let updates = |status: &Status| metric(status, "updates");
+    system.until("an update", LIMIT, |status| (updates(status) >= 1.0).then_some(())).await?;
+    let refused = system.learner.as_ref().context("no learner")?.log().matches(REFUSED).count();
+    fill_until_refused(&mut system, &filler, refused + 1).await?;
+    let done = updates(&now(&mut system).await?);
+    ensure!(done < UPDATES as f64, "the disk was full until {done} updates, which is to the end");
     fs::remove_file(&filler)?;
     is_over(&mut system, &mut [actor]).await?;
     ensure!(learnt_in(&run)? == learnt_by(&[ALL], &[]).await?, "a disk without room changed something");
@@ -75,7 +88,7 @@ async fn a_full_disk_changes_nothing_that_is_learnt() -> Result<()> {
 async fn fill_until_refused(system: &mut System, filler: &Path, checkpoints: usize) -> Result<()> {
     let learner = system.learner.as_mut().context("no learner")?;
     let deadline = Instant::now() + LIMIT;
-    while learner.log().matches("checkpoint not written").count() < checkpoints {
+    while learner.log().matches(REFUSED).count() < checkpoints {
         fill(filler)?;
         ensure!(learner.ended()?.is_none(), "a full disk ended the learner: {}", learner.log());
         ensure!(Instant::now() < deadline, "no checkpoint was refused: {}", learner.log());

@@ -7,7 +7,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use comic_tests::lockstep::{ALL, SLOW, UPDATES, is_over, learnt, learnt_by, lockstep, lockstep_with, train};
+use comic_tests::lockstep::{
+    ALL, SLOW_BYTES_PER_SECOND, UPDATES, is_over, learnt, learnt_by, lockstep, lockstep_with, train,
+};
 use comic_tests::relay::Relay;
 use comic_tests::steps::{LIMIT, books, trains_on};
 
@@ -54,7 +56,7 @@ async fn a_paused_actor_and_broken_connections_change_nothing() -> Result<()> {
 async fn a_slow_line_strangers_and_nonsense_change_nothing() -> Result<()> {
     let mut system = lockstep_with(&["--metrics-port", "0"], &[])?;
     system.start_learner(LIMIT).await?;
-    let relay = Relay::start(system.address(), SLOW).await?;
+    let relay = Relay::start(system.address(), SLOW_BYTES_PER_SECOND).await?;
     let mut actors = [system.start_actor_of(5, &relay.url)?, system.start_actor_of(3, &system.url())?];
     for actor in &mut actors {
         actor.until_log_holds("joined the learner", LIMIT).await?;

@@ -20,12 +20,16 @@ async fn one_unroll_can_be_followed_from_its_actor_to_the_gradient() -> Result<(
     let learner = system.learner.as_ref().context("no learner")?;
     let trained = lines(learner).find(|line| said(line) == "trained on").context("nothing was trained on")?;
     ensure!(trained["span"]["name"] == "update", "the learner does not say in which update: {trained}");
-    let name = ["actor", "incarnation", "sequence"].map(|part| trained["fields"][part].clone());
-    let sequence = &name[2];
+    let name = ["incarnation", "sequence"].map(|part| trained["fields"][part].clone());
+    let sequence = &name[1];
     for step in ["made", "sent", "acknowledged", "close"] {
         let of = |line: &Value| line["span"]["name"] == "unroll" && is(&line["span"], &name);
         let found = lines(&actor).find(|line| said(line) == step && of(line));
         let line = found.with_context(|| format!("the actor does not say when {sequence} was {step}"))?;
+        ensure!(
+            step != "sent" || line["fields"]["actor"] == trained["fields"]["actor"],
+            "sent by another actor: {line}"
+        );
         ensure!(step != "close" || takes(&line, "time.idle"), "the actor does not say how long it waited: {line}");
     }
     let acted = lines(&actor).any(|line| line["span"]["name"] == "rollout" && takes(&line, "time.busy"));
@@ -51,8 +55,8 @@ fn said(line: &Value) -> &str {
     line["fields"]["message"].as_str().unwrap_or_default()
 }
 
-fn is(found: &Value, name: &[Value; 3]) -> bool {
-    ["actor", "incarnation", "sequence"].iter().zip(name).all(|(part, value)| found[*part] == *value)
+fn is(found: &Value, name: &[Value; 2]) -> bool {
+    ["incarnation", "sequence"].iter().zip(name).all(|(part, value)| found[*part] == *value)
 }
 
 fn takes(line: &Value, time: &str) -> bool {

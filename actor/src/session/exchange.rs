@@ -68,7 +68,7 @@ impl Exchange<'_> {
                     }
                 }
                 unroll = self.unrolls.recv(), if producing && self.outbox.has_room() => match unroll {
-                    Some(unroll) => self.outbox.push(unroll, actor, incarnation),
+                    Some(unroll) => self.outbox.push(unroll, incarnation),
                     None => producing = false,
                 },
                 Some(ended) = streams.join_next() => {

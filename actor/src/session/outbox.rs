@@ -31,7 +31,8 @@ pub struct Settled {
 struct Waiting {
     sequence: u64,
     unroll: FinishedUnroll,
-    /// From its number to its answer, or to the session's end. The learner's log calls it by the same three numbers.
+    /// From its number to its answer, or to the session's end. The learner's log has the same incarnation and sequence number;
+    /// which actor that is may change with the learner's life.
     span: Span,
 }
 
@@ -91,10 +92,10 @@ impl Outbox {
     }
 
     /// Gives the unroll its sequence number.
-    pub(super) fn push(&mut self, unroll: FinishedUnroll, actor: u64, incarnation: u64) {
+    pub(super) fn push(&mut self, unroll: FinishedUnroll, incarnation: u64) {
         let (sequence, version, environment) = (self.next_sequence, unroll.version, unroll.environment);
         let incarnation = format_args!("{incarnation:016x}");
-        let span = tracing::debug_span!("unroll", actor, incarnation, sequence, version, environment);
+        let span = tracing::debug_span!("unroll", incarnation, sequence, version, environment);
         span.in_scope(|| tracing::debug!("made"));
         self.waiting.push_back(Waiting { sequence, unroll, span });
         self.next_sequence += 1;
@@ -115,7 +116,7 @@ impl Outbox {
             episodes: unroll.episodes.clone(),
             environment: unroll.environment,
         };
-        span.in_scope(|| tracing::debug!("sent"));
+        span.in_scope(|| tracing::debug!(actor, "sent"));
         Some(UnrollMessage { header: Some(header), payload: unroll.payload.clone() })
     }
 
@@ -182,11 +183,11 @@ mod tests {
     #[test]
     fn what_was_not_acknowledged_is_sent_again_in_order() {
         let mut outbox = Outbox::new(8, [0; 32]);
-        (0..4).for_each(|_| outbox.push(unroll(), 0, 0));
+        (0..4).for_each(|_| outbox.push(unroll(), 0));
         assert_eq!(sent(&mut outbox), [0, 1, 2, 3]);
         outbox.settle(&ack(1, Verdict::Taken));
         outbox.settle(&ack(0, Verdict::Stale));
-        outbox.push(unroll(), 0, 0);
+        outbox.push(unroll(), 0);
         outbox.rewind();
         assert_eq!(sent(&mut outbox), [2, 3, 4]);
         outbox.settle(&ack(2, Verdict::Duplicate));
@@ -196,7 +197,7 @@ mod tests {
     #[test]
     fn acknowledgements_of_the_unknown_and_the_unsent_change_nothing() {
         let mut outbox = Outbox::new(2, [0; 32]);
-        outbox.push(unroll(), 0, 0);
+        outbox.push(unroll(), 0);
         outbox.settle(&ack(0, Verdict::Taken));
         outbox.settle(&ack(7, Verdict::Taken));
         assert_eq!(outbox.settled(), Settled::default());
@@ -206,7 +207,7 @@ mod tests {
     #[test]
     fn the_window_bounds_it() {
         let mut outbox = Outbox::new(2, [0; 32]);
-        (0..2).for_each(|_| outbox.push(unroll(), 0, 0));
+        (0..2).for_each(|_| outbox.push(unroll(), 0));
         assert!(!outbox.has_room());
         sent(&mut outbox);
         outbox.settle(&ack(0, Verdict::Taken));

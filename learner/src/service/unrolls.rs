@@ -72,7 +72,7 @@ async fn answer(shared: &Shared, incoming: &mut Messages) -> Option<Result<Unrol
     }
 }
 
-/// What an unroll is called in every log: the actor gives it the same three numbers.
+/// What an unroll is called in every log: its actor's has the same incarnation and sequence number.
 fn span(header: Option<&UnrollHeader>) -> Span {
     let Some(UnrollHeader { actor, incarnation, sequence, version, .. }) = header else { return Span::none() };
     tracing::debug_span!("unroll", actor, incarnation = format_args!("{incarnation:016x}"), sequence, version)

@@ -134,7 +134,7 @@ pub struct Metrics {
     pub gradient_norm: f32,
     /// 1 − Var(G − V) / Var(G), of the return summed over reward terms.
     pub variance_explained: f32,
-    /// Share of the rows that are transitions.
+    /// Share of the rows that are transitions, and in a warm start demonstrate something.
     pub valid_share: f32,
     /// Every η after the step: one, or one for each task.
     pub temperatures: Vec<f32>,

@@ -197,12 +197,6 @@ impl MinibatchTensors {
         }
     }
 
-    /// Leaves the unrolls for whose index `hidden` holds out of every loss; all sizes stay as they are.
-    pub fn hide(&mut self, hidden: impl Fn(usize) -> bool) {
-        let shown: Vec<f32> = (0..self.tasks.len()).map(|unroll| if hidden(unroll) { 0.0 } else { 1.0 }).collect();
-        self.valid = &self.valid * Tensor::from_slice(&shown).to_device(self.valid.device()).unsqueeze(-1);
-    }
-
     fn indices(&self, unrolls: &[usize]) -> Tensor {
         let indices: Vec<i64> = unrolls.iter().map(|unroll| *unroll as i64).collect();
         Tensor::from_slice(&indices).to_device(self.valid.device())
