@@ -130,9 +130,10 @@ fn expectation_step(evidence: &Evidence, mask: &Tensor, eta: &Tensor, limits: &L
     let advantage = evidence.advantage.detach();
     let selected = top(&advantage, mask, limits.top_fraction);
     let scaled = &advantage / eta;
-    // Subtracting the maximum is what makes this a log-sum-exp. It is 0 only where no step is valid.
+    // Subtracting the maximum is what makes this a log-sum-exp. Where no step is valid it is 0: what it would be otherwise is no
+    // number on a CPU, and on XLA the least one that there is, which is finite and overflows below.
     let maximum = scaled.detach().where_scalarother(&selected, f64::NEG_INFINITY).max();
-    let maximum = maximum.where_scalarother(&maximum.isfinite(), 0.0);
+    let maximum = maximum.where_scalarother(&selected.any(), 0.0);
     let exponentials = (&scaled - &maximum).where_scalarother(&selected, f64::NEG_INFINITY).exp();
     // The largest term is exp(0), so the floor binds only where no step is valid.
     let sum = exponentials.sum(Kind::Float).clamp_min(1.0);

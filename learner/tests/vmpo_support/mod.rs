@@ -160,8 +160,8 @@ impl Unrolls {
         }
     }
 
-    /// Recorded unrolls of an experiment's sizes, of one task or of [`joint_spec`]'s two, `seed` deciding the mix: some end
-    /// an episode, by a fall or a clip's end, and some are padding from a row on.
+    /// Recorded unrolls of an experiment's sizes, of one task or of [`joint_spec`]'s two, `seed` deciding the mix, and every
+    /// fourth of one task alone: some end an episode, by a fall or a clip's end, and some are padding from a row on.
     pub(crate) fn recorded(experiment: &Experiment, spec: &TaskSpec, seed: u64, count: usize) -> Self {
         let mut unrolls = Self::random(seed, count);
         let mut numbers = Numbers::new(seed + 100);
@@ -177,9 +177,10 @@ impl Unrolls {
         unrolls.state = numbers.take(count * network.state_size());
         unrolls.reward = numbers.take(rows * spec.reward_terms.len());
         unrolls.task_count = spec.tasks.len();
+        let alone = (seed % 4 == 3).then_some(seed as usize / 4 % spec.tasks.len());
         for unroll in 0..count {
             let task = (numbers.next().abs() * spec.tasks.len() as f32) as usize;
-            unrolls.tasks[unroll] = task.min(spec.tasks.len() - 1);
+            unrolls.tasks[unroll] = alone.unwrap_or(task.min(spec.tasks.len() - 1));
             let row = 1 + (numbers.next().abs() * (LENGTH - 1) as f32) as usize;
             match (numbers.next() * 2.0) as i32 {
                 1 => unrolls = unrolls.end_episode(unroll, row.min(LENGTH - 1), numbers.next() > 0.0),
