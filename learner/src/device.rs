@@ -94,6 +94,18 @@ impl Backend {
         self.device != Device::Cpu
     }
 
+    /// Tells the device that the calling thread, if it is not the one that opened it, is the one that trains.
+    ///
+    /// # Errors
+    /// When XLA refuses.
+    pub fn train_here(&self) -> Result<()> {
+        #[cfg(feature = "xla")]
+        if let Some(xla) = &self.xla {
+            return xla.train_here();
+        }
+        Ok(())
+    }
+
     /// Ends a gradient step. XLA compiles what was recorded since the last end, if it is new, and runs it; elsewhere
     /// everything runs as it is written, and there is nothing to end. Does not wait for results.
     ///

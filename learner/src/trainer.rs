@@ -120,6 +120,7 @@ impl Trainer {
     pub fn new(setup: Setup) -> Result<Self> {
         let Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, shared } = setup;
         tch::manual_seed(experiment.seed as i64);
+        backend.train_here()?;
         let learner = VmpoLearner::new(&spec, &experiment, &pose, backend.device())?;
         let store = Store::open(&run, experiment.learner.checkpoints_kept)?;
         let mut trainer = Self {

@@ -142,6 +142,33 @@ fn whatever_the_mix_of_tasks_and_ends_nothing_is_compiled_twice() {
 
 #[cfg(feature = "xla")]
 #[test]
+fn no_other_thread_goes_backward_in_which_gradients_could_outlive_their_step() {
+    let (_, experiment, spec) = experiments().remove(0);
+    std::thread::scope(|scope| {
+        let trains = || {
+            backend().train_here().unwrap();
+            let mut learner = learner_on(backend().device(), &spec, &experiment, 9);
+            for seed in 0..10 {
+                step(&mut learner, &Unrolls::recorded(&experiment, &spec, seed, COUNT));
+            }
+        };
+        // Of this thread.
+        backend();
+        scope.spawn(trains);
+    });
+    // libtorch starts its threads whether they are used or not; one that is waits for each pass.
+    for thread in std::fs::read_dir("/proc/self/task").unwrap() {
+        let status = std::fs::read_to_string(thread.unwrap().path().join("status")).unwrap_or_default();
+        let field = |name: &str| status.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_default().trim();
+        if field("Name:").starts_with("pt_autograd") {
+            let waits: u64 = field("voluntary_ctxt_switches:").parse().unwrap();
+            assert!(waits < 5, "{} was woken {waits} times", field("Name:"));
+        }
+    }
+}
+
+#[cfg(feature = "xla")]
+#[test]
 fn a_warm_start_compiles_nothing_twice_whatever_is_demonstrated() {
     let of_two_tasks = |(_, _, spec): &(String, Experiment, TaskSpec)| spec.tasks.len() > 1;
     for (name, experiment, spec) in experiments().into_iter().filter(of_two_tasks) {

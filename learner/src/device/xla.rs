@@ -45,6 +45,8 @@ if found:
     torch_xla._XLAC._xla_set_default_device(device)
 os.environ['COMIC_XLA_INDEX'] = str(index)
 kind = runtime.device_type() if found else ''
+backward_in_threads = torch._C._set_multithreading_enabled
+backward_in_threads(False)
 step_marker = torch_xla._XLAC._xla_step_marker
 wait = torch_xla._XLAC._xla_wait_device_ops
 metric_data = torch_xla._XLAC._xla_metric_data
@@ -77,6 +79,7 @@ fn watched() -> Result<Arc<Busy>> {
 #[derive(Debug)]
 pub(super) struct Plugin {
     device: String,
+    backward_in_threads: Py<PyAny>,
     step_marker: Py<PyAny>,
     wait: Py<PyAny>,
     metric_data: Py<PyAny>,
@@ -115,6 +118,7 @@ impl Plugin {
             tracing::info!(device = index, kind, seconds = started.elapsed().as_secs(), "torch_xla is there");
             Ok(Self {
                 device: of("device")?.extract()?,
+                backward_in_threads: of("backward_in_threads")?.unbind(),
                 step_marker: of("step_marker")?.unbind(),
                 wait: of("wait")?.unbind(),
                 metric_data: of("metric_data")?.unbind(),
@@ -126,6 +130,14 @@ impl Plugin {
             Ok(error) => not_started(&packages, &error),
             Err(error) => error,
         })
+    }
+
+    /// The calling thread trains, as the one does that started the plugin: backward passes are its own from now on. libtorch's
+    /// thread for them lets go of the gradients when its caller has gone on already, and what is still there when a step ends
+    /// is one more result of the step's program, which would be compiled anew.
+    pub(super) fn train_here(&self) -> Result<()> {
+        Python::attach(|python| self.backward_in_threads.call1(python, (false,)).map(drop))
+            .map_err(|error| anyhow!("XLA: {error}"))
     }
 
     /// Compiles what was recorded, if it is new, and hands it to the device.
