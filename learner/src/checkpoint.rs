@@ -22,7 +22,7 @@ use best::Best;
 pub use best::{Evaluated, Judgement};
 use steps::{Step, carry_out, hidden, is_damage, put, replace};
 
-use crate::options::Misuse;
+use crate::error::Misuse;
 
 const MANIFEST: &str = "MANIFEST.json";
 const EPOCH: &str = "epoch";

@@ -13,7 +13,7 @@ use comic_experiment::{DeviceName, Learner};
 use tch::kind::Element;
 use tch::{Device, TchError, Tensor};
 
-use crate::options::Misuse;
+use crate::error::Misuse;
 
 /// A device that is there.
 #[derive(Debug)]

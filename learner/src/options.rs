@@ -7,12 +7,12 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use comic_experiment::{DeviceName, Experiment, LowLevelName};
 use comic_networks::export::Part;
 
-use crate::certs::Certs;
-use crate::health::Health;
+use crate::commands::certs::Certs;
+use crate::commands::health::Health;
 use crate::load::Load;
-use crate::quarantine::QuarantineOptions;
+use crate::service::quarantine::QuarantineOptions;
 use crate::security::{Limits, SecurityOptions};
-use crate::status::Status;
+use crate::commands::status::Status;
 
 /// Learns reusable motor skills from the experience that comic-actor processes stream to it.
 #[derive(Debug, Parser)]
@@ -153,18 +153,6 @@ const EXIT_CODES: &str = "\
 Exit codes: 0 when the run is over or the learner was told to stop and wrote its checkpoint, 2 when the configuration
 is wrong and starting again cannot help, 1 otherwise.
 Logs go to standard error; RUST_LOG chooses what (default: info).";
-
-/// A configuration that is wrong and stays wrong, however often it is tried: exit code 2.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct Misuse(pub(crate) String);
-
-impl Misuse {
-    /// What is wrong, and the remedy.
-    pub fn new(message: impl Into<String>) -> Self {
-        Self(message.into())
-    }
-}
 
 /// Form of the log.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

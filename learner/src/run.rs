@@ -21,12 +21,13 @@ use tokio::sync::oneshot;
 
 use crate::checkpoint::{Snapshot, Store, unfit};
 use crate::device::Backend;
-use crate::options::{Misuse, Options};
-use crate::probes;
+use crate::error::Misuse;
+use crate::options::Options;
+use crate::observe::probes;
 use crate::publish::Publisher;
 use crate::security::Security;
 use crate::service::{self, Shared};
-use crate::trainer::{Ending, Setup, Trainer};
+use crate::train::trainer::{Ending, Setup, Trainer};
 
 /// File descriptors for everything that is no connection to an actor.
 const OTHER_FILES: u64 = 256;

@@ -15,7 +15,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use crate::options::Misuse;
+use crate::error::Misuse;
 
 pub use limits::Limits;
 pub use tls::Tls;

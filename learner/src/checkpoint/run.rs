@@ -7,7 +7,7 @@ use anyhow::{Context as _, Result};
 
 use super::Store;
 use super::steps::{carry_out, replace};
-use crate::options::Misuse;
+use crate::error::Misuse;
 
 const RUN: &str = "run";
 

@@ -13,7 +13,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyList;
 use tch::Device;
 
-use crate::options::Misuse;
+use crate::error::Misuse;
 
 /// XLA in the terms of tch, which does not know it by name: see `xla.cpp`.
 pub(super) const DEVICE: Device = Device::Mps;

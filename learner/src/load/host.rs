@@ -23,7 +23,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::process::obey;
 use crate::publish::Publisher;
-use crate::quarantine::QuarantineOptions;
+use crate::service::quarantine::QuarantineOptions;
 use crate::run::service_runtime;
 use crate::security::{Limits, Security, Tls};
 use crate::service::{Setup, Shared, serve, server, window};

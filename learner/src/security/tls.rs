@@ -11,7 +11,7 @@ use rustls::{RootCertStore, ServerConfig};
 use tokio_rustls::TlsAcceptor;
 
 use super::watched::Watched;
-use crate::options::Misuse;
+use crate::error::Misuse;
 
 /// Certificates that are read again when they change.
 #[derive(Debug)]

@@ -16,7 +16,7 @@ use tonic::body::Body;
 use tower::{Layer, Service};
 
 use crate::security::Tokens;
-use crate::telemetry::Telemetry;
+use crate::observe::telemetry::Telemetry;
 
 /// Says whether the learner serves and nothing else, so that container checks need no secret.
 const OPEN: &str = "/grpc.health.v1.Health/Check";

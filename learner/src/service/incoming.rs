@@ -16,10 +16,10 @@ use tokio::task::JoinSet;
 use tokio::time::Sleep;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
-use super::complaints::Complaints;
+use crate::complaints::Complaints;
 use super::lock;
 use crate::security::{Limits, Tls};
-use crate::telemetry::Telemetry;
+use crate::observe::telemetry::Telemetry;
 
 /// A handshake takes a few round trips, TLS's and HTTP/2's each; whoever takes longer is turned away.
 const HANDSHAKE: Duration = Duration::from_secs(10);

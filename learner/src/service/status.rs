@@ -6,7 +6,7 @@ use comic_proto::v1;
 
 use super::roster::Census;
 use super::{Shared, lock};
-use crate::telemetry::Sample;
+use crate::observe::telemetry::Sample;
 
 /// What `GetStatus` answers.
 pub(super) fn of(shared: &Shared) -> v1::Status {

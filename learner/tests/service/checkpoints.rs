@@ -4,7 +4,7 @@
 
 use crate::support::RUN;
 use comic_learner::checkpoint::{Evaluated, Judgement, Name, Snapshot, Store, find, read};
-use comic_learner::options::Misuse;
+use comic_learner::error::Misuse;
 use proptest::prelude::*;
 
 fn snapshot(content: &str) -> Snapshot {

@@ -5,7 +5,7 @@
 use crate::support::{EPOCH, RUN, World, joining, parameters};
 use comic_experiment::{Experiment, TaskSpec};
 use comic_learner::publish::Publisher;
-use comic_learner::quarantine::QuarantineOptions;
+use comic_learner::service::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
 use comic_proto::v1::{Behaviour, Environments, JoinRequest, StatusRequest, Verdict, WatchRequest};

@@ -6,9 +6,9 @@ use std::io::ErrorKind;
 use std::time::Duration;
 
 use crate::support::{EPOCH, World, joining, within};
-use comic_learner::options::Misuse;
+use comic_learner::error::Misuse;
 use comic_learner::publish::Publisher;
-use comic_learner::quarantine::QuarantineOptions;
+use comic_learner::service::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
 use comic_proto::v1::learner_client::LearnerClient;

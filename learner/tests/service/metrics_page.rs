@@ -6,8 +6,8 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use crate::support::World;
-use comic_learner::probes;
-use comic_learner::telemetry::Telemetry;
+use comic_learner::observe::probes;
+use comic_learner::observe::telemetry::Telemetry;
 use comic_proto::v1::Verdict;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::support::{World, within};
-use comic_learner::certs::Certs;
+use comic_learner::commands::certs::Certs;
 use comic_learner::security::{Security, Tls};
 use comic_proto::v1::StatusRequest;
 use comic_proto::{Access, distrusted};

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use crate::support::{BATCH, EPOCH, World, within};
 use bytes::Bytes;
-use comic_learner::quarantine::QuarantineOptions;
+use comic_learner::service::quarantine::QuarantineOptions;
 use comic_proto::v1::{UnrollMessage, Verdict};
 use comic_proto::{Field, UnrollBuffer};
 use comic_replay::{Next, Phase};

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_fuzz::{experiment, layout, seed, spec};
 use comic_learner::checkpoint::{Name, Snapshot, Store, read};
-use comic_learner::statistics::ObservationStatistics;
+use comic_learner::train::statistics::ObservationStatistics;
 use comic_learner::tensors;
 use comic_learner::vmpo::VmpoLearner;
 use comic_networks::to_safetensors;

@@ -11,7 +11,7 @@ use bytes::Bytes;
 use comic_clips::Asset;
 use comic_experiment::{Experiment, TaskPart, TaskSpec, Unroll};
 use comic_learner::publish::Publisher;
-use comic_learner::quarantine::QuarantineOptions;
+use comic_learner::service::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared, serve};
 use comic_proto::v1::learner_client::LearnerClient;

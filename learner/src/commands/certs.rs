@@ -13,7 +13,7 @@ use rcgen::{
 };
 use time::{Duration, OffsetDateTime};
 
-use crate::options::Misuse;
+use crate::error::Misuse;
 
 /// Makes an authority and certificates for a learner and its actors, or, where DIR holds an authority, renews the
 /// certificates by it: a learner and actors that run take them up by themselves.

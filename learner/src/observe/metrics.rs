@@ -15,7 +15,7 @@ use comic_replay::{Batch, BooksByTask};
 use serde_json::{Map, Value, json};
 
 use crate::service::Evaluation;
-use crate::tensorboard::Events;
+use crate::observe::tensorboard::Events;
 
 /// Sums since the last line.
 #[derive(Debug, Default)]

@@ -16,8 +16,8 @@ use comic_proto::v1::UnrollHeader;
 use comic_proto::{Invalid, Pieces};
 use serde_json::json;
 
-use crate::service::complaints::Complaints;
-use crate::telemetry::Telemetry;
+use crate::complaints::Complaints;
+use crate::observe::telemetry::Telemetry;
 
 /// Unrolls that may wait for the disk; one more is let go of.
 const QUEUE: usize = 8;

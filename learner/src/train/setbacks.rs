@@ -3,8 +3,8 @@
 use anyhow::{Result, bail};
 use serde_json::{Map, Value, json};
 
-use crate::service::complaints::Complaints;
-use crate::trainer::Trainer;
+use crate::complaints::Complaints;
+use crate::train::trainer::Trainer;
 use crate::vmpo;
 
 /// Counts skipped steps. Too many in a row lead back to the last good state; as many again, before as many were taken,

@@ -17,14 +17,14 @@ use serde_json::{Map, Value};
 
 use crate::checkpoint::{Name, Snapshot, Store, unfit};
 use crate::device::Backend;
-use crate::metrics::{Metrics, Position};
-use crate::minibatches::tasks_of_unrolls;
+use crate::observe::metrics::{Metrics, Position};
+use crate::train::minibatches::tasks_of_unrolls;
 use crate::publish::Publisher;
 use crate::service::Shared;
-use crate::setbacks::Setbacks;
-use crate::statistics::ObservationStatistics;
+use crate::train::setbacks::Setbacks;
+use crate::train::statistics::ObservationStatistics;
 use crate::vmpo::{Losses, VmpoLearner};
-use crate::writer::Writer;
+use crate::train::writer::Writer;
 
 /// How often a trainer without batches looks at the clock.
 const PATIENCE: std::time::Duration = std::time::Duration::from_millis(500);

@@ -8,8 +8,8 @@ use bytes::Bytes;
 use comic_networks::to_safetensors;
 
 use crate::checkpoint::{Name, PROGRESS, Snapshot};
-use crate::memory::{Bounds, Sizes};
-use crate::trainer::{Progress, Trainer};
+use crate::service::memory::{Bounds, Sizes};
+use crate::train::trainer::{Progress, Trainer};
 
 impl Trainer {
     /// Hands a snapshot to the writer; while it is still busy with the last one, only a `final_one` waits.

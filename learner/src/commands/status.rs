@@ -12,7 +12,7 @@ use comic_proto::{Access, chain, distrusted};
 use serde_json::{Value, json};
 use tonic::Code;
 
-use crate::options::Misuse;
+use crate::error::Misuse;
 
 /// How often `--watch` asks.
 const EVERY: Duration = Duration::from_secs(2);

@@ -9,8 +9,8 @@ use rand::Rng;
 use rand::seq::index::sample;
 
 use crate::checkpoint::Name;
-use crate::minibatches::tasks_of_unrolls;
-use crate::trainer::{Trainer, Wait};
+use crate::train::minibatches::tasks_of_unrolls;
+use crate::train::trainer::{Trainer, Wait};
 use crate::vmpo::{Losses, MinibatchTensors};
 
 /// Which unrolls of a batch demonstrate something; the others are masked.

@@ -267,11 +267,11 @@ mod tests {
     #[test]
     fn the_metrics_count_every_tasks_steps_and_padding() {
         let (spec, run) = (spec(), tempfile::tempdir().unwrap());
-        let mut metrics = crate::metrics::Metrics::open(run.path(), &spec).unwrap();
-        let rows = |environment_steps, padding| crate::metrics::Rows { rows: 3, environment_steps, padding };
+        let mut metrics = crate::observe::metrics::Metrics::open(run.path(), &spec).unwrap();
+        let rows = |environment_steps, padding| crate::observe::metrics::Rows { rows: 3, environment_steps, padding };
         assert_eq!(metrics.count_rows(&batch(&spec), &[0, 1]), [rows(3, 0), rows(1, 1)]);
         let position =
-            crate::metrics::Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
+            crate::observe::metrics::Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
         let mut books = comic_replay::BooksByTask::default();
         books.tasks.insert("get-up".into(), comic_replay::TaskBooks { trained: 7, ..Default::default() });
         let line = metrics.write(position, books, serde_json::Map::new());

@@ -7,8 +7,8 @@ use comic_experiment::Experiment;
 use comic_networks::export::{Exported, Part, Source};
 
 use crate::checkpoint::{self, Snapshot};
-use crate::options::Misuse;
-use crate::trainer::Progress;
+use crate::error::Misuse;
+use crate::train::trainer::Progress;
 
 /// What the file's extension says it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -18,7 +18,7 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::{Metric, Registry};
 
-use crate::metrics::Rows;
+use crate::observe::metrics::Rows;
 
 /// One label and its value.
 type Label = [(&'static str, &'static str); 1];

@@ -6,7 +6,7 @@ use comic_proto::Field;
 use comic_replay::Batch;
 use rand::seq::SliceRandom as _;
 
-use crate::trainer::Trainer;
+use crate::train::trainer::Trainer;
 use crate::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors};
 
 /// The task of each unroll: that of its clips.

@@ -9,7 +9,7 @@ use std::thread::JoinHandle;
 use anyhow::{Context as _, Result, anyhow};
 
 use crate::checkpoint::{Evaluated, Judgement, Name, Snapshot, Store};
-use crate::telemetry::Telemetry;
+use crate::observe::telemetry::Telemetry;
 
 /// What the thread is asked to do.
 #[derive(Debug)]

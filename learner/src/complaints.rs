@@ -2,10 +2,9 @@
 
 use std::collections::HashMap;
 use std::hash::Hash;
-use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use super::lock;
+use parking_lot::Mutex;
 
 /// Silence after a complaint about a peer.
 const QUIET: Duration = Duration::from_secs(60);
@@ -31,7 +30,7 @@ impl<K: Eq + Hash> Complaints<K> {
     }
 
     fn due_at(&self, peer: K, now: Instant) -> Option<u64> {
-        let mut peers = lock(&self.peers);
+        let mut peers = self.peers.lock();
         if let Some((last, unreported)) = peers.get_mut(&peer) {
             if now.duration_since(*last) < QUIET {
                 *unreported += 1;
@@ -70,7 +69,7 @@ mod tests {
         for peer in 0..5000 {
             complaints.due_at(peer, start);
         }
-        assert_eq!(lock(&complaints.peers).len(), REMEMBERED);
+        assert_eq!(complaints.peers.lock().len(), REMEMBERED);
         assert_eq!(complaints.due_at(5000, start), None);
         assert_eq!(complaints.due_at(5000, start + QUIET), Some(0));
     }

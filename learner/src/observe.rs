@@ -1,0 +1,6 @@
+//! What people and Prometheus see of a run.
+
+pub mod metrics;
+pub mod probes;
+pub mod telemetry;
+mod tensorboard;
