@@ -209,7 +209,7 @@ impl Update {
         milliseconds(|| {
             let losses = learner.step(minibatch)?;
             backend.end_step()?;
-            Ok::<_, anyhow::Error>(losses.to_metrics())
+            Ok::<_, anyhow::Error>(losses.to_values())
         })
     }
 }

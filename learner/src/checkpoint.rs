@@ -129,7 +129,7 @@ impl Store {
     ///
     /// # Errors
     /// [`Misuse`] when the epoch file is damaged; otherwise when it cannot be read or written.
-    pub fn begin_life(&self) -> Result<u64> {
+    pub fn begin_epoch(&self) -> Result<u64> {
         let path = self.directory.join(EPOCH);
         let last = match fs::read(&path) {
             Ok(bytes) => String::from_utf8_lossy(&bytes).trim().parse::<u64>().map_err(|_| {
@@ -275,7 +275,7 @@ impl Store {
 
 /// What to say of a run whose checkpoint verifies and cannot be gone on with: the next start would find the same, unless it
 /// was the device that failed.
-pub(crate) fn unfit(run: &Path, error: anyhow::Error) -> anyhow::Error {
+pub(crate) fn incompatible(run: &Path, error: anyhow::Error) -> anyhow::Error {
     let what = format!("{} cannot be resumed", run.display());
     if error.chain().any(|cause| cause.is::<tch::TchError>()) {
         return error.context(what);
@@ -369,7 +369,7 @@ mod tests {
 
     #[test]
     fn a_device_that_fails_is_no_wrong_checkpoint() {
-        let failed = |error: anyhow::Error| unfit(Path::new("runs/a"), error.context("cannot be restored"));
+        let failed = |error: anyhow::Error| incompatible(Path::new("runs/a"), error.context("cannot be restored"));
         assert!(!failed(tch::TchError::Torch("out of memory".into()).into()).is::<Misuse>());
         assert!(!failed(crate::vmpo::Error::from(tch::TchError::Torch("out of memory".into())).into()).is::<Misuse>());
         assert!(failed(anyhow::anyhow!("the checkpoint does not fit")).is::<Misuse>());
@@ -381,7 +381,7 @@ mod tests {
         let store = Store::open(directory.path(), 1).unwrap();
         for (name, remedy) in [(EPOCH, "earlier starts"), ("run", "start the actors again")] {
             fs::write(store.directory.join(name), b"\xff\xfe1").unwrap();
-            let refused = if name == EPOCH { store.begin_life() } else { store.run() }.unwrap_err();
+            let refused = if name == EPOCH { store.begin_epoch() } else { store.run() }.unwrap_err();
             assert!(refused.is::<Misuse>() && refused.to_string().contains(remedy), "{refused:#}");
         }
     }

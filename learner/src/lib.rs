@@ -7,7 +7,7 @@
 //!   it makes of a batch. [`warm_start`] is what it does before.
 //! - [`device`] is where it computes: CPU, CUDA, XLA.
 //! - [`vmpo`] is the algorithm: losses, and the gradient step. [`adam`] is its optimiser.
-//! - `setbacks` counts gradient steps that were skipped, and leads back to the last good state.
+//! - `skipped_steps` counts gradient steps that were skipped, and leads back to the last good state.
 //! - `state` turns the trainer into a snapshot and back. [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
 //! - [`export`] makes a checkpoint's policy a file that others read.
 //! - [`metrics`] is what a person sees of learning, [`telemetry`] what Prometheus sees of the service, by way of [`probes`].
@@ -23,10 +23,10 @@ pub mod adam;
 pub mod bench;
 pub mod checkpoint;
 pub mod commands;
-mod complaints;
 pub mod device;
 pub mod error;
 pub mod load;
+mod log_limiter;
 pub mod observe;
 pub mod options;
 pub mod publish;

@@ -9,10 +9,10 @@ use comic_networks::export::Part;
 
 use crate::commands::certs::Certs;
 use crate::commands::health::Health;
-use crate::load::Load;
-use crate::service::quarantine::QuarantineOptions;
-use crate::security::{Limits, SecurityOptions};
 use crate::commands::status::Status;
+use crate::load::Load;
+use crate::security::{ConnectionLimits, SecurityOptions};
+use crate::service::quarantine::QuarantineOptions;
 
 /// Learns reusable motor skills from the experience that comic-actor processes stream to it.
 #[derive(Debug, Parser)]
@@ -38,7 +38,7 @@ pub struct Options {
     pub security: SecurityOptions,
     /// How many get in.
     #[command(flatten)]
-    pub limits: Limits,
+    pub limits: ConnectionLimits,
     /// What becomes of invalid unrolls.
     #[command(flatten)]
     pub quarantine: QuarantineOptions,

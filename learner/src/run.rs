@@ -12,18 +12,18 @@ use comic_clips::Catalogue;
 use comic_experiment::{Difference, Experiment, InitialPose, TaskSpec, Unroll};
 use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
-use comic_replay::{Batcher, Config, Ledger, Order, Phase};
+use comic_replay::{BatchOrder, Batcher, Config, Ledger, Phase};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
 
-use crate::checkpoint::{Snapshot, Store, unfit};
+use crate::checkpoint::{Snapshot, Store, incompatible};
 use crate::device::Backend;
 use crate::error::Misuse;
-use crate::options::Options;
 use crate::observe::probes;
+use crate::options::Options;
 use crate::publish::Publisher;
 use crate::security::Security;
 use crate::service::{self, Shared};
@@ -76,7 +76,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     let backend = Backend::open(&experiment.learner)?;
     let (setup, shared) = prepare(options, experiment, backend, security)?;
     let (batcher, publisher, epoch) = (setup.batcher.clone(), setup.publisher.clone(), setup.epoch);
-    let began = batcher.books().trained;
+    let began = batcher.accounting().trained;
     let mut training = start_trainer(setup)?;
     let (stop_serving, stopped) = oneshot::channel::<()>();
     let address = listener.local_addr()?;
@@ -115,7 +115,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
         && let Some(newest) = publisher.newest()
     {
         publisher.publish(newest.version, Behaviour::Leave, &Bytes::new());
-        let trained = batcher.books().trained > began;
+        let trained = batcher.accounting().trained > began;
         tokio::time::sleep(if trained { FAREWELL } else { LATE_FAREWELL }).await;
     }
     batcher.close();
@@ -123,7 +123,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     let served = serving.await;
     let ending = ending.context("the trainer's thread is gone")??;
     served.context("the server failed")??;
-    tracing::info!(books = ?batcher.books(), "{}", match ending {
+    tracing::info!(accounting = ?batcher.accounting(), "{}", match ending {
         Ending::Budget => "the budget is used up",
         Ending::Stopped => "stopped; start again with the same --run to go on",
     });
@@ -182,15 +182,15 @@ fn prepare(
     let resume = store.newest()?;
     if let Some((path, snapshot)) = &resume {
         check_same_experiment(&experiment, &spec, snapshot, options.allow_changed)
-            .map_err(|error| unfit(&options.run, error))?;
+            .map_err(|error| incompatible(&options.run, error))?;
         tracing::info!(checkpoint = %path.display(), "resuming");
     }
     let resume = resume.map(|(_, snapshot)| snapshot);
-    let epoch = store.begin_life()?;
+    let epoch = store.begin_epoch()?;
     std::fs::write(options.run.join("experiment.toml"), experiment.to_toml()?)
         .with_context(|| format!("cannot write into {}", options.run.display()))?;
     let ledger = match &resume {
-        Some(snapshot) => books(snapshot).map_err(|error| unfit(&options.run, error))?,
+        Some(snapshot) => accounting(snapshot).map_err(|error| incompatible(&options.run, error))?,
         None => Ledger::new(),
     };
     let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));
@@ -217,15 +217,17 @@ fn prepare(
 }
 
 /// What a checkpoint says of every unroll so far.
-fn books(snapshot: &Snapshot) -> Result<Ledger> {
-    let books = serde_json::from_slice(snapshot.part("books.json")?).context("books.json of the checkpoint")?;
-    Ledger::restore(&books).context("books.json of the checkpoint")
+fn accounting(snapshot: &Snapshot) -> Result<Ledger> {
+    let accounting =
+        serde_json::from_slice(snapshot.part("accounting.json")?).context("accounting.json of the checkpoint")?;
+    Ledger::restore(&accounting).context("accounting.json of the checkpoint")
 }
 
 /// How unrolls become batches.
 fn batches(unroll: &Unroll) -> Config {
     let Unroll { batch, max_staleness, ahead, lockstep, .. } = *unroll;
-    let (order, max_staleness) = if lockstep { (Order::Environment, 0) } else { (Order::Arrival, max_staleness) };
+    let (order, max_staleness) =
+        if lockstep { (BatchOrder::Environment, 0) } else { (BatchOrder::Arrival, max_staleness) };
     Config { unrolls: batch, max_staleness, ahead, order }
 }
 

@@ -3,7 +3,7 @@
 //! # Layout
 //! - `watched` reads files again when they change. [`Tls`] and [`Tokens`] are made of such files, so certificates and
 //!   tokens are renewed without a restart.
-//! - [`Limits`] is how much of the learner everybody together may take.
+//! - [`ConnectionLimits`] is how much of the learner everybody together may take.
 
 mod limits;
 mod tls;
@@ -17,7 +17,7 @@ use clap::Args;
 
 use crate::error::Misuse;
 
-pub use limits::Limits;
+pub use limits::ConnectionLimits;
 pub use tls::Tls;
 pub use tokens::Tokens;
 

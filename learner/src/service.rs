@@ -7,7 +7,7 @@
 //! - `calls` answers each call; `unrolls`, `assets`, and `broadcast` of what is [published](crate::publish) are the streams
 //!   with a life of their own. `streams` leads the two that carry bytes past tonic's codec, `messages` takes those of one
 //!   apart, as there is room for them. `status` tells how things are,
-//!   `roster` how the actors are. `shares` says which actor simulates what of a run in lockstep. `complaints` keeps the log
+//!   `roster` how the actors are. `assignments` says which actor simulates what of a run in lockstep. `log_limiter` keeps the log
 //!   readable when a peer misbehaves.
 //!
 //! Streams are pulled: nothing is read from an actor until the unroll before it has a slot in a batch, so HTTP/2 flow
@@ -15,6 +15,7 @@
 
 mod admission;
 mod assets;
+mod assignments;
 mod broadcast;
 mod calls;
 mod incoming;
@@ -22,7 +23,6 @@ pub mod memory;
 mod messages;
 pub mod quarantine;
 mod roster;
-mod shares;
 mod status;
 mod streams;
 mod unrolls;
@@ -48,19 +48,19 @@ use tonic::transport::Server;
 use tonic_health::ServingStatus;
 
 use crate::checkpoint::Evaluated;
-use crate::complaints::Complaints;
-use crate::service::memory::Ingest;
 use crate::error::Misuse;
-use crate::publish::Publisher;
-use crate::service::quarantine::{Quarantine, QuarantineOptions};
-use crate::security::{Limits, Security, Tls, Tokens};
+use crate::log_limiter::LogLimiter;
 use crate::observe::telemetry::Telemetry;
+use crate::publish::Publisher;
+use crate::security::{ConnectionLimits, Security, Tls, Tokens};
+use crate::service::memory::Ingest;
+use crate::service::quarantine::{Quarantine, QuarantineOptions};
 use admission::Admission;
+use assignments::Assignments;
 use calls::Calls;
-use incoming::Door;
+use incoming::Acceptor;
 use messages::Room;
 use roster::Roster;
-use shares::Shares;
 use streams::Streams;
 
 /// A peer that answers no ping for [`KEEPALIVE_TIMEOUT`] is gone; without pings a half-open one is never noticed. Thirty
@@ -100,7 +100,7 @@ pub struct Setup {
     /// Who gets in.
     pub security: Security,
     /// How many get in.
-    pub limits: Limits,
+    pub limits: ConnectionLimits,
     /// The resolved experiment, handed to every actor.
     pub experiment: Experiment,
     /// The task's sizes and names, handed to every actor.
@@ -152,7 +152,7 @@ pub struct Shared {
     publisher: Publisher,
     metrics: Mutex<String>,
     evaluations: Mutex<VecDeque<Evaluation>>,
-    complaints: Complaints<u64>,
+    log_limiter: LogLimiter<u64>,
     /// The experiment's name.
     name: String,
     run: PathBuf,
@@ -162,7 +162,7 @@ pub struct Shared {
     capacity: u64,
     tls: Option<Arc<Tls>>,
     tokens: Option<Arc<Tokens>>,
-    limits: Limits,
+    limits: ConnectionLimits,
     message_limit: usize,
     /// Bytes unread on a stream.
     window: u32,
@@ -170,7 +170,7 @@ pub struct Shared {
     roster: Arc<Roster>,
     quarantine: Option<Quarantine>,
     /// Of a run in lockstep.
-    shares: Option<Shares>,
+    assignments: Option<Assignments>,
     /// Of an actor whose command line says nothing else: threads, and environments of each.
     actor: (u64, u64),
     pub(crate) telemetry: Arc<Telemetry>,
@@ -218,7 +218,7 @@ impl Shared {
             window: limits.max_unread_bytes.unwrap_or_else(|| window(batcher.layout())),
             room: Room::new(limits.max_ingest_bytes, telemetry.unrolls_late.clone()),
             roster: Arc::new(Roster::new(limits.max_actors)),
-            shares: experiment.unroll.lockstep.then(|| Shares::new(experiment.unroll.batch)),
+            assignments: experiment.unroll.lockstep.then(|| Assignments::new(experiment.unroll.batch)),
             actor: (experiment.actor.threads as u64, experiment.actor.environments as u64),
             limits,
             quarantine: Quarantine::start(&quarantine, &telemetry)?,
@@ -232,7 +232,7 @@ impl Shared {
             publisher,
             metrics: Mutex::new(String::from("{}")),
             evaluations: Mutex::new(VecDeque::new()),
-            complaints: Complaints::default(),
+            log_limiter: LogLimiter::default(),
             draining: watch::Sender::new(false),
             closing: watch::Sender::new(false),
         }))
@@ -353,7 +353,7 @@ pub async fn serve(listener: TcpListener, shared: Arc<Shared>, shutdown: impl Fu
         .context("the protocol's descriptors are damaged")?;
     let telemetry = &shared.telemetry;
     let admission = Admission::new(shared.tokens.clone(), shared.limits.max_requests, telemetry.clone());
-    let door = Door::new(shared.tls.clone(), &shared.limits, telemetry.clone());
+    let door = Acceptor::new(shared.tls.clone(), &shared.limits, telemetry.clone());
     let mut closing = shared.closing();
     let server = server(shared.window)
         .layer(admission)

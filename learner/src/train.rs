@@ -1,7 +1,7 @@
 //! Training: one OS thread that owns the device. Batches in, gradient steps, parameters out.
 
 mod minibatches;
-mod setbacks;
+mod skipped_steps;
 mod state;
 pub mod statistics;
 pub mod trainer;

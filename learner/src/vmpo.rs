@@ -6,7 +6,7 @@
 //! - [`policy_improvement`]: L_π, L_η and L_α from log-probabilities, advantages and the two KLs.
 //! - [`Multipliers`]: η, α_μ and α_Σ.
 //! - [`VmpoLearner`]: networks, multipliers and Adam; one gradient step at a time.
-//! - [`Losses`] and [`Metrics`]: what a step reports, read from the device once.
+//! - [`Losses`] and [`LossValues`]: what a step reports, read from the device once.
 //!
 //! Everything is float32 and of static shape: masks instead of selections, so that a compiler of tensor programs
 //! meets one shape only.
@@ -14,16 +14,16 @@
 mod error;
 mod improvement;
 mod learner;
-mod metrics;
+mod losses;
 mod minibatch;
 mod multipliers;
 mod returns;
 mod stores;
 
 pub use error::Error;
-pub use improvement::{Evidence, Improvement, Limits, masked_mean, policy_improvement};
+pub use improvement::{Evidence, Improvement, KlLimits, masked_mean, policy_improvement};
 pub use learner::VmpoLearner;
-pub use metrics::{Losses, Metrics};
+pub use losses::{LossValues, Losses};
 pub use minibatch::{MinibatchShape, MinibatchSource, MinibatchTensors};
 pub use multipliers::{MULTIPLIER_FLOOR, Multipliers};
 pub use returns::returns;

@@ -58,7 +58,7 @@ fn step(learner: &mut VmpoLearner, unrolls: &Unrolls) -> Metrics {
     if learner.device() != Device::Cpu {
         backend().end_step().unwrap();
     }
-    Losses::mean(&losses).unwrap().to_metrics()
+    Losses::mean(&losses).unwrap().to_values()
 }
 
 /// The largest difference of what the two learners hold under names that begin so, relative to the largest number of the
@@ -187,7 +187,7 @@ fn a_warm_start_compiles_nothing_twice_whatever_is_demonstrated() {
             let (losses, latents) = learner.regress(&demonstrations.select(&order)).unwrap();
             demonstrations.refresh_previous_latent(&order, &latents);
             backend().end_step().unwrap();
-            assert!(Losses::mean(&[losses]).unwrap().to_metrics().is_finite(), "{name}");
+            assert!(Losses::mean(&[losses]).unwrap().to_values().is_finite(), "{name}");
         }
         assert_eq!(backend().compilations().unwrap(), after_warm_up, "{name}: compiled after the warm-up");
     }

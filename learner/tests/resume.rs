@@ -11,13 +11,13 @@ use comic_experiment::{Experiment, TaskSpec, resolve};
 use comic_learner::checkpoint::{Snapshot, Store, find, read};
 use comic_learner::device::Backend;
 use comic_learner::publish::{Published, Publisher};
-use comic_learner::service::quarantine::QuarantineOptions;
 use comic_learner::security::{Limits, Security};
+use comic_learner::service::quarantine::QuarantineOptions;
 use comic_learner::service::{self, Evaluation, Shared};
 use comic_learner::train::trainer::{Ending, Setup, Trainer};
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
-use comic_replay::{Batcher, Config, Ledger, Order, Outcome, Phase};
+use comic_replay::{BatchOrder, Batcher, Config, Ledger, Outcome, Phase};
 use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 
@@ -111,7 +111,7 @@ struct Life {
     telemetry: String,
 }
 
-/// One life of the learner, fed with the recording from where its books say up to `unrolls`, altered.
+/// One life of the learner, fed with the recording from where its accounting say up to `unrolls`, altered.
 fn live(experiment: &Experiment, run: &Path, unrolls: u64, alter: fn(u64, &mut UnrollBuffer)) -> Life {
     live_evaluated(experiment, run, unrolls, alter, &[])
 }
@@ -128,13 +128,13 @@ fn live_evaluated(
     let spec = spec(&experiment);
     let store = Store::open(run, 3).unwrap();
     let resume = store.newest().unwrap().map(|(_, snapshot)| snapshot);
-    let epoch = store.begin_life().unwrap();
+    let epoch = store.begin_epoch().unwrap();
     let ledger = resume.as_ref().map_or_else(Ledger::new, |snapshot| {
-        Ledger::restore(&serde_json::from_slice(snapshot.part("books.json").unwrap()).unwrap()).unwrap()
+        Ledger::restore(&serde_json::from_slice(snapshot.part("accounting.json").unwrap()).unwrap()).unwrap()
     });
     let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
-    let config = Config { unrolls: experiment.unroll.batch, max_staleness: 1000, ahead: 1, order: Order::Arrival };
+    let config = Config { unrolls: experiment.unroll.batch, max_staleness: 1000, ahead: 1, order: BatchOrder::Arrival };
     let batcher = Batcher::new(layout.clone(), config, Phase { epoch, ..Phase::default() }, ledger);
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {
@@ -170,7 +170,7 @@ fn live_evaluated(
                     other => panic!("{other:?}"),
                 }
                 // Batch by batch, so that none waits while the trainer changes the terms.
-                while (sequence + 1) % batch == 0 && batcher.books().in_flight > 0 && !batcher.is_closed() {
+                while (sequence + 1) % batch == 0 && batcher.accounting().in_flight > 0 && !batcher.is_closed() {
                     std::thread::yield_now();
                 }
             }
@@ -194,7 +194,7 @@ fn live_evaluated(
     Life { ended, published: publisher.newest().unwrap(), telemetry: shared.metrics_page() }
 }
 
-/// So many updates of a preset, with exactly the unrolls they need, so that the books are the same whoever feeds; the
+/// So many updates of a preset, with exactly the unrolls they need, so that the accounting are the same whoever feeds; the
 /// last checkpoint.
 fn trained(preset: &str, run: &Path, updates: u64) -> Snapshot {
     let experiment = experiment(preset, updates);

@@ -9,7 +9,7 @@
 use std::path::{Path, PathBuf};
 
 use comic_experiment::Prior;
-use comic_learner::vmpo::{Evidence, Limits, Multipliers, policy_improvement, returns};
+use comic_learner::vmpo::{Evidence, KlLimits, Multipliers, policy_improvement, returns};
 use comic_networks::{ActionDistribution, DiagonalGaussian};
 use npyz::npz::NpzArchive;
 use tch::{Device, Kind, Tensor};
@@ -91,7 +91,7 @@ fn losses_and_gradients_equal_rlax() {
         let [temperature, alpha_mean, alpha_std] =
             ["temperature", "alpha_mean", "alpha_std"].map(|name| fixture.scalar(name) as f32);
         let multipliers = Multipliers::new(&[temperature], &[alpha_mean, alpha_std], Device::Cpu);
-        let limits = Limits {
+        let limits = KlLimits {
             epsilon_eta: fixture.scalar("epsilon_eta"),
             epsilon_mean: fixture.scalar("epsilon_mean"),
             epsilon_std: fixture.scalar("epsilon_std"),

@@ -20,7 +20,7 @@ fn kl_to_an_unchanged_policy_is_exactly_zero_with_equal_batch_shapes() {
     let mut learner = learner(&experiment(), 1);
     let mut unrolls = unrolls(2);
     unrolls.behave(&learner, UNROLLS * LENGTH);
-    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_metrics();
+    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_values();
     // Rows that are no transition are blanked to another distribution, and still do not count.
     assert_eq!((metrics.kl_mean, metrics.kl_std), (0.0, 0.0));
 }
@@ -30,7 +30,7 @@ fn kl_to_an_unchanged_policy_is_zero_to_1e_6_with_other_batch_shapes() {
     let mut learner = learner(&experiment(), 1);
     let mut unrolls = unrolls(2);
     unrolls.behave(&learner, 5);
-    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_metrics();
+    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_values();
     assert!(metrics.kl_mean.abs() < 1e-6 && metrics.kl_std.abs() < 1e-6, "{metrics:?}");
 }
 
@@ -41,7 +41,7 @@ fn a_changed_policy_has_a_kl() {
     unrolls.behave(&learner, UNROLLS * LENGTH);
     let minibatch = unrolls.minibatch();
     learner.step(&minibatch).unwrap();
-    let metrics = learner.step(&minibatch).unwrap().to_metrics();
+    let metrics = learner.step(&minibatch).unwrap().to_values();
     assert!(metrics.kl_mean > 0.0 && metrics.kl_std > 0.0, "{metrics:?}");
 }
 
@@ -123,7 +123,7 @@ fn a_batch_without_a_transition_is_survived() {
     let mut learner = learner(&experiment(), 1);
     let mut unrolls = unrolls(6);
     unrolls.valid.fill(0.0);
-    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_metrics();
+    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_values();
     assert!(metrics.is_finite(), "{metrics:?}");
     assert!(state(&learner).iter().all(|(_, values)| values.iter().all(|value| value.is_finite())));
 }
@@ -135,7 +135,7 @@ fn a_clipped_action_would_be_scored_differently() {
     let loss = |size: f32| {
         let mut unrolls = base.clone();
         unrolls.action.fill(size);
-        learner(&experiment(), 1).step(&unrolls.minibatch()).unwrap().to_metrics().policy_loss
+        learner(&experiment(), 1).step(&unrolls.minibatch()).unwrap().to_values().policy_loss
     };
     assert!(loss(3.0) > loss(1.0) + 1.0);
 }
@@ -173,9 +173,9 @@ fn the_report_of_several_steps_is_their_mean() {
     let minibatch = unrolls(10).minibatch();
     let mut learner = learner(&experiment(), 1);
     let steps: Vec<Losses> = (0..3).map(|_| learner.step(&minibatch).unwrap()).collect();
-    let mean = Losses::mean(&steps).unwrap().to_metrics().entries();
+    let mean = Losses::mean(&steps).unwrap().to_values().entries();
     for (index, (name, value)) in mean.into_iter().enumerate() {
-        let expected = steps.iter().map(|step| step.to_metrics().entries()[index].1).sum::<f32>() / 3.0;
+        let expected = steps.iter().map(|step| step.to_values().entries()[index].1).sum::<f32>() / 3.0;
         assert!((value - expected).abs() <= 1e-5 * expected.abs().max(1.0), "{name}");
     }
     assert!(Losses::mean(&[]).is_none());
@@ -189,7 +189,7 @@ fn gradients_are_clipped_only_when_asked() {
         experiment.optimiser.max_gradient_norm = limit;
         let mut learner = learner(&experiment, 1);
         let before = values(&learner.policy_store().variables()["encoder.tracking.head.weight"].detach().copy());
-        let norm = f64::from(learner.step(&minibatch).unwrap().to_metrics().gradient_norm);
+        let norm = f64::from(learner.step(&minibatch).unwrap().to_values().gradient_norm);
         let after = values(&learner.policy_store().variables()["encoder.tracking.head.weight"].detach());
         (norm, before.iter().zip(after).map(|(before, after)| (before - after).abs()).fold(0.0, f32::max))
     };
@@ -222,7 +222,7 @@ proptest! {
         unrolls.behave(&learner, UNROLLS * LENGTH);
         let minibatch = unrolls.minibatch();
         for _ in 0..4 {
-            prop_assert!(learner.step(&minibatch).unwrap().to_metrics().is_finite());
+            prop_assert!(learner.step(&minibatch).unwrap().to_values().is_finite());
             let multipliers = values(&learner.multipliers().parameter().detach());
             prop_assert!(multipliers.iter().all(|value| *value >= MULTIPLIER_FLOOR as f32), "{multipliers:?}");
         }

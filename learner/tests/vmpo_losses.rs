@@ -2,12 +2,12 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
-use comic_learner::vmpo::{Evidence, Improvement, Limits, Multipliers, masked_mean, policy_improvement};
+use comic_learner::vmpo::{Evidence, Improvement, KlLimits, Multipliers, masked_mean, policy_improvement};
 use proptest::prelude::*;
 use tch::{Device, Kind, Tensor};
 
-const LIMITS: Limits =
-    Limits { epsilon_eta: 0.1, epsilon_mean: 0.2, epsilon_std: 0.3, epsilon_discrete: 0.4, top_fraction: 0.5 };
+const LIMITS: KlLimits =
+    KlLimits { epsilon_eta: 0.1, epsilon_mean: 0.2, epsilon_std: 0.3, epsilon_discrete: 0.4, top_fraction: 0.5 };
 
 /// Four steps, all valid unless said otherwise, whose every tensor can be differentiated.
 struct Case {

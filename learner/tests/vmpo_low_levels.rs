@@ -120,7 +120,7 @@ fn acting_step_by_step_is_acting_on_the_whole_unroll() {
 fn what_acted_is_what_is_learnt_from() {
     for (name, experiment) in every_low_level() {
         let mut learner = learner(&experiment, 1);
-        let metrics = learner.step(&minibatch(&learner, &experiment, 2)).unwrap().to_metrics();
+        let metrics = learner.step(&minibatch(&learner, &experiment, 2)).unwrap().to_values();
         // Nothing has changed since the policy acted: a limit of 0 on every part of its distribution.
         for kl in [metrics.kl_mean, metrics.kl_std, metrics.kl_weights] {
             assert!(kl.abs() < 1e-5, "{name}: {metrics:?}");
@@ -134,7 +134,7 @@ fn a_wrong_memory_is_noticed() {
     let mut learner = learner(&experiment, 1);
     let mut unrolls = unrolls(&learner, &experiment, 2);
     unrolls.state.iter_mut().for_each(|number| *number = -*number);
-    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_metrics();
+    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_values();
     assert!(metrics.kl_mean > 1e-5, "{metrics:?}");
 }
 
@@ -145,7 +145,7 @@ fn a_changed_policy_has_a_kl_in_every_part_and_multipliers_that_move() {
         let minibatch = minibatch(&learner, &experiment, 2);
         let before = learner.multipliers().parameter().copy();
         learner.step(&minibatch).unwrap();
-        let metrics = learner.step(&minibatch).unwrap().to_metrics();
+        let metrics = learner.step(&minibatch).unwrap().to_values();
         assert!(metrics.kl_mean > 0.0 && metrics.kl_std > 0.0, "{name}: {metrics:?}");
         let mixture = name.starts_with("mixture");
         assert_eq!(metrics.kl_weights > 0.0, mixture, "{name}: {metrics:?}");
@@ -287,7 +287,7 @@ fn a_warm_start_makes_whatever_acts_aim_at_the_demonstration() {
         };
         let before = target(&learner);
         let losses: Vec<f32> =
-            (0..150).map(|_| learner.regress(&minibatch).unwrap().0.to_metrics().regression_loss).collect();
+            (0..150).map(|_| learner.regress(&minibatch).unwrap().0.to_values().regression_loss).collect();
         assert!(losses[149] < 0.5 * losses[0], "{name}: {} to {}", losses[0], losses[149]);
         // Fixed biases set a mixture's components apart; regression brings each of them to the demonstration.
         assert!(!name.starts_with("mixture") || target(&learner) < 0.7 * before, "{name}: {before}");

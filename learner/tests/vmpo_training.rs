@@ -36,7 +36,7 @@ fn a_restored_learner_goes_on_bit_for_bit() {
     restored.load_state(&saved).unwrap();
     for seed in 3..6 {
         let (left, right) = (original.step(&unrolls(seed).minibatch()), restored.step(&unrolls(seed).minibatch()));
-        assert_eq!(left.unwrap().to_metrics(), right.unwrap().to_metrics());
+        assert_eq!(left.unwrap().to_values(), right.unwrap().to_values());
     }
     assert_eq!(state(&restored), state(&original));
 }
@@ -108,10 +108,10 @@ fn a_step_that_is_not_finite_changes_not_one_bit_and_is_reported() {
         let mut learner = learner(&training(), 1);
         (0..taken_before).for_each(|seed| drop(learner.step(&unrolls(seed).minibatch()).unwrap()));
         let before = bits(&learner);
-        let report = learner.step(&poisoned(9).minibatch()).unwrap().to_metrics();
+        let report = learner.step(&poisoned(9).minibatch()).unwrap().to_values();
         assert_eq!((report.steps, report.skipped, report.skipped_last), (1, 1, 1), "{report:?}");
         let (report, latents) = learner.regress(&poisoned(9).minibatch()).unwrap();
-        assert_eq!(report.to_metrics().skipped, 1);
+        assert_eq!(report.to_values().skipped, 1);
         assert!(values(&latents).iter().all(|value| value.is_finite()));
         assert_eq!(bits(&learner), before);
         assert!(learner.is_finite());
@@ -124,7 +124,7 @@ fn what_was_skipped_leaves_no_trace_in_the_steps_after_it() {
     for seed in 0..4 {
         let _ = struck.step(&poisoned(seed).minibatch()).unwrap();
         let (left, right) = (spared.step(&unrolls(seed).minibatch()), struck.step(&unrolls(seed).minibatch()));
-        assert_eq!(left.unwrap().to_metrics(), right.unwrap().to_metrics());
+        assert_eq!(left.unwrap().to_values(), right.unwrap().to_values());
     }
     assert_eq!(bits(&spared), bits(&struck));
 }
@@ -137,12 +137,12 @@ fn a_mean_is_over_the_steps_that_were_taken_and_counts_the_others() {
         of.iter().map(|minibatch| learner.step(minibatch).unwrap()).collect()
     };
     let mixed = steps(&[&bad, &good, &bad, &good, &bad, &bad]);
-    let mean = Losses::mean(&mixed).unwrap().to_metrics();
+    let mean = Losses::mean(&mixed).unwrap().to_values();
     assert_eq!((mean.steps, mean.skipped, mean.skipped_last), (6, 4, 2));
-    let taken = [1, 3].map(|step| mixed[step].to_metrics().total_loss);
+    let taken = [1, 3].map(|step| mixed[step].to_values().total_loss);
     assert_eq!(mean.total_loss, f32::midpoint(taken[0], taken[1]));
     assert!(mean.is_finite());
-    let none = Losses::mean(&steps(&[&bad, &bad])).unwrap().to_metrics();
+    let none = Losses::mean(&steps(&[&bad, &bad])).unwrap().to_values();
     assert_eq!((none.steps, none.skipped, none.skipped_last), (2, 2, 2));
     assert!(!none.is_finite());
 }
@@ -153,7 +153,7 @@ fn parameters_that_are_lost_are_noticed() {
     experiment.optimiser.learning_rate = 1e38;
     let mut learner = learner(&experiment, 1);
     assert!(learner.is_finite());
-    let report = learner.step(&unrolls(1).minibatch()).unwrap().to_metrics();
+    let report = learner.step(&unrolls(1).minibatch()).unwrap().to_values();
     assert_eq!(report.skipped, 0, "the step itself is one of finite numbers");
     assert!(!learner.is_finite());
 }
@@ -190,7 +190,7 @@ fn rewarded_actions_become_likelier() {
         let (unrolls, _) = reach(&learner, seed);
         let minibatch = unrolls.minibatch();
         for _ in 0..4 {
-            assert!(learner.step(&minibatch).unwrap().to_metrics().is_finite());
+            assert!(learner.step(&minibatch).unwrap().to_values().is_finite());
         }
     }
     let (_, after) = reach(&learner, 0);
@@ -202,11 +202,11 @@ fn rewarded_actions_become_likelier() {
 fn the_value_function_learns_its_targets() {
     let mut learner = learner(&training(), 1);
     let minibatch = unrolls(1).minibatch();
-    let first = learner.step(&minibatch).unwrap().to_metrics();
+    let first = learner.step(&minibatch).unwrap().to_values();
     for _ in 0..300 {
         learner.step(&minibatch).unwrap();
     }
-    let last = learner.step(&minibatch).unwrap().to_metrics();
+    let last = learner.step(&minibatch).unwrap().to_values();
     assert!(last.value_loss < 0.2 * first.value_loss, "{first:?} {last:?}");
     assert!(last.variance_explained > 0.6 && last.variance_explained <= 1.0, "{last:?}");
 }
@@ -220,11 +220,11 @@ fn a_warm_start_moves_the_mean_to_the_demonstrations_and_leaves_deviation_and_mu
     let head = |learner: &VmpoLearner| values(&learner.policy_store().variables()["low_level.head.weight"].detach());
     let multipliers = |learner: &VmpoLearner| values(&learner.multipliers().parameter().detach());
     let (head_before, multipliers_before) = (head(&learner), multipliers(&learner));
-    let first = learner.regress(&minibatch).unwrap().0.to_metrics();
+    let first = learner.regress(&minibatch).unwrap().0.to_values();
     for _ in 0..200 {
         let _ = learner.regress(&minibatch).unwrap();
     }
-    let last = learner.regress(&minibatch).unwrap().0.to_metrics();
+    let last = learner.regress(&minibatch).unwrap().0.to_values();
     assert!(last.regression_loss < 0.05 * first.regression_loss, "{first:?} {last:?}");
     assert!(last.value_loss < first.value_loss);
     let half = head_before.len() / 2;
@@ -254,7 +254,7 @@ fn a_masked_unroll_teaches_a_warm_start_as_little_as_one_that_is_not_there() {
     masked.valid[3 * LENGTH..4 * LENGTH].fill(0.0);
     let others: Vec<usize> = (0..UNROLLS).filter(|unroll| *unroll != 3).collect();
     let regressed = |minibatch: &MinibatchTensors| {
-        let losses = learner(&training(), 1).regress(minibatch).unwrap().0.to_metrics();
+        let losses = learner(&training(), 1).regress(minibatch).unwrap().0.to_values();
         [losses.regression_loss, losses.value_loss, losses.latent_kl, losses.total_loss, losses.gradient_norm]
     };
     let (masked, absent) = (regressed(&masked.minibatch()), regressed(&all.minibatch().select(&others)));

@@ -6,7 +6,7 @@ use crate::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
 use crate::{Field, Pieces, UnrollLayout};
 
 /// Sequence numbers lie below this. At a thousand unrolls a second an actor reaches it after thirty years; a larger
-/// one is a broken header, and one such number taken seriously would spoil the books.
+/// one is a broken header, and one such number taken seriously would spoil the accounting.
 pub const MAX_SEQUENCE: u64 = 1 << 40;
 
 /// What the learner knows at this moment and a header has to agree with.

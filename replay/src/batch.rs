@@ -195,7 +195,7 @@ impl Batch {
         self.buffer.as_ref().map_or(&[], |buffer| &buffer.headers)
     }
 
-    /// Ends its life in the books: trained on, or dropped for a reason.
+    /// Ends its life in the accounting: trained on, or dropped for a reason.
     pub(crate) fn finish(mut self, end: Option<Reason>) {
         self.give_back(end);
     }

@@ -9,9 +9,9 @@ use comic_proto::{Field, Pieces, UnrollLayout};
 use tokio::sync::Semaphore;
 
 use crate::batch::{Batch, Buffer};
-use crate::ledger::{Books, JoinError, Joined, Ledger, Reason, Sighting};
+use crate::ledger::{Accounting, JoinError, Joined, Ledger, Reason, Sighting};
 use crate::snapshot::Snapshot;
-use crate::tasks::BooksByTask;
+use crate::tasks::AccountingByTask;
 
 /// What does not change while a batcher lives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -24,12 +24,12 @@ pub struct Config {
     /// fresh as can be; with 1 the next batch is ready when the trainer is.
     pub ahead: usize,
     /// In which order unrolls stand in a batch.
-    pub order: Order,
+    pub order: BatchOrder,
 }
 
 /// Which slot of a batch an unroll takes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Order {
+pub enum BatchOrder {
     /// The next one: first come, first served.
     Arrival,
     /// That of its environment's number. A batch has one unroll of each of B environments, and no order of arrival can
@@ -109,10 +109,10 @@ pub struct Batcher {
 }
 
 impl Batcher {
-    /// An empty batcher that carries on these books.
+    /// An empty batcher that carries on these accounting.
     pub fn new(layout: Arc<UnrollLayout>, config: Config, phase: Phase, ledger: Ledger) -> Self {
         // An environment's next unroll is of the next batch, which has to wait.
-        let ahead = if config.order == Order::Environment { 0 } else { config.ahead };
+        let ahead = if config.order == BatchOrder::Environment { 0 } else { config.ahead };
         let config = Config { unrolls: config.unrolls.max(1), ahead, ..config };
         let mut free: Vec<_> = (0..=config.ahead).map(|_| Buffer::new(&layout, config.unrolls)).collect();
         let open = free.pop();
@@ -152,8 +152,8 @@ impl Batcher {
         let unfilled = [next, open].into_iter().flatten().find(|batch| !batch.is_full());
         let Some(batch) = unfilled else { return Outcome::Closed };
         let place = match self.inner.config.order {
-            Order::Arrival => batch.first_free(),
-            Order::Environment => header.environment as usize,
+            BatchOrder::Arrival => batch.first_free(),
+            BatchOrder::Environment => header.environment as usize,
         };
         if !ledger.record(header.actor, header.sequence, first_clip(&self.inner.layout, &payload)) {
             ledger.refuse();
@@ -234,28 +234,28 @@ impl Batcher {
         }
     }
 
-    /// Books a batch as trained on and takes its memory back.
+    /// Accounting a batch as trained on and takes its memory back.
     pub fn trained(&self, batch: Batch) {
         batch.finish(None);
     }
 
-    /// Books a batch as dropped for this reason and takes its memory back.
+    /// Accounting a batch as dropped for this reason and takes its memory back.
     pub fn discard(&self, batch: Batch, reason: Reason) {
         batch.finish(Some(reason));
     }
 
-    /// The books at this moment.
-    pub fn books(&self) -> Books {
-        self.books_by_task().all
+    /// The accounting at this moment.
+    pub fn accounting(&self) -> Accounting {
+        self.accounting_by_task().all
     }
 
-    /// The books at this moment, and each task's.
-    pub fn books_by_task(&self) -> BooksByTask {
+    /// The accounting at this moment, and each task's.
+    pub fn accounting_by_task(&self) -> AccountingByTask {
         let state = self.lock();
-        state.ledger.books(state.waiting())
+        state.ledger.accounting(state.waiting())
     }
 
-    /// Books and accounts for a checkpoint.
+    /// Accounting and accounts for a checkpoint.
     pub fn snapshot(&self) -> Snapshot {
         let state = self.lock();
         state.ledger.snapshot(state.waiting())
@@ -288,7 +288,7 @@ impl Batcher {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        // Nothing in here panics half-way through a change; a poisoned lock means a bug elsewhere, not broken books.
+        // Nothing in here panics half-way through a change; a poisoned lock means a bug elsewhere, not broken accounting.
         self.inner.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -346,7 +346,7 @@ impl Batcher {
 
     /// Whether there can be a slot for an unroll of this environment.
     fn has_room_for(&self, state: &State, header: &UnrollHeader) -> bool {
-        let Order::Environment = self.inner.config.order else { return true };
+        let BatchOrder::Environment = self.inner.config.order else { return true };
         let environment = header.environment as usize;
         let waiting = [&state.next, &state.open].into_iter().flatten();
         environment < self.inner.config.unrolls
@@ -419,6 +419,6 @@ fn drop_unroll(ledger: &mut Ledger, header: &UnrollHeader, clip: Option<u32>, re
 
 impl fmt::Debug for Batcher {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.debug_struct("Batcher").field("books", &self.books()).finish_non_exhaustive()
+        formatter.debug_struct("Batcher").field("accounting", &self.accounting()).finish_non_exhaustive()
     }
 }

@@ -6,12 +6,12 @@ use comic_proto::MAX_SEQUENCE;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::tasks::{BooksByTask, TaskBooks, Tasks};
+use crate::tasks::{AccountingByTask, TaskAccounting, Tasks};
 
 /// Sums over every unroll ever produced for this run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Books {
+pub struct Accounting {
     /// Unrolls the sequence numbers speak of.
     pub produced: u64,
     /// Unrolls trained on.
@@ -26,7 +26,7 @@ pub struct Books {
     pub unattributed: u64,
 }
 
-impl Books {
+impl Accounting {
     /// Whether `produced = trained + dropped + in flight`.
     pub fn balance(&self) -> bool {
         self.dropped.add_to([self.trained, self.in_flight]) == Some(self.produced)
@@ -138,10 +138,10 @@ pub struct Ledger {
     pub(crate) clock: u64,
     capacity: usize,
     /// In flight is what the trainer holds; what waits for it is counted in the batcher's buffers.
-    pub(crate) sums: Books,
+    pub(crate) sums: Accounting,
     tasks: Tasks,
-    /// The books of tasks that this life does not have, for one that does.
-    pub(crate) others: BTreeMap<String, TaskBooks>,
+    /// The accounting of tasks that this life does not have, for one that does.
+    pub(crate) others: BTreeMap<String, TaskAccounting>,
 }
 
 impl Default for Ledger {
@@ -167,13 +167,13 @@ impl Ledger {
             next_actor: 0,
             clock: 0,
             capacity: capacity.max(1),
-            sums: Books::default(),
+            sums: Accounting::default(),
             tasks: Tasks::default(),
             others: BTreeMap::new(),
         }
     }
 
-    /// Keeps books of each of these tasks too: name, and number of clips, which are counted through all tasks. A restored
+    /// Keeps accounting of each of these tasks too: name, and number of clips, which are counted through all tasks. A restored
     /// ledger goes on with those of the same name.
     #[must_use]
     pub fn with_tasks(mut self, tasks: impl IntoIterator<Item = (String, usize)>) -> Self {
@@ -260,8 +260,8 @@ impl Ledger {
         entry.next_sequence = sequence + 1;
         self.sums.produced = produced;
         self.sums.dropped.count(Reason::LostAtRestart, skipped);
-        if let Some(books) = clip.and_then(|clip| self.tasks.of(clip)) {
-            books.produced += 1;
+        if let Some(accounting) = clip.and_then(|clip| self.tasks.of(clip)) {
+            accounting.produced += 1;
         }
         true
     }
@@ -280,39 +280,39 @@ impl Ledger {
     pub(crate) fn hand_out(&mut self, clips: impl Iterator<Item = u32>) {
         for clip in clips {
             self.sums.in_flight += 1;
-            self.tasks.of(clip).into_iter().for_each(|books| books.in_flight += 1);
+            self.tasks.of(clip).into_iter().for_each(|accounting| accounting.in_flight += 1);
         }
     }
 
-    /// Books one that was handed out as trained on, or as dropped for a reason.
+    /// Accounting one that was handed out as trained on, or as dropped for a reason.
     pub(crate) fn take_back(&mut self, clip: u32, end: Option<Reason>) {
         self.sums.in_flight -= 1;
-        self.tasks.of(clip).into_iter().for_each(|books| books.in_flight -= 1);
+        self.tasks.of(clip).into_iter().for_each(|accounting| accounting.in_flight -= 1);
         self.end(Some(clip), end);
     }
 
-    /// Books one unroll, of this first clip, as trained on, or as dropped for a reason.
+    /// Accounting one unroll, of this first clip, as trained on, or as dropped for a reason.
     pub(crate) fn end(&mut self, clip: Option<u32>, end: Option<Reason>) {
-        let books = clip.and_then(|clip| self.tasks.of(clip));
+        let accounting = clip.and_then(|clip| self.tasks.of(clip));
         match end {
             None => {
                 self.sums.trained += 1;
-                books.into_iter().for_each(|books| books.trained += 1);
+                accounting.into_iter().for_each(|accounting| accounting.trained += 1);
             }
             Some(reason) => {
                 self.sums.dropped.count(reason, 1);
-                books.into_iter().for_each(|books| books.dropped.count(reason, 1));
+                accounting.into_iter().for_each(|accounting| accounting.dropped.count(reason, 1));
             }
         }
     }
 
-    /// The books, with unrolls of these first clips waiting for the trainer.
-    pub(crate) fn books(&self, waiting: impl Iterator<Item = u32>) -> BooksByTask {
+    /// The accounting, with unrolls of these first clips waiting for the trainer.
+    pub(crate) fn accounting(&self, waiting: impl Iterator<Item = u32>) -> AccountingByTask {
         let (mut all, mut tasks) = (self.sums, self.tasks.clone());
         for clip in waiting {
             all.in_flight += 1;
-            tasks.of(clip).into_iter().for_each(|books| books.in_flight += 1);
+            tasks.of(clip).into_iter().for_each(|accounting| accounting.in_flight += 1);
         }
-        BooksByTask { all, tasks: tasks.by_name() }
+        AccountingByTask { all, tasks: tasks.by_name() }
     }
 }

@@ -1,10 +1,10 @@
-//! From validated unrolls to batches: each trained on at most once, bounded in memory, with books that balance.
+//! From validated unrolls to batches: each trained on at most once, bounded in memory, with accounting that balance.
 //!
 //! # Layout
 //! - [`Batcher`] is the meeting point: network tasks [`insert`](Batcher::insert) unrolls, the trainer's thread takes
 //!   [`Batch`]es and gives them back with [`trained`](Batcher::trained).
 //! - [`Ledger`] knows every actor's account: which sequence number comes next, and what became of the earlier ones.
-//! - [`Books`] are the sums, [`TaskBooks`] those of one task; [`Snapshot`] is books and accounts in a checkpoint.
+//! - [`Accounting`] are the sums, [`TaskAccounting`] those of one task; [`Snapshot`] is accounting and accounts in a checkpoint.
 //!
 //! # The rules
 //! An actor process is an *incarnation*, a number it draws once. Joining opens an account, `(actor index, incarnation,
@@ -18,7 +18,7 @@
 //! 3. The unroll itself is either dropped for a reason — **invalid**; **superseded**, made in another epoch or in
 //!    another phase (demonstrations and policy are phases); **stale**, made with parameters more than `max_staleness`
 //!    published versions old — or it is copied into a slot of the open batch and is then *in flight*. Where slots are
-//!    the environments' ([`Order::Environment`]), one whose environment has no slot, or has filled it, is invalid.
+//!    the environments' ([`BatchOrder::Environment`]), one whose environment has no slot, or has filled it, is invalid.
 //! 4. An unroll in flight ends in one way: its batch is trained on, or it is dropped. A change of phase drops what waits
 //!    in the batcher as superseded. What grew too old while it waited is dropped as stale when its batch is due, and the
 //!    batch is handed out when its slots are filled again. A batch that its taker lets go of without training is lost
@@ -28,12 +28,12 @@
 //! 6. Restoring a [`Snapshot`] counts what was in flight in it as lost at restart, and leaves the accounts as they
 //!    were: an unroll numbered below the account's next sequence is never trained on again.
 //! 7. At most [`Ledger::CAPACITY`] accounts are open. One more closes the account heard of least recently: its sums
-//!    stay in the books, and its incarnation cannot come back (joining is refused, a new process gets a new account).
+//!    stay in the accounting, and its incarnation cannot come back (joining is refused, a new process gets a new account).
 //! 8. What cannot be attributed to an account is refused and counted apart, like duplicates: it is nobody's number.
 //!
 //! # Invariants
 //! - `produced = trained + dropped + in flight` whenever anyone looks; *in flight* is counted in the buffers, not
-//!   computed from the others. The same holds of every task's own books. An unroll is of the task that has its first
+//!   computed from the others. The same holds of every task's own accounting. An unroll is of the task that has its first
 //!   row's clip; one that is invalid, or of another epoch, is of no task.
 //! - Memory is [`Config::ahead`] batches and the one at the trainer, whatever the number of actors.
 //! - No unroll is in two batches, or twice in one.
@@ -46,7 +46,7 @@ mod streaming;
 mod tasks;
 
 pub use batch::Batch;
-pub use batcher::{Batcher, Config, Next, Order, Outcome, Phase};
-pub use ledger::{Books, Dropped, JoinError, Joined, Ledger, Reason};
+pub use batcher::{BatchOrder, Batcher, Config, Next, Outcome, Phase};
+pub use ledger::{Accounting, Dropped, JoinError, Joined, Ledger, Reason};
 pub use snapshot::{Account, Error, Snapshot};
-pub use tasks::{BooksByTask, TaskBooks};
+pub use tasks::{AccountingByTask, TaskAccounting};

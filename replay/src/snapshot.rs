@@ -1,4 +1,4 @@
-//! Books and accounts in a checkpoint.
+//! Accounting and accounts in a checkpoint.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -6,8 +6,8 @@ use comic_proto::MAX_SEQUENCE;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::ledger::{Books, Entry, Ledger, Reason};
-use crate::tasks::{BooksByTask, TaskBooks};
+use crate::ledger::{Accounting, Entry, Ledger, Reason};
+use crate::tasks::{AccountingByTask, TaskAccounting};
 
 /// One open account.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -26,10 +26,10 @@ pub struct Account {
 #[serde(deny_unknown_fields)]
 pub struct Snapshot {
     /// The sums, what was in flight included.
-    pub books: Books,
+    pub accounting: Accounting,
     /// The same of each task, by its name.
     #[serde(default)]
-    pub tasks: BTreeMap<String, TaskBooks>,
+    pub tasks: BTreeMap<String, TaskAccounting>,
     /// The index the next new actor gets.
     pub next_actor: u64,
     /// Open accounts, the one heard of least recently first.
@@ -41,18 +41,18 @@ pub struct Snapshot {
 #[non_exhaustive]
 pub enum Error {
     /// The law does not hold.
-    #[error("books of the checkpoint do not balance: {books:?}")]
+    #[error("accounting of the checkpoint do not balance: {accounting:?}")]
     Unbalanced {
         /// As stored.
-        books: Books,
+        accounting: Accounting,
     },
     /// The law does not hold of one task, or the tasks come to more than all.
-    #[error("books of {task} in the checkpoint do not balance: {books:?}")]
+    #[error("accounting of {task} in the checkpoint do not balance: {accounting:?}")]
     UnbalancedTask {
         /// The task's name.
         task: String,
         /// As stored.
-        books: TaskBooks,
+        accounting: TaskAccounting,
     },
     /// An index or an incarnation stands there twice, or an index that was never given out.
     #[error("account of actor {actor} in the checkpoint is repeated or out of range")]
@@ -74,9 +74,9 @@ impl Ledger {
                 next_sequence: entry.next_sequence,
             })
             .collect();
-        let BooksByTask { all: books, mut tasks } = self.books(waiting);
-        tasks.extend(self.others.iter().map(|(task, books)| (task.clone(), *books)));
-        Snapshot { books, tasks, next_actor: self.next_actor, accounts }
+        let AccountingByTask { all: accounting, mut tasks } = self.accounting(waiting);
+        tasks.extend(self.others.iter().map(|(task, accounting)| (task.clone(), *accounting)));
+        Snapshot { accounting, tasks, next_actor: self.next_actor, accounts }
     }
 
     /// The ledger a new life of the learner starts with: what was in flight at the snapshot is lost at restart.
@@ -100,27 +100,29 @@ impl Ledger {
         if snapshot.next_actor > MAX_SEQUENCE {
             return Err(Error::Account { actor: snapshot.next_actor });
         }
-        let mut sums = snapshot.books;
+        let mut sums = snapshot.accounting;
         // Closed accounts are in the sum too, so the open ones can only fall short of it.
         if !sums.balance() || in_accounts > sums.produced {
-            return Err(Error::Unbalanced { books: snapshot.books });
+            return Err(Error::Unbalanced { accounting: snapshot.accounting });
         }
         sums.dropped.count(Reason::LostAtRestart, std::mem::take(&mut sums.in_flight));
-        let parts = |books: &TaskBooks| [books.produced, books.trained, books.dropped.total(), books.in_flight];
-        let all = [sums.produced, sums.trained, snapshot.books.dropped.total(), snapshot.books.in_flight];
+        let parts = |accounting: &TaskAccounting| {
+            [accounting.produced, accounting.trained, accounting.dropped.total(), accounting.in_flight]
+        };
+        let all = [sums.produced, sums.trained, snapshot.accounting.dropped.total(), snapshot.accounting.in_flight];
         let mut together = [0u64; 4];
-        for (task, books) in &snapshot.tasks {
-            // Of books that balance no sum can leave its range.
-            let sound = books.balance() && {
-                together.iter_mut().zip(parts(books)).for_each(|(sum, part)| *sum = sum.saturating_add(part));
+        for (task, accounting) in &snapshot.tasks {
+            // Of accounting that balance no sum can leave its range.
+            let sound = accounting.balance() && {
+                together.iter_mut().zip(parts(accounting)).for_each(|(sum, part)| *sum = sum.saturating_add(part));
                 together.iter().zip(all).all(|(sum, all)| *sum <= all)
             };
             if !sound {
-                return Err(Error::UnbalancedTask { task: task.clone(), books: *books });
+                return Err(Error::UnbalancedTask { task: task.clone(), accounting: *accounting });
             }
-            let mut books = *books;
-            books.dropped.count(Reason::LostAtRestart, std::mem::take(&mut books.in_flight));
-            ledger.others.insert(task.clone(), books);
+            let mut accounting = *accounting;
+            accounting.dropped.count(Reason::LostAtRestart, std::mem::take(&mut accounting.in_flight));
+            ledger.others.insert(task.clone(), accounting);
         }
         ledger.next_actor = snapshot.next_actor;
         ledger.sums = sums;

@@ -1,18 +1,18 @@
-//! The same books for each task of joint training.
+//! The same accounting for each task of joint training.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::ledger::{Books, Dropped};
+use crate::ledger::{Accounting, Dropped};
 
 /// Sums over the unrolls that are known to be of one task: `produced = trained + dropped + in flight`.
 ///
-/// What nobody can tell the task of is in [`Books`] alone (numbers that were lost, invalid messages, and what another life of
+/// What nobody can tell the task of is in [`Accounting`] alone (numbers that were lost, invalid messages, and what another life of
 /// the learner had asked for), so the tasks together come to no more than those.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct TaskBooks {
+pub struct TaskAccounting {
     /// Unrolls that were decided about.
     pub produced: u64,
     /// Unrolls trained on.
@@ -23,20 +23,20 @@ pub struct TaskBooks {
     pub in_flight: u64,
 }
 
-impl TaskBooks {
+impl TaskAccounting {
     /// Whether `produced = trained + dropped + in flight`.
     pub fn balance(&self) -> bool {
         self.dropped.add_to([self.trained, self.in_flight]) == Some(self.produced)
     }
 }
 
-/// Everybody's books, and each task's, at one moment.
+/// Everybody's accounting, and each task's, at one moment.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct BooksByTask {
+pub struct AccountingByTask {
     /// Of all tasks, and of what is nobody's.
-    pub all: Books,
+    pub all: Accounting,
     /// By the task's name.
-    pub tasks: BTreeMap<String, TaskBooks>,
+    pub tasks: BTreeMap<String, TaskAccounting>,
 }
 
 /// A task of the run, with clips of its own.
@@ -45,7 +45,7 @@ struct Part {
     name: String,
     /// Their number. Clips are counted through all tasks.
     clips: usize,
-    books: TaskBooks,
+    accounting: TaskAccounting,
 }
 
 /// The tasks of a run, in their order.
@@ -55,17 +55,17 @@ pub(crate) struct Tasks {
 }
 
 impl Tasks {
-    /// These tasks, with the books that are `known` of them, which are taken out.
+    /// These tasks, with the accounting that are `known` of them, which are taken out.
     pub(crate) fn new(
         tasks: impl IntoIterator<Item = (String, usize)>,
-        known: &mut BTreeMap<String, TaskBooks>,
+        known: &mut BTreeMap<String, TaskAccounting>,
     ) -> Self {
-        let part = |(name, clips)| Part { books: known.remove(&name).unwrap_or_default(), name, clips };
+        let part = |(name, clips)| Part { accounting: known.remove(&name).unwrap_or_default(), name, clips };
         Self { parts: tasks.into_iter().map(part).collect() }
     }
 
-    /// The books of the task that has this clip.
-    pub(crate) fn of(&mut self, clip: u32) -> Option<&mut TaskBooks> {
+    /// The accounting of the task that has this clip.
+    pub(crate) fn of(&mut self, clip: u32) -> Option<&mut TaskAccounting> {
         let mut clip = clip as usize;
         let found = self.parts.iter_mut().find(|part| match clip.checked_sub(part.clips) {
             Some(rest) => {
@@ -74,11 +74,11 @@ impl Tasks {
             }
             None => true,
         });
-        found.map(|part| &mut part.books)
+        found.map(|part| &mut part.accounting)
     }
 
-    /// Every task's books by its name.
-    pub(crate) fn by_name(self) -> BTreeMap<String, TaskBooks> {
-        self.parts.into_iter().map(|part| (part.name, part.books)).collect()
+    /// Every task's accounting by its name.
+    pub(crate) fn by_name(self) -> BTreeMap<String, TaskAccounting> {
+        self.parts.into_iter().map(|part| (part.name, part.accounting)).collect()
     }
 }

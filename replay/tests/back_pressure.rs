@@ -17,8 +17,8 @@ fn nothing_more_is_taken_than_an_open_and_a_full_batch() {
         assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
     }
     assert_eq!(actor.send(&batcher, SLOTS as u64), None);
-    assert_eq!(batcher.books().in_flight, SLOTS as u64);
-    assert_eq!(batcher.books().produced, SLOTS as u64, "waiting left no trace");
+    assert_eq!(batcher.accounting().in_flight, SLOTS as u64);
+    assert_eq!(batcher.accounting().produced, SLOTS as u64, "waiting left no trace");
 }
 
 #[test]
@@ -66,7 +66,7 @@ fn of_two_copies_that_wait_one_is_taken() {
     assert_eq!((now(&mut old), now(&mut new)), (None, None));
     batcher.trained(batch_now(&batcher).unwrap());
     assert_eq!((now(&mut old), now(&mut new)), (Some(Outcome::Taken), Some(Outcome::Duplicate)));
-    assert_eq!(batcher.books().produced, SLOTS as u64 + 1);
+    assert_eq!(batcher.accounting().produced, SLOTS as u64 + 1);
 }
 
 #[test]
@@ -93,13 +93,13 @@ fn closing_ends_all_waiting_and_records_nothing() {
     let header = actor.header(SLOTS as u64);
     let mut waiting = Box::pin(batcher.insert(&header, payload(&header)));
     assert_eq!(now(&mut waiting), None);
-    let before = batcher.books();
+    let before = batcher.accounting();
     batcher.close();
     assert_eq!(now(&mut waiting), Some(Outcome::Closed));
     assert_eq!(actor.send(&batcher, 0), Some(Outcome::Closed));
     assert_eq!(batcher.refuse_invalid(&header), Outcome::Closed);
     assert!(batcher.next_batch().is_none());
-    assert_eq!(batcher.books(), before);
+    assert_eq!(batcher.accounting(), before);
 }
 
 #[test]
@@ -125,7 +125,7 @@ fn a_trainer_waits_for_a_batch_and_is_woken_by_its_last_unroll_or_by_the_end() {
     }
     batcher.close();
     trainer.join().unwrap();
-    assert_eq!(batcher.books().trained, 12);
+    assert_eq!(batcher.accounting().trained, 12);
 }
 
 #[test]
@@ -143,7 +143,7 @@ fn many_tasks_and_one_trainer_lose_nothing() {
                     assert!(seen.insert((header.actor, header.sequence)), "trained on twice");
                 }
                 batcher.trained(batch);
-                assert!(batcher.books().balance());
+                assert!(batcher.accounting().balance());
             }
         }
     });
@@ -164,6 +164,6 @@ fn many_tasks_and_one_trainer_lose_nothing() {
         }
     });
     trainer.join().unwrap();
-    let books = batcher.books();
-    assert_eq!((books.produced, books.trained, books.in_flight), (ACTORS * EACH, ACTORS * EACH, 0));
+    let accounting = batcher.accounting();
+    assert_eq!((accounting.produced, accounting.trained, accounting.in_flight), (ACTORS * EACH, ACTORS * EACH, 0));
 }

@@ -6,7 +6,7 @@ mod common;
 
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, Invalid};
-use comic_replay::{Batch, Batcher, Config, Ledger, Order, Outcome, Phase};
+use comic_replay::{Batch, BatchOrder, Batcher, Config, Ledger, Outcome, Phase};
 use common::{Actor, CONFIG, PHASE, SLOTS, batch_now, batcher, insert_now, layout, mark, payload};
 use proptest::prelude::*;
 
@@ -42,7 +42,7 @@ fn fields_are_contiguous_and_in_order_of_arrival_also_when_buffers_are_used_agai
         assert_holds(&batch, &sent);
         batcher.trained(batch);
     }
-    assert_eq!(batcher.books().trained, 30);
+    assert_eq!(batcher.accounting().trained, 30);
 }
 
 #[test]
@@ -65,7 +65,7 @@ fn while_one_batch_is_trained_on_the_next_two_are_assembled() {
     batcher.trained(first);
     assert_eq!(actor.send(&batcher, 9), Some(Outcome::Taken));
     assert_holds(&second, &[3, 4, 5].map(|sequence| actor.header(sequence)));
-    assert!(batcher.books().balance());
+    assert!(batcher.accounting().balance());
 }
 
 #[test]
@@ -82,7 +82,7 @@ fn what_grew_too_old_while_it_waited_is_dropped_and_its_slots_are_filled_again()
     }
     batcher.set_phase(Phase { version: newest(1), ..PHASE });
     assert!(batch_now(&batcher).is_none(), "one slot is free");
-    assert_eq!((batcher.books().dropped.stale, batcher.books().in_flight), (3, 2));
+    assert_eq!((batcher.accounting().dropped.stale, batcher.accounting().in_flight), (3, 2));
     let late = UnrollHeader { version: newest(1), ..actor.header(5) };
     assert_eq!(insert_now(&batcher, &late), Some(Outcome::Taken));
     assert_holds(&batch_now(&batcher).unwrap(), &[sent[4].clone(), sent[1].clone(), late]);
@@ -102,7 +102,7 @@ fn a_batch_can_be_assembled_from_a_recording() {
     let batch = Batch::assemble(layout(), unrolls.clone()).unwrap();
     assert_holds(&batch, &recorded);
     batcher.trained(batch);
-    assert_eq!(batcher.books().trained, 0, "it was none of this batcher's");
+    assert_eq!(batcher.accounting().trained, 0, "it was none of this batcher's");
 
     let short = unrolls[0].1.slice(1..);
     let refused = Batch::assemble(layout(), [(recorded[0].clone(), short)]).err();
@@ -111,7 +111,7 @@ fn a_batch_can_be_assembled_from_a_recording() {
 
 /// A batcher whose slots are the environments'.
 fn ordered() -> Batcher {
-    let config = Config { ahead: 0, max_staleness: 0, order: Order::Environment, ..CONFIG };
+    let config = Config { ahead: 0, max_staleness: 0, order: BatchOrder::Environment, ..CONFIG };
     Batcher::new(layout(), config, PHASE, Ledger::new())
 }
 
@@ -134,7 +134,7 @@ proptest! {
             assert_holds(&batch, &sent);
             batcher.trained(batch);
         }
-        prop_assert!(batcher.books().balance());
+        prop_assert!(batcher.accounting().balance());
     }
 }
 
@@ -149,5 +149,5 @@ fn an_environment_without_a_slot_or_with_a_full_one_is_invalid() {
     assert_eq!(send(3, u32::MAX), Some(Outcome::Invalid));
     assert_eq!((send(4, 0), send(5, 2)), (Some(Outcome::Taken), Some(Outcome::Taken)));
     assert_eq!(batch_now(&batcher).unwrap().unrolls, 3);
-    assert_eq!(batcher.books().dropped.invalid, 3);
+    assert_eq!(batcher.accounting().dropped.invalid, 3);
 }

@@ -16,8 +16,8 @@ fn an_unroll_sent_twice_is_taken_once() {
     assert_eq!(actor.send(&batcher, 0), Some(Outcome::Duplicate));
     assert_eq!(actor.send(&batcher, 1), Some(Outcome::Taken));
     assert_eq!(actor.send(&batcher, 0), Some(Outcome::Duplicate));
-    let books = batcher.books();
-    assert_eq!((books.produced, books.in_flight, books.duplicates), (2, 2, 2));
+    let accounting = batcher.accounting();
+    assert_eq!((accounting.produced, accounting.in_flight, accounting.duplicates), (2, 2, 2));
 }
 
 #[test]
@@ -26,8 +26,8 @@ fn skipped_sequence_numbers_were_lost_and_do_not_come_back() {
     let actor = Actor::join(&batcher, 5);
     assert_eq!(actor.send(&batcher, 4), Some(Outcome::Taken));
     assert_eq!(actor.send(&batcher, 2), Some(Outcome::Duplicate));
-    let books = batcher.books();
-    assert_eq!((books.produced, books.in_flight, books.dropped.lost_at_restart), (5, 1, 4));
+    let accounting = batcher.accounting();
+    assert_eq!((accounting.produced, accounting.in_flight, accounting.dropped.lost_at_restart), (5, 1, 4));
 }
 
 #[test]
@@ -37,7 +37,7 @@ fn two_incarnations_count_apart() {
     assert_ne!(one.actor, other.actor);
     assert_eq!(one.send(&batcher, 0), Some(Outcome::Taken));
     assert_eq!(other.send(&batcher, 0), Some(Outcome::Taken));
-    assert_eq!(batcher.books().produced, 2);
+    assert_eq!(batcher.accounting().produced, 2);
 }
 
 #[test]
@@ -52,8 +52,8 @@ fn nobody_is_charged_for_a_message_without_an_account() {
     assert_eq!(actor.send(&batcher, MAX_SEQUENCE), Some(Outcome::Invalid));
     assert_eq!(actor.send(&batcher, u64::MAX), Some(Outcome::Invalid));
     batcher.refuse_unattributed();
-    let books = batcher.books();
-    assert_eq!((books.produced, books.unattributed), (0, 6));
+    let accounting = batcher.accounting();
+    assert_eq!((accounting.produced, accounting.unattributed), (0, 6));
     assert_eq!(actor.send(&batcher, 0), Some(Outcome::Taken), "its account was not spoilt");
 }
 
@@ -66,7 +66,7 @@ fn invalid_unrolls_are_dropped_once_and_the_next_one_is_welcome() {
     let short = common::now(&mut Box::pin(batcher.insert(&actor.header(1), payload(&actor.header(1)).slice(4..))));
     assert_eq!(short, Some(Outcome::Invalid), "the batcher itself takes no payload of another size");
     assert_eq!(actor.send(&batcher, 2), Some(Outcome::Taken));
-    assert_eq!(batcher.books().dropped, Dropped { invalid: 2, ..Dropped::default() });
+    assert_eq!(batcher.accounting().dropped, Dropped { invalid: 2, ..Dropped::default() });
 }
 
 #[test]
@@ -79,8 +79,12 @@ fn staleness_is_counted_in_published_versions() {
     batcher.set_phase(Phase { version: PHASE.version + 1, ..PHASE });
     header.sequence = 1;
     assert_eq!(insert_now(&batcher, &header), Some(Outcome::Stale));
-    let books = batcher.books();
-    assert_eq!((books.dropped.stale, books.in_flight), (1, 1), "a new version takes nothing away from the open batch");
+    let accounting = batcher.accounting();
+    assert_eq!(
+        (accounting.dropped.stale, accounting.in_flight),
+        (1, 1),
+        "a new version takes nothing away from the open batch"
+    );
 }
 
 #[test]
@@ -95,7 +99,7 @@ fn unrolls_of_another_epoch_or_phase_are_superseded() {
     batcher.set_phase(Phase { demonstration: true, ..PHASE });
     demonstration.sequence = 2;
     assert_eq!(insert_now(&batcher, &demonstration), Some(Outcome::Taken));
-    assert_eq!(batcher.books().dropped.superseded, 2);
+    assert_eq!(batcher.accounting().dropped.superseded, 2);
 }
 
 #[test]
@@ -105,7 +109,7 @@ fn an_unroll_made_before_the_terms_changed_is_superseded() {
     assert_eq!(actor.send(&batcher, 0), Some(Outcome::Taken));
     batcher.set_phase(Phase { version: PHASE.version + 1, oldest: PHASE.version + 1, ..PHASE });
     assert_eq!(actor.send(&batcher, 1), Some(Outcome::Superseded));
-    assert_eq!(batcher.books().dropped.superseded, 2);
+    assert_eq!(batcher.accounting().dropped.superseded, 2);
 }
 
 #[test]
@@ -117,19 +121,19 @@ fn a_change_of_phase_drops_what_waits_for_the_old_one() {
     }
     assert_eq!(actor.send(&batcher, 6), None);
     batcher.set_phase(Phase { demonstration: true, ..PHASE });
-    let books = batcher.books();
-    assert_eq!((books.dropped.superseded, books.in_flight), (6, 0));
+    let accounting = batcher.accounting();
+    assert_eq!((accounting.dropped.superseded, accounting.in_flight), (6, 0));
     assert!(batch_now(&batcher).is_none());
     for sequence in 6..12 {
         let mut header = actor.header(sequence);
         header.demonstration = true;
         assert_eq!(insert_now(&batcher, &header), Some(Outcome::Taken), "all slots are free again");
     }
-    assert!(batcher.books().balance());
+    assert!(batcher.accounting().balance());
 }
 
 #[test]
-fn every_batch_ends_in_the_books_also_one_that_is_let_go() {
+fn every_batch_ends_in_the_accounting_also_one_that_is_let_go() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     let mut sequences = 0..;
@@ -142,7 +146,7 @@ fn every_batch_ends_in_the_books_also_one_that_is_let_go() {
     batcher.trained(next());
     batcher.discard(next(), Reason::Stale);
     drop(next());
-    let books = batcher.books();
-    assert_eq!((books.trained, books.dropped.stale, books.dropped.lost_at_restart), (3, 3, 3));
-    assert_eq!((books.produced, books.in_flight), (9, 0));
+    let accounting = batcher.accounting();
+    assert_eq!((accounting.trained, accounting.dropped.stale, accounting.dropped.lost_at_restart), (3, 3, 3));
+    assert_eq!((accounting.produced, accounting.in_flight), (9, 0));
 }

@@ -1,10 +1,10 @@
-//! A checkpoint's books and accounts carry on in the next life of the learner.
+//! A checkpoint's accounting and accounts carry on in the next life of the learner.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
 
-use comic_replay::{Batcher, Books, Dropped, Error, Joined, Ledger, Outcome, Phase, Snapshot, TaskBooks};
+use comic_replay::{Accounting, Batcher, Dropped, Error, Joined, Ledger, Outcome, Phase, Snapshot, TaskAccounting};
 use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, layout, with_tasks};
 
 /// The next life of the learner, from what a checkpoint file would hold.
@@ -23,18 +23,18 @@ fn what_was_in_flight_at_the_checkpoint_is_lost_and_never_trained_on_later() {
     }
     before.trained(batch_now(&before).unwrap());
     let snapshot = before.snapshot();
-    assert_eq!((snapshot.books.trained, snapshot.books.in_flight), (3, 2));
+    assert_eq!((snapshot.accounting.trained, snapshot.accounting.in_flight), (3, 2));
 
     let after = restarted(&snapshot);
     let lost = Dropped { lost_at_restart: 2, ..Dropped::default() };
-    assert_eq!(after.books(), Books { produced: 5, trained: 3, dropped: lost, ..Books::default() });
+    assert_eq!(after.accounting(), Accounting { produced: 5, trained: 3, dropped: lost, ..Accounting::default() });
     let mut resent = actor.header(4);
     resent.learner_epoch = PHASE.epoch + 1;
     assert_eq!(insert_now(&after, &resent), Some(Outcome::Duplicate));
 }
 
 #[test]
-fn every_task_goes_on_with_its_own_books_and_a_new_one_begins_with_none() {
+fn every_task_goes_on_with_its_own_accounting_and_a_new_one_begins_with_none() {
     let before = batcher();
     let actor = Actor::join(&before, 5);
     for sequence in 7..12 {
@@ -46,19 +46,19 @@ fn every_task_goes_on_with_its_own_books_and_a_new_one_begins_with_none() {
     let ledger = Ledger::restore(&serde_json::from_str(&stored).unwrap()).unwrap();
     let tasks = [("ball-catch", 1), ("get-up", 10)].map(|(name, clips)| (name.to_string(), clips));
     let away = Batcher::new(layout(), CONFIG, PHASE, ledger.with_tasks(tasks));
-    let after = away.books_by_task().tasks;
+    let after = away.accounting_by_task().tasks;
     let lost = Dropped { lost_at_restart: 2, ..Dropped::default() };
-    assert_eq!(after["get-up"], TaskBooks { produced: 2, dropped: lost, ..TaskBooks::default() });
-    assert_eq!(after["ball-catch"], TaskBooks::default());
+    assert_eq!(after["get-up"], TaskAccounting { produced: 2, dropped: lost, ..TaskAccounting::default() });
+    assert_eq!(after["ball-catch"], TaskAccounting::default());
     assert_eq!(after.len(), 2);
     // A task that one life does not have is known to the next one.
     let back = with_tasks(Ledger::restore(&away.snapshot()).unwrap());
-    let tracking = Batcher::new(layout(), CONFIG, PHASE, back).books_by_task().tasks["tracking"];
-    assert_eq!(tracking, TaskBooks { produced: 3, trained: 3, ..TaskBooks::default() });
+    let tracking = Batcher::new(layout(), CONFIG, PHASE, back).accounting_by_task().tasks["tracking"];
+    assert_eq!(tracking, TaskAccounting { produced: 3, trained: 3, ..TaskAccounting::default() });
 }
 
 #[test]
-fn a_snapshot_from_before_tasks_had_books_is_restored_without_them() {
+fn a_snapshot_from_before_tasks_had_accounting_is_restored_without_them() {
     let before = batcher();
     let mut stored = serde_json::to_value(before.snapshot()).unwrap();
     stored.as_object_mut().unwrap().remove("tasks");
@@ -83,14 +83,14 @@ fn back_after_a_crash() -> (Actor, Batcher, Joined) {
 fn an_actor_that_reconnects_finds_its_account_and_the_learner_counts_what_it_missed() {
     let (actor, after, joined) = back_after_a_crash();
     assert_eq!((joined.actor, joined.next_sequence), (actor.actor, 1));
-    let of_tasks = after.books_by_task().tasks;
+    let of_tasks = after.accounting_by_task().tasks;
     assert_eq!(actor.send(&after, 3), Some(Outcome::Superseded), "resent, but made in the life before");
-    assert_eq!(after.books_by_task().tasks, of_tasks, "what that life called a clip is no task's here");
+    assert_eq!(after.accounting_by_task().tasks, of_tasks, "what that life called a clip is no task's here");
     let mut fresh = actor.header(4);
     fresh.learner_epoch = PHASE.epoch + 1;
     assert_eq!(insert_now(&after, &fresh), Some(Outcome::Taken));
     let dropped = Dropped { lost_at_restart: 3, superseded: 1, ..Dropped::default() };
-    assert_eq!(after.books(), Books { produced: 5, dropped, in_flight: 1, ..Books::default() });
+    assert_eq!(after.accounting(), Accounting { produced: 5, dropped, in_flight: 1, ..Accounting::default() });
 }
 
 #[test]
@@ -99,9 +99,9 @@ fn an_actor_that_sends_nothing_more_still_says_what_was_lost() {
     assert_eq!(after.catch_up(joined.actor, 3), 3);
     assert_eq!(after.catch_up(joined.actor, 2), 3, "an account does not go back");
     let dropped = Dropped { lost_at_restart: 3, ..Dropped::default() };
-    assert_eq!(after.books(), Books { produced: 3, dropped, ..Books::default() });
+    assert_eq!(after.accounting(), Accounting { produced: 3, dropped, ..Accounting::default() });
     assert_eq!(after.catch_up(99, 3), 0, "nobody's numbers are not counted");
-    assert_eq!(after.books().produced, 3);
+    assert_eq!(after.accounting().produced, 3);
     assert_eq!(actor.send(&after, 2), Some(Outcome::Duplicate), "it is never trained on again");
 }
 
@@ -121,10 +121,10 @@ fn an_actor_the_checkpoint_does_not_know_starts_afresh() {
 #[test]
 fn a_snapshot_may_claim_any_number_of_refusals() {
     let mut snapshot = batcher().snapshot();
-    (snapshot.books.duplicates, snapshot.books.unattributed) = (u64::MAX, u64::MAX);
+    (snapshot.accounting.duplicates, snapshot.accounting.unattributed) = (u64::MAX, u64::MAX);
     let after = restarted(&snapshot);
     after.refuse_unattributed();
-    assert_eq!(after.books().unattributed, u64::MAX);
+    assert_eq!(after.accounting().unattributed, u64::MAX);
 }
 
 #[test]
@@ -139,8 +139,8 @@ fn a_snapshot_that_contradicts_itself_is_refused() {
         Ledger::restore(&snapshot).err()
     };
     assert_eq!(refusal(|_| {}), None);
-    assert!(matches!(refusal(|snapshot| snapshot.books.trained += 1), Some(Error::Unbalanced { .. })));
-    assert!(matches!(refusal(|snapshot| snapshot.books.dropped.stale = u64::MAX), Some(Error::Unbalanced { .. })));
+    assert!(matches!(refusal(|snapshot| snapshot.accounting.trained += 1), Some(Error::Unbalanced { .. })));
+    assert!(matches!(refusal(|snapshot| snapshot.accounting.dropped.stale = u64::MAX), Some(Error::Unbalanced { .. })));
     assert!(matches!(refusal(|snapshot| snapshot.accounts[0].next_sequence = 2), Some(Error::Unbalanced { .. })));
     let repeated = |snapshot: &mut Snapshot| snapshot.accounts.push(snapshot.accounts[0]);
     assert_eq!(refusal(repeated), Some(Error::Account { actor: 0 }));
@@ -149,7 +149,7 @@ fn a_snapshot_that_contradicts_itself_is_refused() {
     let unbalanced = |snapshot: &mut Snapshot| snapshot.tasks.get_mut("tracking").unwrap().trained += 1;
     assert!(matches!(refusal(unbalanced), Some(Error::UnbalancedTask { .. })));
     let too_many = |snapshot: &mut Snapshot| {
-        let own = TaskBooks { produced: 1, trained: 1, ..TaskBooks::default() };
+        let own = TaskAccounting { produced: 1, trained: 1, ..TaskAccounting::default() };
         snapshot.tasks.insert("get-up".into(), own);
     };
     assert!(matches!(refusal(too_many), Some(Error::UnbalancedTask { .. })), "more than all tasks have");

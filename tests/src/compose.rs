@@ -105,7 +105,7 @@ impl Project {
         Ok(serde_json::from_str(&self.in_learner(&["comic-learner", "status", "--json"])?)?)
     }
 
-    /// Looks at the learner's status until `condition` holds; books that do not balance end the test at once.
+    /// Looks at the learner's status until `condition` holds; accounting that do not balance end the test at once.
     ///
     /// # Errors
     /// After `limit`, with what was waited for, the last status, and all logs.
@@ -115,9 +115,17 @@ impl Project {
         while begin.elapsed() < limit {
             match self.status() {
                 Ok(status) => {
-                    ensure!(balance_of_json(&status["books"]), "{what}: the books do not balance: {}", status["books"]);
+                    ensure!(
+                        balance_of_json(&status["accounting"]),
+                        "{what}: the accounting do not balance: {}",
+                        status["accounting"]
+                    );
                     if condition(&status) {
-                        println!("{what}: after {:.1} s, books {}", begin.elapsed().as_secs_f64(), status["books"]);
+                        println!(
+                            "{what}: after {:.1} s, accounting {}",
+                            begin.elapsed().as_secs_f64(),
+                            status["accounting"]
+                        );
                         return Ok(status);
                     }
                     last = status.to_string();

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
-use comic_proto::v1::{Books, Status};
+use comic_proto::v1::{Accounting, Status};
 
 use crate::process::Process;
 use crate::system::{Answered, System, balance, metric};
@@ -24,9 +24,9 @@ const BEYOND_WHAT_IS_LEFT: u64 = 200;
 /// More versions than actors may lag behind.
 const VERSIONS: f64 = 30.0;
 
-/// The books of a status.
-pub fn books(status: &Status) -> Books {
-    status.books.unwrap_or_default()
+/// The accounting of a status.
+pub fn accounting(status: &Status) -> Accounting {
+    status.accounting.unwrap_or_default()
 }
 
 /// A status; a learner that is too busy for an answer is asked again.
@@ -42,8 +42,8 @@ pub async fn now(system: &mut System) -> Result<Status> {
 /// # Errors
 /// When it does not, in time.
 pub async fn trains_on(system: &mut System, what: &str) -> Result<()> {
-    let before = books(&now(system).await?).trained;
-    system.until(what, LIMIT, |status| (books(status).trained >= before + BEYOND_WHAT_IS_LEFT).then_some(())).await
+    let before = accounting(&now(system).await?).trained;
+    system.until(what, LIMIT, |status| (accounting(status).trained >= before + BEYOND_WHAT_IS_LEFT).then_some(())).await
 }
 
 /// While versions go up, what is trained on stays only a few versions old: it was made with new parameters.
@@ -115,13 +115,13 @@ pub async fn leaves(actor: Process) -> Result<()> {
 ///
 /// # Errors
 /// When it is not so.
-pub async fn the_books_balance_at_the_end(mut system: System) -> Result<()> {
-    let books = books(&now(&mut system).await?);
-    ensure!(balance(&books), "{books:?}");
-    ensure!(books.dropped_invalid == 0, "no actor sends what is invalid: {books:?}");
+pub async fn the_accounting_balances_at_the_end(mut system: System) -> Result<()> {
+    let accounting = accounting(&now(&mut system).await?);
+    ensure!(balance(&accounting), "{accounting:?}");
+    ensure!(accounting.dropped_invalid == 0, "no actor sends what is invalid: {accounting:?}");
     let Answered { unrolls, all } = system.answered()?;
-    ensure!(unrolls <= books.produced, "actors were answered about {unrolls} unrolls: {books:?}");
-    ensure!(!all || unrolls == books.produced, "actors made no more than {unrolls} unrolls: {books:?}");
+    ensure!(unrolls <= accounting.produced, "actors were answered about {unrolls} unrolls: {accounting:?}");
+    ensure!(!all || unrolls == accounting.produced, "actors made no more than {unrolls} unrolls: {accounting:?}");
     let grown = system.grown()?;
     ensure!(grown < MEMORY, "the learner has {grown} bytes more than before anybody came");
     let learner = system.learner.take().context("no learner")?;

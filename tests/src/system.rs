@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail, ensure};
 use comic_proto::Access;
 use comic_proto::v1::learner_client::LearnerClient;
-use comic_proto::v1::{Books, Status, StatusRequest};
+use comic_proto::v1::{Accounting, Status, StatusRequest};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -358,7 +358,7 @@ impl System {
         tokio::time::timeout(CALL_LIMIT, call).await.context("the learner does not answer")?
     }
 
-    /// Polls the learner's status until `condition` gives something; books that do not balance end the test at once.
+    /// Polls the learner's status until `condition` gives something; accounting that do not balance end the test at once.
     ///
     /// # Errors
     /// After `limit`, with `what` was waited for, the last status and the end of the learner's log; or when the learner
@@ -374,8 +374,8 @@ impl System {
         while Instant::now() < deadline {
             match self.status().await {
                 Ok(status) => {
-                    let books = status.books.unwrap_or_default();
-                    ensure!(balance(&books), "{what}: the books do not balance: {books:?}");
+                    let accounting = status.accounting.unwrap_or_default();
+                    ensure!(balance(&accounting), "{what}: the accounting do not balance: {accounting:?}");
                     if let Some(found) = condition(&status) {
                         return Ok(found);
                     }
@@ -412,19 +412,21 @@ fn flags(access: &Access) -> Vec<OsString> {
     given.flat_map(|(flag, path)| [flag.into(), path.into()]).collect()
 }
 
-/// [`balance`] of books as metrics and `comic-learner status --json` write them.
-pub fn balance_of_json(books: &Value) -> bool {
+/// [`balance`] of accounting as metrics and `comic-learner status --json` write them.
+pub fn balance_of_json(accounting: &Value) -> bool {
     let of = |value: &Value| value.as_u64();
-    let dropped = books["dropped"].as_object().map(|reasons| reasons.values().filter_map(of).sum::<u64>());
-    let parts = [of(&books["trained"]), dropped, of(&books["in_flight"])];
-    of(&books["produced"]).is_some_and(|produced| Some(produced) == parts.into_iter().sum::<Option<u64>>())
+    let dropped = accounting["dropped"].as_object().map(|reasons| reasons.values().filter_map(of).sum::<u64>());
+    let parts = [of(&accounting["trained"]), dropped, of(&accounting["in_flight"])];
+    of(&accounting["produced"]).is_some_and(|produced| Some(produced) == parts.into_iter().sum::<Option<u64>>())
 }
 
 /// produced = trained + dropped by reason + in flight.
-pub fn balance(books: &Books) -> bool {
-    let Books { produced, trained, in_flight, .. } = *books;
-    let dropped =
-        books.dropped_stale + books.dropped_invalid + books.dropped_superseded + books.dropped_lost_at_restart;
+pub fn balance(accounting: &Accounting) -> bool {
+    let Accounting { produced, trained, in_flight, .. } = *accounting;
+    let dropped = accounting.dropped_stale
+        + accounting.dropped_invalid
+        + accounting.dropped_superseded
+        + accounting.dropped_lost_at_restart;
     produced == trained + dropped + in_flight
 }
 

@@ -10,7 +10,7 @@ use comic_tests::lockstep::{ALL, SLOW_BYTES_PER_SECOND, UPDATES, is_over, learnt
 use comic_tests::process::Process;
 use comic_tests::relay::Relay;
 use comic_tests::repository::root;
-use comic_tests::steps::{LIMIT, leaves, now, parameters_arrive, the_books_balance_at_the_end, trains_on};
+use comic_tests::steps::{LIMIT, leaves, now, parameters_arrive, the_accounting_balances_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System, metric};
 
 /// Far enough for another year in every line of a log.
@@ -38,7 +38,7 @@ async fn nothing_is_lost_when_the_clock_is_set() -> Result<()> {
     ensure!(!actor_log.contains("no connection"), "{actor_log}");
     ensure!(!learner_log.contains("ERROR"), "{learner_log}");
     leaves(actor).await?;
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }
 
 #[tokio::test]

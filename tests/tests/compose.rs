@@ -16,7 +16,7 @@ const LIMIT: Duration = Duration::from_secs(180);
 const BEYOND_WHAT_IS_LEFT: u64 = 100;
 
 fn trained(status: &Value) -> u64 {
-    status["books"]["trained"].as_u64().unwrap_or_default()
+    status["accounting"]["trained"].as_u64().unwrap_or_default()
 }
 
 fn alive(status: &Value) -> u64 {
@@ -33,7 +33,7 @@ async fn trains_on_with(actors: u64, project: &Project, what: &str) -> Result<Va
 }
 
 #[tokio::test]
-async fn containers_survive_what_happens_to_them_and_their_books_balance() -> Result<()> {
+async fn containers_survive_what_happens_to_them_and_their_accounting_balance() -> Result<()> {
     let project = Project::new("faults", &["compose.yaml"]);
     project.up(2)?;
     trains_on_with(2, &project, "two actors train").await?;
@@ -78,7 +78,7 @@ async fn containers_survive_what_happens_to_them_and_their_books_balance() -> Re
     project.compose(&["stop", "actor"])?;
     ensure!(healthy.inspect(".State.ExitCode")? == "1", "an actor that is told to stop is not done");
     let last = project.until("nobody acts", LIMIT, |status| alive(status) == 0).await?;
-    ensure!(last["books"]["dropped"]["invalid"] == 0, "nobody sends what is invalid: {last}");
+    ensure!(last["accounting"]["dropped"]["invalid"] == 0, "nobody sends what is invalid: {last}");
     Ok(())
 }
 

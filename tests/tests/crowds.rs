@@ -6,7 +6,8 @@ use std::time::Duration;
 use anyhow::{Context as _, Result, ensure};
 use comic_proto::v1::Status;
 use comic_tests::steps::{
-    LIMIT, books, kill_and_restart_the_learner, newest_checkpoint, now, the_books_balance_at_the_end, trains_on,
+    LIMIT, accounting, kill_and_restart_the_learner, newest_checkpoint, now, the_accounting_balances_at_the_end,
+    trains_on,
 };
 use comic_tests::system::{SMALL, System, program};
 use serde_json::Value;
@@ -34,7 +35,7 @@ async fn actors_become_a_hundred_times_as_many_and_few_again() -> Result<()> {
     // What the first crowd used, the allocator keeps for the next, and does not always find again.
     ensure!(left[2] < left[0] + 60 * MEGABYTE, "each of those who left keeps 60 KB: bytes after each crowd {left:?}");
     drop(few);
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }
 
 #[tokio::test]
@@ -47,15 +48,15 @@ async fn fifty_actors_come_back_to_a_learner_that_was_killed() -> Result<()> {
     trains_on(&mut system, "fifty actors' unrolls are trained on").await?;
     newest_checkpoint(&mut system).await?;
     trains_on(&mut system, "and some after a checkpoint").await?;
-    let before = books(&now(&mut system).await?).trained;
-    let resumed = books(&kill_and_restart_the_learner(&mut system).await?).trained;
+    let before = accounting(&now(&mut system).await?).trained;
+    let resumed = accounting(&kill_and_restart_the_learner(&mut system).await?).trained;
     actors(&mut system, 50).await?;
     trains_on(&mut system, "fifty actors' unrolls are trained on again").await?;
     // What was acknowledged and trained on after the checkpoint has a name, once every actor told its next number.
-    let counted = |status: &Status| books(status).dropped_lost_at_restart >= before.saturating_sub(resumed);
+    let counted = |status: &Status| accounting(status).dropped_lost_at_restart >= before.saturating_sub(resumed);
     system.until("what the learner lost is counted", LIMIT, |status| counted(status).then_some(())).await?;
     drop(crowd);
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }
 
 async fn actors(system: &mut System, wanted: u64) -> Result<()> {

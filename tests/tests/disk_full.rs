@@ -13,7 +13,9 @@ use anyhow::{Context as _, Result, ensure};
 use comic_proto::v1::Status;
 use comic_tests::lockstep::{ALL, SLOW_BYTES_PER_SECOND, UPDATES, is_over, learnt_by, learnt_in, lockstep};
 use comic_tests::relay::Relay;
-use comic_tests::steps::{LIMIT, checkpoint_in, half_written, leaves, now, the_books_balance_at_the_end, trains_on};
+use comic_tests::steps::{
+    LIMIT, checkpoint_in, half_written, leaves, now, the_accounting_balances_at_the_end, trains_on,
+};
 use comic_tests::system::{SMALL, System, metric, python};
 use comic_tests::tensorboard::curves;
 
@@ -51,7 +53,7 @@ async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
     let last = |run: &Path| Some(curves(&run.join("tensorboard")).ok()?.get("updates")?.last()?.0 as f64);
     system.until("TensorBoard sees what is learnt since", LIMIT, |_| (last(&run)? > step).then_some(())).await?;
     leaves(actor).await?;
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }
 
 #[tokio::test]

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
-use comic_tests::steps::{LIMIT, leaves, the_books_balance_at_the_end, trains_on};
+use comic_tests::steps::{LIMIT, leaves, the_accounting_balances_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
 use tokio::time::{Instant, sleep_until};
 
@@ -35,7 +35,7 @@ async fn a_stopped_actor_is_given_up_and_comes_back() -> Result<()> {
     leaves(other).await?;
     trains_on(&mut system, "alone, it is trained on again").await?;
     leaves(stopped).await?;
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }
 
 #[tokio::test]
@@ -56,5 +56,5 @@ async fn a_stopped_learner_is_noticed_and_served_again() -> Result<()> {
     actor.until_log_holds("reconnected to the learner", LIMIT).await?;
     trains_on(&mut system, "training goes on").await?;
     leaves(actor).await?;
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }

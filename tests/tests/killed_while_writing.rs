@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use anyhow::{Context as _, Result, ensure};
-use comic_tests::steps::{LIMIT, checkpoint_in, half_written, leaves, the_books_balance_at_the_end, trains_on};
+use comic_tests::steps::{LIMIT, checkpoint_in, half_written, leaves, the_accounting_balances_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System, metric};
 
 /// How often it is caught in the act.
@@ -38,5 +38,5 @@ async fn a_learner_killed_while_it_writes_a_checkpoint_goes_on_from_the_one_befo
     }
     trains_on(&mut system, "training goes on").await?;
     leaves(actor).await?;
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }

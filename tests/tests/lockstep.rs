@@ -11,7 +11,7 @@ use comic_tests::lockstep::{
     ALL, SLOW_BYTES_PER_SECOND, UPDATES, is_over, learnt, learnt_by, lockstep, lockstep_with, train,
 };
 use comic_tests::relay::Relay;
-use comic_tests::steps::{LIMIT, books, trains_on};
+use comic_tests::steps::{LIMIT, accounting, trains_on};
 
 const MEMORY_AND_TWO_TASKS: [&str; 4] = [
     "network.low_level=lstm",
@@ -44,7 +44,7 @@ async fn a_paused_actor_and_broken_connections_change_nothing() -> Result<()> {
     paused.pause()?;
     let mut cut = system.start_actor_of(3, &fragile_way(&system.url())?)?;
     let what = "the other environments' unrolls wait for the paused actor's";
-    system.until(what, LIMIT, |status| (books(status).in_flight >= 3).then_some(())).await?;
+    system.until(what, LIMIT, |status| (accounting(status).in_flight >= 3).then_some(())).await?;
     paused.resume()?;
     cut.until_log_holds("reconnected to the learner", LIMIT).await?;
     is_over(&mut system, &mut [paused, cut]).await?;

@@ -7,7 +7,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use comic_tests::steps::{LIMIT, leaves, the_books_balance_at_the_end, trains_on};
+use comic_tests::steps::{LIMIT, leaves, the_accounting_balances_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
 
 /// What is promised.
@@ -100,7 +100,7 @@ async fn a_partition_heals(number: u8, cut: impl Fn(&Host, bool) -> Result<()>) 
     actor.until_log_holds("reconnected to the learner", LIMIT).await?;
     trains_on(&mut system, "the actor's unrolls are trained on again").await?;
     leaves(actor).await?;
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }
 
 #[tokio::test]

@@ -5,7 +5,7 @@ use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{JoinRequest, WatchRequest};
 use comic_proto::{Access, PROTOCOL_VERSION};
 use comic_tests::relay::Relay;
-use comic_tests::steps::{LIMIT, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on};
+use comic_tests::steps::{LIMIT, leaves, parameters_arrive, the_accounting_balances_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
 
 /// A version of so small a policy takes seconds at this pace, and there are dozens of new ones meanwhile.
@@ -30,7 +30,7 @@ async fn a_slow_reader_gets_whole_versions_and_holds_up_nobody() -> Result<()> {
     ensure!(last - first > VERSIONS as u64, "nothing is skipped, so nothing was slow: {versions:?}");
 
     leaves(actor).await?;
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }
 
 /// The first few versions that are whole.

@@ -35,11 +35,11 @@ async fn a_running_learner_is_asked_how_it_is() -> Result<()> {
     let status: Value =
         serde_json::from_slice(&answer.stdout).context(String::from_utf8_lossy(&answer.stderr).into_owned())?;
     ensure!(status["actors"]["alive"] == 1 && status["queue"]["capacity"].as_u64() > Some(0), "{status}");
-    ensure!(status["books"]["trained"].as_u64() > Some(0), "{status}");
+    ensure!(status["accounting"]["trained"].as_u64() > Some(0), "{status}");
     ensure!(status["metrics"]["updates"].as_u64() > Some(0), "{status}");
     let answer = system.ask(&["status"])?;
     let text = String::from_utf8_lossy(&answer.stdout);
-    for word in ["run ", "updates/s", "environment steps/s", "queue ", "ages ", "books ", "1 alive"] {
+    for word in ["run ", "updates/s", "environment steps/s", "queue ", "ages ", "accounting ", "1 alive"] {
         ensure!(text.contains(word), "no `{word}` in {text}");
     }
     ensure!(system.ask(&["health"])?.status.code() == Some(0), "it serves");
@@ -64,13 +64,13 @@ async fn who_watches_sees_how_it_goes_on_and_waits_for_a_learner_that_is_away() 
     let mut system = System::new(&SMALL)?;
     let mut watching = system.start_watching()?;
     watching.until_log_holds(&system.address(), LIMIT).await?;
-    ensure!(!watching.log().contains("books "), "nobody serves yet: {}", watching.log());
+    ensure!(!watching.log().contains("accounting "), "nobody serves yet: {}", watching.log());
     system.start_learner(LIMIT).await?;
     let _actor = system.start_actor()?;
     // On paper one state follows the other.
     watching
         .until_log("two states, and the actor in one of them", LIMIT, |log| {
-            log.matches("books ").count() >= 2 && log.contains("1 alive")
+            log.matches("accounting ").count() >= 2 && log.contains("1 alive")
         })
         .await
 }

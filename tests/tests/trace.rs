@@ -2,7 +2,7 @@
 
 use anyhow::{Context as _, Result, ensure};
 use comic_tests::process::Process;
-use comic_tests::steps::{LIMIT, leaves, the_books_balance_at_the_end, trains_on};
+use comic_tests::steps::{LIMIT, leaves, the_accounting_balances_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
 use serde_json::Value;
 
@@ -42,7 +42,7 @@ async fn one_unroll_can_be_followed_from_its_actor_to_the_gradient() -> Result<(
         ensure!(found, "the learner does not say how long it took to {step} {sequence}");
     }
     leaves(actor).await?;
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }
 
 /// The whole lines of a log, the last one of which may be half-written.

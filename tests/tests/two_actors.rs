@@ -2,12 +2,12 @@
 
 use anyhow::{Result, ensure};
 use comic_tests::steps::{
-    LIMIT, kill_and_restart_the_learner, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on,
+    LIMIT, kill_and_restart_the_learner, leaves, parameters_arrive, the_accounting_balances_at_the_end, trains_on,
 };
 use comic_tests::system::{SMALL, System};
 
 #[tokio::test]
-async fn two_actors_and_a_learner_survive_every_death_and_their_books_balance() -> Result<()> {
+async fn two_actors_and_a_learner_survive_every_death_and_their_accounting_balance() -> Result<()> {
     let mut system = System::new(&SMALL)?;
     let first = system.start_learner(LIMIT).await?;
 
@@ -35,5 +35,5 @@ async fn two_actors_and_a_learner_survive_every_death_and_their_books_balance() 
     trains_on(&mut system, "the third actor's unrolls are trained on after the restart").await?;
     parameters_arrive(&mut system, "the third actor acts with the restarted learner's parameters").await?;
     leaves(third).await?;
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }

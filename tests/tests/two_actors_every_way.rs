@@ -5,7 +5,7 @@
 use anyhow::{Result, ensure};
 use comic_proto::v1::Status;
 use comic_tests::steps::{
-    LIMIT, kill_and_restart_the_learner, leaves, parameters_arrive, the_books_balance_at_the_end, trains_on,
+    LIMIT, kill_and_restart_the_learner, leaves, parameters_arrive, the_accounting_balances_at_the_end, trains_on,
 };
 use comic_tests::system::{SMALL, System, balance_of_json};
 
@@ -30,7 +30,7 @@ async fn two_actors_learn(overrides: &[&str], check: fn(&Status) -> Option<()>) 
     for actor in actors {
         leaves(actor).await?;
     }
-    the_books_balance_at_the_end(system).await
+    the_accounting_balances_at_the_end(system).await
 }
 
 #[tokio::test]
@@ -62,7 +62,7 @@ async fn with_two_tasks() -> Result<()> {
         let padded = both.iter().any(|task| of(task, "padding_share") > 0.0);
         let ended = both.iter().any(|task| of(task, "head_height") > 0.0);
         for task in both {
-            let (own, all) = (&metrics["tasks"][task]["books"], &metrics["books"]);
+            let (own, all) = (&metrics["tasks"][task]["accounting"], &metrics["accounting"]);
             assert!(balance_of_json(own), "{task}: {own}");
             let trained = own["trained"].as_u64().unwrap();
             assert!(Some(trained) <= all["trained"].as_u64(), "{task}: {own} of {all}");

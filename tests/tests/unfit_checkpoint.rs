@@ -20,7 +20,7 @@ async fn starting_again_does_not_help_and_the_exit_code_says_so() -> Result<()> 
     let manifest = system.run().join(format!("checkpoints/checkpoint-{newest:010}/MANIFEST.json"));
     let whole = fs::read(&manifest)?;
     let parts: BTreeMap<String, String> = serde_json::from_slice(&whole)?;
-    for part in ["books.json", "progress.json", "task.json", "learner.safetensors", "experiment.toml"] {
+    for part in ["accounting.json", "progress.json", "task.json", "learner.safetensors", "experiment.toml"] {
         let mut without = parts.clone();
         without.remove(part).context("no such part")?;
         fs::write(&manifest, serde_json::to_vec(&without)?)?;

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
 use comic_proto::v1::*;
 use comic_proto::{Access, Expected, Field, Pieces, UnrollBuffer, UnrollLayout, UnrollShape, validate};
-use comic_replay::{Batcher, Config, Ledger, Order, Outcome, Phase};
+use comic_replay::{BatchOrder, Batcher, Config, Ledger, Outcome, Phase};
 use futures::{Stream, StreamExt as _};
 use tokio::net::TcpListener;
 use tokio::sync::{mpsc, watch};
@@ -36,7 +36,7 @@ pub(super) fn wire(subject: &Subject) -> Result<Figure, Error> {
         unrolls: experiment.unroll.batch,
         max_staleness: experiment.unroll.max_staleness,
         ahead: experiment.unroll.ahead,
-        order: Order::Arrival,
+        order: BatchOrder::Arrival,
     };
     let batcher = Batcher::new(Arc::clone(&layout), config, phase, Ledger::new());
     let trainer = thread::spawn({

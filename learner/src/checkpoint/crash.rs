@@ -23,7 +23,7 @@ fn snapshot(content: &str) -> Snapshot {
 fn run_with(next: Name) -> (TempDir, Store, Vec<Step<'static>>) {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), KEPT).unwrap();
-    store.begin_life().unwrap();
+    store.begin_epoch().unwrap();
     store.write(Name::Updates(1), &snapshot("one")).unwrap();
     let steps = store.steps(next, &snapshot("two")).unwrap().iter().map(owned).collect();
     (run, store, steps)
@@ -92,7 +92,7 @@ fn crash(done: &[Step<'_>], luck: u128) {
 fn survives(run: &Path, expected: &[&Snapshot]) -> Result<(), TestCaseError> {
     let store = Store::open(run, KEPT).map_err(fail)?;
     let found = store.newest().map_err(fail)?.map(|(_, snapshot)| snapshot);
-    prop_assert_eq!(store.begin_life().map_err(fail)?, 2);
+    prop_assert_eq!(store.begin_epoch().map_err(fail)?, 2);
     prop_assert!(expected.iter().any(|expected| found.as_ref() == Some(*expected)), "{:?}", found);
     let left = std::fs::read_dir(run.join("checkpoints")).map_err(fail)?.flatten();
     let hidden: Vec<_> =

@@ -19,7 +19,7 @@ const EVERY: Duration = Duration::from_secs(2);
 /// A learner that does not answer in this time is not there.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Prints run, speed, queue, ages, books and actors of a running learner.
+/// Prints run, speed, queue, ages, accounting and actors of a running learner.
 #[derive(Clone, Debug, Args)]
 pub struct Status {
     /// The learner's address.
@@ -101,7 +101,7 @@ fn metrics(status: &v1::Status) -> Value {
 }
 
 fn to_json(status: &v1::Status) -> Value {
-    let books = status.books.unwrap_or_default();
+    let accounting = status.accounting.unwrap_or_default();
     let queue = status.queue.unwrap_or_default();
     let ages = status.ages.unwrap_or_default();
     let actors = status.actors.unwrap_or_default();
@@ -113,18 +113,18 @@ fn to_json(status: &v1::Status) -> Value {
         "metrics": metrics(status),
         "queue": { "unrolls": queue.unrolls, "capacity": queue.capacity, "waiting": queue.waiting },
         "ages": { "median": ages.median, "p99": ages.p99, "max": ages.max },
-        "books": {
-            "produced": books.produced,
-            "trained": books.trained,
+        "accounting": {
+            "produced": accounting.produced,
+            "trained": accounting.trained,
             "dropped": {
-                "stale": books.dropped_stale,
-                "invalid": books.dropped_invalid,
-                "superseded": books.dropped_superseded,
-                "lost_at_restart": books.dropped_lost_at_restart,
+                "stale": accounting.dropped_stale,
+                "invalid": accounting.dropped_invalid,
+                "superseded": accounting.dropped_superseded,
+                "lost_at_restart": accounting.dropped_lost_at_restart,
             },
-            "in_flight": books.in_flight,
-            "duplicates": books.duplicates,
-            "unattributed": books.unattributed,
+            "in_flight": accounting.in_flight,
+            "duplicates": accounting.duplicates,
+            "unattributed": accounting.unattributed,
         },
         "actors": { "alive": actors.alive, "slow": actors.slow, "lost": actors.lost },
     })
@@ -150,27 +150,29 @@ impl fmt::Display for Text<'_> {
         writeln!(f, "queue     {} of {} unrolls, {} more wait", queue.unrolls, queue.capacity, queue.waiting)?;
         let ages = status.ages.unwrap_or_default();
         writeln!(f, "ages      median {}, p99 {}, at most {} versions", ages.median, ages.p99, ages.max)?;
-        let v1::Books { produced, trained, in_flight, duplicates, unattributed, .. } = status.books.unwrap_or_default();
-        let books = status.books.unwrap_or_default();
+        let v1::Accounting { produced, trained, in_flight, duplicates, unattributed, .. } =
+            status.accounting.unwrap_or_default();
+        let accounting = status.accounting.unwrap_or_default();
         let dropped = [
-            ("stale", books.dropped_stale),
-            ("invalid", books.dropped_invalid),
-            ("superseded", books.dropped_superseded),
-            ("lost at restart", books.dropped_lost_at_restart),
+            ("stale", accounting.dropped_stale),
+            ("invalid", accounting.dropped_invalid),
+            ("superseded", accounting.dropped_superseded),
+            ("lost at restart", accounting.dropped_lost_at_restart),
         ];
         let sum = grouped(dropped.iter().map(|(_, count)| count).sum());
         let (produced, trained) = (grouped(produced), grouped(trained));
-        writeln!(f, "books     produced {produced} = trained {trained} + dropped {sum} + in flight {in_flight}")?;
+        writeln!(f, "accounting     produced {produced} = trained {trained} + dropped {sum} + in flight {in_flight}")?;
         let reasons: Vec<_> = dropped.iter().map(|(reason, count)| format!("{reason} {}", grouped(*count))).collect();
         writeln!(f, "          dropped: {}", reasons.join(", "))?;
         writeln!(f, "          beside them: duplicates {duplicates}, unattributed {unattributed}")?;
         for (name, task) in metrics["tasks"].as_object().into_iter().flatten() {
             let [produced, trained, in_flight] =
-                ["produced", "trained", "in_flight"].map(|part| count(&task["books"][part]));
-            let dropped = task["books"]["dropped"].as_object().into_iter().flatten().map(|(_, part)| count(part)).sum();
+                ["produced", "trained", "in_flight"].map(|part| count(&task["accounting"][part]));
+            let dropped =
+                task["accounting"]["dropped"].as_object().into_iter().flatten().map(|(_, part)| count(part)).sum();
             let [produced, trained, dropped, in_flight] = [produced, trained, dropped, in_flight].map(grouped);
-            let shares = format!("trained {trained} + dropped {dropped} + in flight {in_flight}");
-            writeln!(f, "          {name}: produced {produced} = {shares}")?;
+            let assignments = format!("trained {trained} + dropped {dropped} + in flight {in_flight}");
+            writeln!(f, "          {name}: produced {produced} = {assignments}")?;
         }
         let actors = status.actors.unwrap_or_default();
         writeln!(f, "actors    {} alive, {} slow, {} lost", actors.alive, actors.slow, actors.lost)
@@ -207,10 +209,10 @@ mod tests {
     }
 
     #[test]
-    fn joint_training_shows_the_books_of_every_task() {
-        let books =
+    fn joint_training_shows_the_accounting_of_every_task() {
+        let accounting =
             json!({ "produced": 1234, "trained": 1000, "dropped": { "stale": 200, "invalid": 30 }, "in_flight": 4 });
-        let metrics_json = json!({ "tasks": { "get-up": { "books": books }, "tracking": {} } }).to_string();
+        let metrics_json = json!({ "tasks": { "get-up": { "accounting": accounting }, "tracking": {} } }).to_string();
         let text = Text(&v1::Status { metrics_json, ..v1::Status::default() }).to_string();
         assert!(text.contains("get-up: produced 1,234 = trained 1,000 + dropped 230 + in flight 4\n"), "{text}");
         assert!(text.contains("tracking: produced 0 = trained 0 + dropped 0 + in flight 0\n"), "{text}");
@@ -220,6 +222,6 @@ mod tests {
     fn a_learner_that_has_nothing_to_tell_yet_is_shown() {
         let text = Text(&v1::Status::default()).to_string();
         assert!(text.contains("0.00 updates/s") && text.contains("0 alive"), "{text}");
-        assert_eq!(to_json(&v1::Status::default())["books"]["trained"], 0);
+        assert_eq!(to_json(&v1::Status::default())["accounting"]["trained"], 0);
     }
 }

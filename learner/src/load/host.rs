@@ -12,7 +12,7 @@ use bytes::Bytes;
 use clap::{Args, ValueEnum};
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
 use comic_proto::v1::{self, Behaviour, UnrollAck, UnrollMessage, Verdict};
-use comic_replay::{Batcher, Config, Ledger, Next, Order, Phase};
+use comic_replay::{BatchOrder, Batcher, Config, Ledger, Next, Phase};
 use futures::stream::{self, BoxStream, StreamExt as _};
 use serde_json::{Value, json};
 use tokio::io::AsyncWriteExt as _;
@@ -23,9 +23,9 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::process::obey;
 use crate::publish::Publisher;
-use crate::service::quarantine::QuarantineOptions;
 use crate::run::service_runtime;
-use crate::security::{Limits, Security, Tls};
+use crate::security::{ConnectionLimits, Security, Tls};
+use crate::service::quarantine::QuarantineOptions;
 use crate::service::{Setup, Shared, serve, server, window};
 
 const EPOCH: u64 = 1;
@@ -113,15 +113,15 @@ impl Stand {
             unrolls: experiment.unroll.batch,
             max_staleness: experiment.unroll.max_staleness,
             ahead: experiment.unroll.ahead,
-            order: Order::Arrival,
+            order: BatchOrder::Arrival,
         };
         let batcher = Batcher::new(Arc::new(layout), config, Phase { epoch: EPOCH, ..Phase::default() }, Ledger::new());
         let publisher = Publisher::new(EPOCH);
-        let limits = Limits {
+        let limits = ConnectionLimits {
             max_actors: 65_536,
             max_connections_per_address: 65_536,
             max_requests: 262_144,
-            ..Limits::default()
+            ..ConnectionLimits::default()
         };
         crate::run::allow_descriptors(16_384);
         let shared = Shared::new(Setup {
@@ -189,13 +189,13 @@ impl Stand {
         if order == "publish" {
             self.publish();
         }
-        let books = self.batcher.books();
+        let accounting = self.batcher.accounting();
         json!({
-            "bytes": books.trained * self.batcher.layout().size() as u64,
+            "bytes": accounting.trained * self.batcher.layout().size() as u64,
             "version": self.publisher.newest_version(),
-            "trained": books.trained,
-            "balanced": books.balance(),
-            "books": books,
+            "trained": accounting.trained,
+            "balanced": accounting.balance(),
+            "accounting": accounting,
         })
     }
 }

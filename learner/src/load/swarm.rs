@@ -75,11 +75,11 @@ impl Options {
         let Some((since, cpu, trained, bytes)) = warm else { anyhow::bail!("--minutes is too short to measure") };
         let seconds = since.elapsed().as_secs_f64();
         let per_second = |now: &Value, then: f64| (now.as_f64().unwrap_or_default() - then) / seconds;
-        ensure!(state["balanced"] == true, "the books do not balance: {state}");
+        ensure!(state["balanced"] == true, "the accounting do not balance: {state}");
         let rest = json!({
             "actors": self.actors, "minutes": self.minutes, "unrolls_per_s": per_second(&state["trained"], trained),
             "parameters_mb_per_s": per_second(&stats["bytes"], bytes) / MEGABYTE,
-            "cores": (usage.cpu_seconds - cpu) / seconds, "crowd": stats, "books": state["books"],
+            "cores": (usage.cpu_seconds - cpu) / seconds, "crowd": stats, "accounting": state["accounting"],
         });
         let slope = slope(&samples);
         println!("{}", json!({ "figure": "swarm.rss_slope", "value": slope, "unit": "MB/min" }));

@@ -11,11 +11,11 @@ use anyhow::{Context as _, Result};
 use comic_experiment::TaskSpec;
 use comic_proto::Field;
 use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
-use comic_replay::{Batch, BooksByTask};
+use comic_replay::{AccountingByTask, Batch};
 use serde_json::{Map, Value, json};
 
-use crate::service::Evaluation;
 use crate::observe::tensorboard::Events;
+use crate::service::Evaluation;
 
 /// Sums since the last line.
 #[derive(Debug, Default)]
@@ -106,7 +106,7 @@ impl Episodes {
     }
 }
 
-/// Shares of nothing are absent, not 0.
+/// Assignments of nothing are absent, not 0.
 fn per(value: f64, count: u64) -> Value {
     if count == 0 { Value::Null } else { json!(value / count as f64) }
 }
@@ -121,8 +121,8 @@ pub struct Metrics {
     events: Option<Events>,
     window: Window,
     since: Instant,
-    /// The books of the last line.
-    books: BooksByTask,
+    /// The accounting of the last line.
+    accounting: AccountingByTask,
     /// Whether the last line may have ended half-way.
     torn: bool,
 }
@@ -157,15 +157,15 @@ impl Metrics {
             events: None,
             window: Window::default(),
             since: Instant::now(),
-            books: BooksByTask::default(),
+            accounting: AccountingByTask::default(),
             torn: false,
         })
     }
 
-    /// Begins a life of the learner after so many environment steps: what these books say is no news. It can do without
+    /// Begins a life of the learner after so many environment steps: what these accounting say is no news. It can do without
     /// TensorBoard.
-    pub fn begin(&mut self, epoch: u64, environment_steps: u64, books: BooksByTask) {
-        self.books = books;
+    pub fn begin(&mut self, epoch: u64, environment_steps: u64, accounting: AccountingByTask) {
+        self.accounting = accounting;
         let begun = Events::begin(&self.run, epoch, environment_steps);
         self.events = begun.map_err(|error| tracing::error!("nothing is written for TensorBoard: {error:#}")).ok();
     }
@@ -176,8 +176,10 @@ impl Metrics {
     }
 
     /// Whether a line would say anything that the last one did not: a learner that nobody feeds writes none.
-    pub fn has_news(&self, books: &BooksByTask) -> bool {
-        self.window.unrolls > 0 || self.window.tasks.iter().any(|task| task.unrolls > 0) || self.books != *books
+    pub fn has_news(&self, accounting: &AccountingByTask) -> bool {
+        self.window.unrolls > 0
+            || self.window.tasks.iter().any(|task| task.unrolls > 0)
+            || self.accounting != *accounting
     }
 
     /// Appends an actor's evaluation to `RUN/evaluations.jsonl`. A disk that refuses is complained about, and training
@@ -252,7 +254,7 @@ impl Metrics {
 
     /// Writes the line, starts a new window, and returns the line for the status. A disk that refuses is complained
     /// about, and training goes on.
-    pub fn write(&mut self, position: Position, books: BooksByTask, losses: Map<String, Value>) -> String {
+    pub fn write(&mut self, position: Position, accounting: AccountingByTask, losses: Map<String, Value>) -> String {
         let seconds = self.since.elapsed().as_secs_f64().max(1e-9);
         let window = std::mem::take(&mut self.window);
         self.since = Instant::now();
@@ -272,7 +274,7 @@ impl Metrics {
             "unroll_age": per(window.age as f64, window.unrolls),
             "reward_terms": terms,
             "losses": losses,
-            "books": books.all,
+            "accounting": accounting.all,
         });
         for (name, value) in window.episodes.entries() {
             line[name] = value;
@@ -284,7 +286,7 @@ impl Metrics {
                 .iter()
                 .enumerate()
                 .map(|(index, task)| {
-                    // Nothing was trained on since the last line: the books may have moved all the same.
+                    // Nothing was trained on since the last line: the accounting may have moved all the same.
                     let window = window.tasks.get(index).cloned().unwrap_or_default();
                     let mut entries: Map<String, Value> =
                         window.episodes.entries().map(|(name, value)| (name.to_string(), value)).into_iter().collect();
@@ -292,13 +294,13 @@ impl Metrics {
                     let Rows { rows, environment_steps, padding } = window.rows;
                     entries.insert("environment_steps".into(), json!(environment_steps));
                     entries.insert("padding_share".into(), per(padding as f64, rows));
-                    entries.insert("books".into(), json!(books.tasks.get(&task.name)));
+                    entries.insert("accounting".into(), json!(accounting.tasks.get(&task.name)));
                     (task.name.clone(), Value::Object(entries))
                 })
                 .collect::<Map<String, Value>>()
                 .into();
         }
-        self.books = books;
+        self.accounting = accounting;
         if let Some(Err(error)) = self.events.as_mut().map(|events| events.write(&line)) {
             tracing::error!("TensorBoard's file lacks a line: {error}");
         }
@@ -347,7 +349,7 @@ mod tests {
         let mut metrics = Metrics::open(directory.path(), &spec).unwrap();
         let position = Position { seconds: 1.0, environment_steps: 2, updates: 3, version: 4, epoch: 5 };
         for _ in 0..2 {
-            let line = metrics.write(position, BooksByTask::default(), Map::new());
+            let line = metrics.write(position, AccountingByTask::default(), Map::new());
             assert!(line.contains("\"updates\":3"), "{line}");
         }
         metrics.keep_evaluation(&Evaluation { run: None, epoch: 5, version: 4, updates: 3, json: "{}".into() });

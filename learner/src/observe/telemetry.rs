@@ -1,7 +1,7 @@
 //! Every counter, gauge and histogram that `/metrics` shows, each with its name and what it means.
 //!
 //! One registration gives the metric, its help text and its line of `docs/metrics.md` (`comic-learner metrics` prints
-//! that page). Counters begin at 0 when the process starts, except those of the books, which go on with the run.
+//! that page). Counters begin at 0 when the process starts, except those of the accounting, which go on with the run.
 
 use std::fmt::Write as _;
 use std::sync::atomic::Ordering;
@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use comic_experiment::TaskName;
-use comic_replay::BooksByTask;
+use comic_replay::AccountingByTask;
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
@@ -176,7 +176,7 @@ struct Sampled {
     tasks: SampledTasks,
 }
 
-/// The books of each task.
+/// The accounting of each task.
 #[derive(Debug)]
 struct SampledTasks {
     produced: Labelled<Counter>,
@@ -224,7 +224,7 @@ impl Sampled {
 /// What [`Telemetry::page`] cannot know by itself.
 #[derive(Debug)]
 pub(crate) struct Sample {
-    pub(crate) books: BooksByTask,
+    pub(crate) accounting: AccountingByTask,
     pub(crate) capacity: u64,
     pub(crate) waiting: u64,
     pub(crate) ingest: u64,
@@ -355,21 +355,21 @@ impl Telemetry {
     /// The page that Prometheus reads, in the OpenMetrics text format.
     pub(crate) fn page(&self, sample: &Sample) -> String {
         let Sampled { produced, trained, dropped, duplicates, unattributed, in_flight, .. } = &self.sampled;
-        let books = sample.books.all;
+        let accounting = sample.accounting.all;
         for (counter, value) in [
-            (produced, books.produced),
-            (trained, books.trained),
-            (duplicates, books.duplicates),
-            (unattributed, books.unattributed),
-            (&dropped.of("stale"), books.dropped.stale),
-            (&dropped.of("invalid"), books.dropped.invalid),
-            (&dropped.of("superseded"), books.dropped.superseded),
-            (&dropped.of("lost_at_restart"), books.dropped.lost_at_restart),
+            (produced, accounting.produced),
+            (trained, accounting.trained),
+            (duplicates, accounting.duplicates),
+            (unattributed, accounting.unattributed),
+            (&dropped.of("stale"), accounting.dropped.stale),
+            (&dropped.of("invalid"), accounting.dropped.invalid),
+            (&dropped.of("superseded"), accounting.dropped.superseded),
+            (&dropped.of("lost_at_restart"), accounting.dropped.lost_at_restart),
         ] {
             counter.inner().store(value, Ordering::Relaxed);
         }
         for (gauge, value) in [
-            (in_flight, books.in_flight),
+            (in_flight, accounting.in_flight),
             (&self.sampled.capacity, sample.capacity),
             (&self.sampled.waiting, sample.waiting),
             (&self.sampled.ingest, sample.ingest),
@@ -379,14 +379,14 @@ impl Telemetry {
         ] {
             gauge.set(value as i64);
         }
-        for (task, books) in TASKS.iter().filter_map(|task| Some((task, sample.books.tasks.get(*task)?))) {
+        for (task, accounting) in TASKS.iter().filter_map(|task| Some((task, sample.accounting.tasks.get(*task)?))) {
             let SampledTasks { produced, trained, dropped, in_flight } = &self.sampled.tasks;
             for (counter, value) in
-                [(produced, books.produced), (trained, books.trained), (dropped, books.dropped.total())]
+                [(produced, accounting.produced), (trained, accounting.trained), (dropped, accounting.dropped.total())]
             {
                 counter.of(task).inner().store(value, Ordering::Relaxed);
             }
-            in_flight.of(task).set(books.in_flight as i64);
+            in_flight.of(task).set(accounting.in_flight as i64);
         }
         for (state, actors) in sample.actors {
             self.sampled.actors.of(state).set(actors as i64);

@@ -15,8 +15,8 @@ use tonic::Status;
 use tonic::body::Body;
 use tower::{Layer, Service};
 
-use crate::security::Tokens;
 use crate::observe::telemetry::Telemetry;
+use crate::security::Tokens;
 
 /// Says whether the learner serves and nothing else, so that container checks need no secret.
 const OPEN: &str = "/grpc.health.v1.Health/Check";

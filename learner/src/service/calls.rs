@@ -13,8 +13,8 @@ use futures::stream::{BoxStream, StreamExt as _};
 use serde::de::IgnoredAny;
 use tonic::{Request, Response, Status, Streaming};
 
+use super::assignments::{Assignment, Denied};
 use super::roster::Admission;
-use super::shares::{Denied, Share};
 use super::{Evaluation, Shared, assets, status};
 
 /// Bytes of an actor's name, as many as a host's can have.
@@ -160,11 +160,11 @@ pub(super) fn superseded() -> Status {
 /// What an actor simulates of a run in lockstep; nothing in particular otherwise.
 fn environments_of(shared: &Shared, request: &JoinRequest) -> Result<Option<Environments>, Status> {
     let JoinRequest { incarnation, actor, threads, environments, .. } = *request;
-    let Some(shares) = &shared.shares else { return Ok(None) };
+    let Some(assignments) = &shared.assignments else { return Ok(None) };
     let wanted = threads.map_or(shared.actor.0, u64::from) * environments.map_or(shared.actor.1, u64::from);
     let now = Instant::now();
-    let claimed = shares.claim(incarnation, wanted, actor.is_some(), |owner| shared.roster.expects(owner, now));
-    let Share { environments, inherited, left } = claimed.map_err(|denied| match denied {
+    let claimed = assignments.claim(incarnation, wanted, actor.is_some(), |owner| shared.roster.expects(owner, now));
+    let Assignment { environments, inherited, left } = claimed.map_err(|denied| match denied {
         Denied::Taken => {
             shared.telemetry.joins.of("full").inc();
             Status::resource_exhausted("other actors simulate every environment of this run in lockstep: standing by")

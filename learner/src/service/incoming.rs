@@ -16,10 +16,10 @@ use tokio::task::JoinSet;
 use tokio::time::Sleep;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
-use crate::complaints::Complaints;
 use super::lock;
-use crate::security::{Limits, Tls};
+use crate::log_limiter::LogLimiter;
 use crate::observe::telemetry::Telemetry;
+use crate::security::{ConnectionLimits, Tls};
 
 /// A handshake takes a few round trips, TLS's and HTTP/2's each; whoever takes longer is turned away.
 const HANDSHAKE: Duration = Duration::from_secs(10);
@@ -32,12 +32,12 @@ const BREATH: Duration = Duration::from_millis(100);
 
 /// What decides about a connection.
 #[derive(Clone, Debug)]
-pub(super) struct Door {
+pub(super) struct Acceptor {
     tls: Option<Arc<Tls>>,
     per_address: usize,
     in_all: usize,
     places: Arc<Mutex<Places>>,
-    complaints: Arc<Complaints<IpAddr>>,
+    log_limiter: Arc<LogLimiter<IpAddr>>,
     telemetry: Arc<Telemetry>,
 }
 
@@ -47,14 +47,14 @@ struct Places {
     in_all: usize,
 }
 
-impl Door {
-    pub(super) fn new(tls: Option<Arc<Tls>>, limits: &Limits, telemetry: Arc<Telemetry>) -> Self {
+impl Acceptor {
+    pub(super) fn new(tls: Option<Arc<Tls>>, limits: &ConnectionLimits, telemetry: Arc<Telemetry>) -> Self {
         Self {
             tls,
             per_address: limits.max_connections_per_address,
             in_all: limits.max_connections(),
             places: Arc::default(),
-            complaints: Arc::default(),
+            log_limiter: Arc::default(),
             telemetry,
         }
     }
@@ -102,7 +102,7 @@ impl Door {
         };
         drop(places);
         self.telemetry.connections_refused.of(reason).inc();
-        if let Some(unreported) = self.complaints.due(address) {
+        if let Some(unreported) = self.log_limiter.due(address) {
             let (per_address, in_all) = (self.per_address, self.in_all);
             tracing::warn!(%address, unreported, per_address, in_all, "connection refused: too many");
         }
@@ -123,7 +123,7 @@ impl Door {
                     Err(_) => (io::ErrorKind::TimedOut.into(), None),
                 };
                 self.telemetry.connections_refused.of("tls").inc();
-                if let Some(unreported) = self.complaints.due(place.address) {
+                if let Some(unreported) = self.log_limiter.due(place.address) {
                     tracing::warn!(address = %place.address, unreported, "no agreement on TLS: {error}");
                 }
                 if let Some(stream) = stream {
@@ -148,7 +148,7 @@ async fn linger(mut stream: TcpStream) -> io::Result<()> {
 #[derive(Debug)]
 struct Place {
     address: IpAddr,
-    door: Door,
+    door: Acceptor,
 }
 
 impl Drop for Place {

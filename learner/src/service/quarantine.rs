@@ -16,7 +16,7 @@ use comic_proto::v1::UnrollHeader;
 use comic_proto::{Invalid, Pieces};
 use serde_json::json;
 
-use crate::complaints::Complaints;
+use crate::log_limiter::LogLimiter;
 use crate::observe::telemetry::Telemetry;
 
 /// Unrolls that may wait for the disk; one more is let go of.
@@ -107,13 +107,13 @@ struct Cell {
 
 impl Cell {
     fn keep_all(&mut self, queue: &Receiver<Refused>, telemetry: &Telemetry) {
-        let complaints = Complaints::default();
+        let log_limiter = LogLimiter::default();
         while let Ok(refused) = queue.recv() {
             let result = match self.keep(&refused) {
                 Ok(true) => "kept",
                 Ok(false) => "full",
                 Err(error) => {
-                    if let Some(unreported) = complaints.due(()) {
+                    if let Some(unreported) = log_limiter.due(()) {
                         tracing::error!(unreported, "a refused unroll is not kept: {error:#}");
                     }
                     "failed"

@@ -10,27 +10,27 @@ use crate::observe::telemetry::Sample;
 
 /// What `GetStatus` answers.
 pub(super) fn of(shared: &Shared) -> v1::Status {
-    let books = shared.batcher.books();
+    let accounting = shared.batcher.accounting();
     let Census { alive, slow, lost, waiting } = shared.roster.census(Instant::now());
     let ages = shared.telemetry.ages();
     v1::Status {
         learner_epoch: shared.publisher.epoch(),
-        books: Some(v1::Books {
-            produced: books.produced,
-            trained: books.trained,
-            dropped_stale: books.dropped.stale,
-            dropped_invalid: books.dropped.invalid,
-            dropped_superseded: books.dropped.superseded,
-            dropped_lost_at_restart: books.dropped.lost_at_restart,
-            in_flight: books.in_flight,
-            duplicates: books.duplicates,
-            unattributed: books.unattributed,
+        accounting: Some(v1::Accounting {
+            produced: accounting.produced,
+            trained: accounting.trained,
+            dropped_stale: accounting.dropped.stale,
+            dropped_invalid: accounting.dropped.invalid,
+            dropped_superseded: accounting.dropped.superseded,
+            dropped_lost_at_restart: accounting.dropped.lost_at_restart,
+            in_flight: accounting.in_flight,
+            duplicates: accounting.duplicates,
+            unattributed: accounting.unattributed,
         }),
         metrics_json: lock(&shared.metrics).clone(),
         run: shared.run.display().to_string(),
         experiment: shared.name.clone(),
         uptime_seconds: shared.since.elapsed().as_secs_f64(),
-        queue: Some(v1::Queue { unrolls: books.in_flight, capacity: shared.capacity, waiting }),
+        queue: Some(v1::Queue { unrolls: accounting.in_flight, capacity: shared.capacity, waiting }),
         ages: Some(v1::Ages { median: ages.median, p99: ages.p99, max: ages.max }),
         actors: Some(v1::Actors { alive, slow, lost }),
     }
@@ -41,7 +41,7 @@ impl Shared {
     pub fn metrics_page(&self) -> String {
         let Census { alive, slow, lost, waiting } = self.roster.census(Instant::now());
         self.telemetry.page(&Sample {
-            books: self.batcher.books_by_task(),
+            accounting: self.batcher.accounting_by_task(),
             capacity: self.capacity,
             waiting,
             ingest: self.room.taken(),

@@ -89,8 +89,8 @@ async fn take(shared: &Shared, unroll: ReceivedUnroll) -> Result<Option<UnrollAc
     if !shared.roster.heard(header.incarnation, Instant::now()) {
         return Err(superseded());
     }
-    if let Some(shares) = &shared.shares
-        && !shares.owns(header.incarnation, header.environment)
+    if let Some(assignments) = &shared.assignments
+        && !assignments.owns(header.incarnation, header.environment)
     {
         let environment = header.environment;
         return Err(Status::failed_precondition(format!("in lockstep environment {environment} is not this actor's")));
@@ -140,7 +140,7 @@ async fn take(shared: &Shared, unroll: ReceivedUnroll) -> Result<Option<UnrollAc
                 || "its numbers fit no account, or its environment no slot of the batch".into(),
                 |invalid| invalid.to_string(),
             );
-            if let Some(unreported) = shared.complaints.due(header.actor) {
+            if let Some(unreported) = shared.log_limiter.due(header.actor) {
                 tracing::warn!(actor = header.actor, sequence, unreported, "invalid unroll refused: {reason}");
             }
             ack(shared, sequence, Verdict::Invalid, reason)

@@ -63,7 +63,7 @@ impl Trainer {
             ("target.safetensors", self.target.to_vec()),
             ("learner.safetensors", crate::tensors::to_bytes(&tensors)?),
             (PROGRESS, serde_json::to_vec_pretty(&progress)?),
-            ("books.json", serde_json::to_vec_pretty(&self.batcher.snapshot())?),
+            ("accounting.json", serde_json::to_vec_pretty(&self.batcher.snapshot())?),
         ] {
             snapshot.parts.insert(name.to_string(), bytes);
         }

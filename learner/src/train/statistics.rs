@@ -7,7 +7,7 @@ use comic_proto::Field;
 use comic_replay::Batch;
 use tch::{Kind, Tensor};
 
-/// Of proprioception, which every task shares, and of each task's own observation.
+/// Of proprioception, which every task assignments, and of each task's own observation.
 #[derive(Debug)]
 pub struct ObservationStatistics {
     /// Rows of the batches seen, whatever stands in them.
@@ -272,11 +272,11 @@ mod tests {
         assert_eq!(metrics.count_rows(&batch(&spec), &[0, 1]), [rows(3, 0), rows(1, 1)]);
         let position =
             crate::observe::metrics::Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
-        let mut books = comic_replay::BooksByTask::default();
-        books.tasks.insert("get-up".into(), comic_replay::TaskBooks { trained: 7, ..Default::default() });
-        let line = metrics.write(position, books, serde_json::Map::new());
+        let mut accounting = comic_replay::AccountingByTask::default();
+        accounting.tasks.insert("get-up".into(), comic_replay::TaskAccounting { trained: 7, ..Default::default() });
+        let line = metrics.write(position, accounting, serde_json::Map::new());
         let line: serde_json::Value = serde_json::from_str(&line).unwrap();
-        assert_eq!(line["tasks"]["get-up"]["books"]["trained"], 7);
+        assert_eq!(line["tasks"]["get-up"]["accounting"]["trained"], 7);
         assert_eq!(line["tasks"]["tracking"]["environment_steps"], 3);
         assert_eq!(line["tasks"]["get-up"]["environment_steps"], 1);
         // Its second row is the episode's last observation, and no padding.

@@ -15,16 +15,16 @@ use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::checkpoint::{Name, Snapshot, Store, unfit};
+use crate::checkpoint::{Name, Snapshot, Store, incompatible};
 use crate::device::Backend;
 use crate::observe::metrics::{Metrics, Position};
-use crate::train::minibatches::tasks_of_unrolls;
 use crate::publish::Publisher;
 use crate::service::Shared;
-use crate::train::setbacks::Setbacks;
+use crate::train::minibatches::tasks_of_unrolls;
+use crate::train::skipped_steps::SkippedSteps;
 use crate::train::statistics::ObservationStatistics;
-use crate::vmpo::{Losses, VmpoLearner};
 use crate::train::writer::Writer;
+use crate::vmpo::{Losses, VmpoLearner};
 
 /// How often a trainer without batches looks at the clock.
 const PATIENCE: std::time::Duration = std::time::Duration::from_millis(500);
@@ -109,7 +109,7 @@ pub struct Trainer {
     pub(crate) checkpointed: Instant,
     /// The newest checkpoint, in memory: where a learner turns back to that lost its way.
     pub(crate) good: Arc<Snapshot>,
-    pub(crate) setbacks: Setbacks,
+    pub(crate) skipped_steps: SkippedSteps,
 }
 
 impl Trainer {
@@ -143,7 +143,7 @@ impl Trainer {
             writer: Writer::start(store, shared.telemetry.clone())?,
             checkpointed: Instant::now(),
             good: Arc::default(),
-            setbacks: Setbacks::new(experiment.learner.restore_after),
+            skipped_steps: SkippedSteps::new(experiment.learner.restore_after),
             experiment,
             spec,
             epoch,
@@ -156,13 +156,13 @@ impl Trainer {
         };
         match resume {
             Some(snapshot) => {
-                trainer.restore(&snapshot).map_err(|error| unfit(&run, error))?;
+                trainer.restore(&snapshot).map_err(|error| incompatible(&run, error))?;
                 trainer.good = Arc::new(snapshot);
             }
             None => trainer.keep(Name::Initial)?,
         }
-        let books = trainer.batcher.books_by_task();
-        trainer.metrics.begin(epoch, trainer.progress.environment_steps, books);
+        let accounting = trainer.batcher.accounting_by_task();
+        trainer.metrics.begin(epoch, trainer.progress.environment_steps, accounting);
         tracing::info!("buffers take {}", trainer.memory());
         Ok(trainer)
     }
@@ -205,7 +205,7 @@ impl Trainer {
         Ok(Ending::Budget)
     }
 
-    /// One batch: gradient steps on it, its books, and new parameters when they are due.
+    /// One batch: gradient steps on it, its accounting, and new parameters when they are due.
     fn learn(&mut self, batch: Batch) -> Result<()> {
         let began = Instant::now();
         let _update = tracing::debug_span!("update", update = self.progress.updates + 1).entered();
@@ -235,13 +235,13 @@ impl Trainer {
         drop(tensors);
         self.backend.end_step()?;
         let publishes = (self.progress.updates + 1).is_multiple_of(self.experiment.vmpo.target_period);
-        let turned_back = self.report_when_there(losses, publishes || self.checkpoint_is_due())?;
+        let restored = self.report_when_there(losses, publishes || self.checkpoint_is_due())?;
         self.progress.updates += 1;
         self.metrics.count_update();
         self.metrics.absorb(batch.headers(), self.progress.version);
         let ages = batch.headers().iter().map(|header| self.progress.version.saturating_sub(header.version)).collect();
         // Published before the batch goes back: whoever waits for its room goes on with these parameters.
-        if turned_back || publishes {
+        if restored || publishes {
             self.publish(Behaviour::Policy)?;
         } else {
             self.keep_step(Behaviour::Policy);
@@ -256,19 +256,19 @@ impl Trainer {
     /// good state.
     fn report_when_there(&mut self, losses: Option<Losses>, at_once: bool) -> Result<bool> {
         self.shared.telemetry.count_compilations(self.backend.compilations()?);
-        let turned_back = self.report_late()?;
+        let restored = self.report_late()?;
         match losses {
             // Of the state that was left.
-            Some(losses) if turned_back => self.count_skipped(losses.to_metrics().skipped),
-            Some(losses) if at_once || !self.backend.is_asynchronous() => return self.report(&losses.to_metrics()),
+            Some(losses) if restored => self.count_skipped(losses.to_values().skipped),
+            Some(losses) if at_once || !self.backend.is_asynchronous() => return self.report(&losses.to_values()),
             losses => self.late = losses,
         }
-        Ok(turned_back)
+        Ok(restored)
     }
 
     fn report_late(&mut self) -> Result<bool> {
         match self.late.take() {
-            Some(losses) => self.report(&losses.to_metrics()),
+            Some(losses) => self.report(&losses.to_values()),
             None => Ok(false),
         }
     }
@@ -364,7 +364,7 @@ impl Trainer {
         self.clock.map_or(self.progress.seconds, |(start, before)| before + start.elapsed().as_secs_f64())
     }
 
-    /// Share of the budget that is used up, by whichever limit is nearest.
+    /// Assignment of the budget that is used up, by whichever limit is nearest.
     fn share_used(&self) -> f64 {
         let budget = &self.experiment.budget;
         [
@@ -405,7 +405,7 @@ impl Trainer {
         if !self.writer.is_busy() {
             self.take_evaluations()?;
         }
-        if self.metrics.has_news(&self.batcher.books_by_task()) { self.write_metrics() } else { Ok(()) }
+        if self.metrics.has_news(&self.batcher.accounting_by_task()) { self.write_metrics() } else { Ok(()) }
     }
 
     /// Keeps what actors found out about checkpoints.
@@ -427,8 +427,8 @@ impl Trainer {
             version: self.progress.version,
             epoch: self.epoch,
         };
-        let books = self.batcher.books_by_task();
-        let line = self.metrics.write(position, books, self.losses.clone());
+        let accounting = self.batcher.accounting_by_task();
+        let line = self.metrics.write(position, accounting, self.losses.clone());
         tracing::info!(target: "metrics", "{line}");
         self.shared.set_metrics(line);
         Ok(())

@@ -76,7 +76,7 @@ impl Trainer {
             if (step % 50 == 0 || step + 1 >= config.steps)
                 && let Some(losses) = Losses::mean(&std::mem::take(&mut unreported))
             {
-                let losses = losses.to_metrics();
+                let losses = losses.to_values();
                 tracing::info!(step, regression = losses.regression_loss, latent_kl = losses.latent_kl, "regressing");
                 if self.report(&losses)? {
                     step = 0;

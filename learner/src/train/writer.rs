@@ -13,7 +13,7 @@ use crate::observe::telemetry::Telemetry;
 
 /// What the thread is asked to do.
 #[derive(Debug)]
-enum Order {
+enum WriteRequest {
     Write(Name, Arc<Snapshot>),
     Judge(Evaluated),
 }
@@ -21,7 +21,7 @@ enum Order {
 /// The writing thread. At most one order waits behind the one being carried out.
 #[derive(Debug)]
 pub struct Writer {
-    queue: SyncSender<Order>,
+    queue: SyncSender<WriteRequest>,
     /// Orders given and not yet carried out.
     pending: Arc<AtomicUsize>,
     thread: JoinHandle<Result<()>>,
@@ -38,7 +38,7 @@ impl Writer {
         let shared = Arc::clone(&pending);
         let thread = std::thread::Builder::new()
             .name("checkpoints".into())
-            .spawn(move || obey(&store, &received, &shared, &telemetry))
+            .spawn(move || run_writer(&store, &received, &shared, &telemetry))
             .context("cannot start the checkpoint thread")?;
         Ok(Self { queue, pending, thread })
     }
@@ -53,7 +53,7 @@ impl Writer {
     /// # Errors
     /// When the thread is gone.
     pub fn write(&self, name: Name, snapshot: Arc<Snapshot>) -> Result<()> {
-        self.order(Order::Write(name, snapshot))
+        self.order(WriteRequest::Write(name, snapshot))
     }
 
     /// Has the checkpoint that was evaluated kept if it is the best; waits while another order waits.
@@ -61,10 +61,10 @@ impl Writer {
     /// # Errors
     /// When the thread is gone.
     pub fn judge(&self, evaluated: Evaluated) -> Result<()> {
-        self.order(Order::Judge(evaluated))
+        self.order(WriteRequest::Judge(evaluated))
     }
 
-    fn order(&self, order: Order) -> Result<()> {
+    fn order(&self, order: WriteRequest) -> Result<()> {
         self.pending.fetch_add(1, Ordering::AcqRel);
         self.queue.send(order).map_err(|_| anyhow!("the checkpoint thread is gone"))
     }
@@ -80,18 +80,23 @@ impl Writer {
 }
 
 /// A disk that refuses once may take the next one: training goes on, and the log says so. The last one counts.
-fn obey(store: &Store, queue: &Receiver<Order>, pending: &AtomicUsize, telemetry: &Telemetry) -> Result<()> {
+fn run_writer(
+    store: &Store,
+    queue: &Receiver<WriteRequest>,
+    pending: &AtomicUsize,
+    telemetry: &Telemetry,
+) -> Result<()> {
     let mut last = Ok(());
     while let Ok(order) = queue.recv() {
         match order {
-            Order::Write(name, snapshot) => {
+            WriteRequest::Write(name, snapshot) => {
                 last = store.write(name, &snapshot).map(|path| tracing::info!(checkpoint = %path.display(), "written"));
                 telemetry.checkpoints.of(if last.is_ok() { "written" } else { "failed" }).inc();
                 if let Err(error) = &last {
                     tracing::error!(checkpoint = %name, "checkpoint not written: {error:#}");
                 }
             }
-            Order::Judge(evaluated) => judge(store, evaluated),
+            WriteRequest::Judge(evaluated) => judge(store, evaluated),
         }
         pending.fetch_sub(1, Ordering::AcqRel);
     }

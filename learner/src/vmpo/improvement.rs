@@ -26,7 +26,7 @@ pub struct Evidence<'a> {
 
 /// V-MPO's limits.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Limits {
+pub struct KlLimits {
     /// ε_η.
     pub epsilon_eta: f64,
     /// ε_μ.
@@ -35,11 +35,11 @@ pub struct Limits {
     pub epsilon_std: f64,
     /// ε_discrete.
     pub epsilon_discrete: f64,
-    /// Share of the valid steps in D̃.
+    /// Assignment of the valid steps in D̃.
     pub top_fraction: f64,
 }
 
-impl From<&Vmpo> for Limits {
+impl From<&Vmpo> for KlLimits {
     fn from(config: &Vmpo) -> Self {
         Self {
             epsilon_eta: config.epsilon_eta,
@@ -83,9 +83,9 @@ impl Improvement {
 /// - L_η = η ε_η + η ln(1/|D̃| Σ_{D̃} exp(A/η)).
 /// - L_α = Σ_k α_k (ε_k − sg KL_k) + sg(α_k) KL_k, KL_k the mean over all valid steps.
 ///
-/// Several groups have a D̃ and an η each, and L_π and L_η are their means, weighed by their shares of the valid steps
+/// Several groups have a D̃ and an η each, and L_π and L_η are their means, weighed by their assignments of the valid steps
 /// (D): a step counts the same whatever it is grouped with, and a group without a step has no influence.
-pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits: &Limits) -> Improvement {
+pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits: &KlLimits) -> Improvement {
     let mask = evidence.valid.gt(0.5);
     let (policy, temperature) = expectation_steps(evidence, &mask, multipliers, limits);
     let kl_mean = masked_mean(evidence.kl_mean, evidence.valid);
@@ -111,7 +111,7 @@ fn expectation_steps(
     evidence: &Evidence,
     mask: &Tensor,
     multipliers: &Multipliers,
-    limits: &Limits,
+    limits: &KlLimits,
 ) -> (Tensor, Tensor) {
     let steps = mask.sum(Kind::Float).clamp_min(1.0);
     let (mut policies, mut temperatures) = (Vec::new(), Vec::new());
@@ -126,7 +126,7 @@ fn expectation_steps(
     (sum(&policies), sum(&temperatures))
 }
 
-fn expectation_step(evidence: &Evidence, mask: &Tensor, eta: &Tensor, limits: &Limits) -> (Tensor, Tensor) {
+fn expectation_step(evidence: &Evidence, mask: &Tensor, eta: &Tensor, limits: &KlLimits) -> (Tensor, Tensor) {
     let advantage = evidence.advantage.detach();
     let selected = top(&advantage, mask, limits.top_fraction);
     let scaled = &advantage / eta;

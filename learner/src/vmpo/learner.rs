@@ -8,7 +8,7 @@ use tch::{Device, Kind, Tensor, nn};
 use super::error::Error;
 use super::stores::{named, trainable};
 use super::{
-    Evidence, Improvement, Limits, Losses, MinibatchShape, MinibatchTensors, Multipliers, masked_mean,
+    Evidence, Improvement, KlLimits, Losses, MinibatchShape, MinibatchTensors, Multipliers, masked_mean,
     policy_improvement, returns,
 };
 use crate::adam::{self, Adam};
@@ -23,7 +23,7 @@ pub struct VmpoLearner {
     network: Network,
     vmpo: Vmpo,
     optimiser: Optimiser,
-    limits: Limits,
+    limits: KlLimits,
     policy_store: nn::VarStore,
     value_store: nn::VarStore,
     policy: Policy,
@@ -47,7 +47,7 @@ struct Pass {
     valid: Tensor,
     /// The steps that each E-step ranks, `[N]` booleans; together all of them.
     groups: Vec<Tensor>,
-    /// Share of the rows that are transitions.
+    /// Assignment of the rows that are transitions.
     share: Tensor,
     /// ½ mean (V − G)², summed over the reward terms.
     value_loss: Tensor,
@@ -98,7 +98,7 @@ impl VmpoLearner {
             network: network.clone(),
             vmpo: vmpo.clone(),
             optimiser: optimiser.clone(),
-            limits: Limits::from(vmpo),
+            limits: KlLimits::from(vmpo),
             policy_store,
             value_store,
             policy,

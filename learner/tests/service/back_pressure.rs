@@ -38,8 +38,8 @@ async fn an_actor_stalls_while_the_batches_are_full_and_goes_on_afterwards() {
 
     // The unread stream holds up no other call on its connection.
     for _ in 0..300 {
-        let books = actor.books().await;
-        assert_eq!((books.produced, books.in_flight), (SLOTS as u64, SLOTS as u64));
+        let accounting = actor.accounting().await;
+        assert_eq!((accounting.produced, accounting.in_flight), (SLOTS as u64, SLOTS as u64));
     }
     // Beyond what has been taken: the stream's window, one unroll decoded, and the client's own send buffer of 1 MiB.
     let under_way = (256 * 1024 + 1024 * 1024) / size + 3;
@@ -61,8 +61,8 @@ async fn an_actor_stalls_while_the_batches_are_full_and_goes_on_afterwards() {
     }
     trainer.await.unwrap();
     assert!(acks.message().await.unwrap().is_none(), "the stream ends with the actor's");
-    let books = actor.books().await;
-    assert_eq!((books.produced, books.trained, books.in_flight), (UNROLLS as u64, UNROLLS as u64, 0));
+    let accounting = actor.accounting().await;
+    assert_eq!((accounting.produced, accounting.trained, accounting.in_flight), (UNROLLS as u64, UNROLLS as u64, 0));
 }
 
 #[tokio::test]
@@ -85,10 +85,10 @@ async fn an_actor_that_dies_while_it_waits_leaves_no_trace_and_its_slot_to_other
     }
     let ack = within(Duration::from_secs(10), unrolls.acks.message()).await.unwrap().unwrap();
     assert_eq!(ack.verdict(), Verdict::Taken);
-    let books = living.books().await;
+    let accounting = living.accounting().await;
     // The dead actor's last unroll may or may not have come through before the end of its connection was noticed.
-    assert_eq!(books.produced, books.trained + books.in_flight);
-    assert!((SLOTS as u64 + 1..=SLOTS as u64 + 2).contains(&books.produced));
+    assert_eq!(accounting.produced, accounting.trained + accounting.in_flight);
+    assert!((SLOTS as u64 + 1..=SLOTS as u64 + 2).contains(&accounting.produced));
 }
 
 #[tokio::test]

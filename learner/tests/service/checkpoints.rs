@@ -190,7 +190,7 @@ fn a_manifest_that_points_elsewhere_is_refused() {
 #[test]
 fn every_life_has_a_larger_epoch_than_the_one_before() {
     let run = tempfile::tempdir().unwrap();
-    let epochs: Vec<u64> = (0..3).map(|_| Store::open(run.path(), 1).unwrap().begin_life().unwrap()).collect();
+    let epochs: Vec<u64> = (0..3).map(|_| Store::open(run.path(), 1).unwrap().begin_epoch().unwrap()).collect();
     assert_eq!(epochs, [1, 2, 3]);
 }
 
@@ -211,7 +211,7 @@ fn a_damaged_epoch_is_an_error_that_names_the_file() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 1).unwrap();
     std::fs::write(run.path().join("checkpoints/epoch"), "many").unwrap();
-    let damaged = store.begin_life().unwrap_err();
+    let damaged = store.begin_epoch().unwrap_err();
     assert!(damaged.is::<Misuse>() && damaged.to_string().contains("checkpoints/epoch is damaged"), "{damaged}");
 }
 
@@ -262,7 +262,7 @@ fn which_one_is_the_best_survives_a_restart_in_the_middle_of_noting_it() {
     std::os::unix::fs::symlink("checkpoint-0000000020", run.path().join("checkpoints/.best")).unwrap();
     drop(store);
     let store = Store::open(run.path(), 1).unwrap();
-    store.begin_life().unwrap();
+    store.begin_epoch().unwrap();
     assert_eq!(std::fs::read_link(&best).unwrap().to_str(), Some("checkpoint-0000000010"));
     assert_eq!(judge(&store, 20, 0.2), Judgement::NotBetter);
     write_evaluated(&store, 30);
@@ -294,7 +294,7 @@ fn a_damaged_record_of_the_best_is_ignored_and_replaced() {
     for damaged in ["", "{", "[]", r#"{"updates": 77, "learner_epoch": 3, "version": 7, "normalised_reward": 9.0}"#] {
         let (run, store) = evaluated_run(&[10, 20]);
         std::fs::write(run.path().join("checkpoints/best.json"), damaged).unwrap();
-        store.begin_life().unwrap();
+        store.begin_epoch().unwrap();
         write_evaluated(&store, 30);
         assert!(!store.has(Name::Updates(10)), "{damaged}");
         assert_eq!(judge(&store, 30, 0.1), Judgement::Best(Name::Updates(30)), "{damaged}");

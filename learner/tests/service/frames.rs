@@ -62,8 +62,8 @@ async fn a_message_without_its_end_is_no_unroll() {
         let (acks, status) = send(&world, vec![first.clone(), second.slice(..half)]).await;
         assert_eq!((acks.len(), status), (1, Code::Internal), "the first {half} bytes");
     }
-    let books = actor.books().await;
-    assert_eq!((books.in_flight, books.duplicates, books.unattributed), (1, 2, 3));
+    let accounting = actor.accounting().await;
+    assert_eq!((accounting.in_flight, accounting.duplicates, accounting.unattributed), (1, 2, 3));
 }
 
 #[tokio::test]
@@ -77,5 +77,5 @@ async fn what_is_compressed_or_no_message_at_all_is_refused_by_a_status() {
     assert_eq!(send(&world, vec![nonsense]).await, (vec![], Code::Internal));
     let endless = Bytes::from_static(b"\x00\xff\xff\xff\xff");
     assert_eq!(send(&world, vec![endless]).await, (vec![], Code::OutOfRange));
-    assert_eq!(actor.books().await.unattributed, 3);
+    assert_eq!(actor.accounting().await.unattributed, 3);
 }

@@ -5,8 +5,8 @@
 use crate::support::{EPOCH, RUN, World, joining, parameters};
 use comic_experiment::{Experiment, TaskSpec};
 use comic_learner::publish::Publisher;
+use comic_learner::security::{ConnectionLimits, Security};
 use comic_learner::service::quarantine::QuarantineOptions;
-use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
 use comic_proto::v1::{Behaviour, Environments, JoinRequest, StatusRequest, Verdict, WatchRequest};
 use comic_proto::{PROTOCOL_VERSION, UnrollLayout, UnrollShape};
@@ -59,11 +59,11 @@ async fn what_an_earlier_life_acknowledged_is_counted_as_lost_as_soon_as_its_act
     assert_eq!(reply.next_sequence, 7);
     let again = client.join(JoinRequest { acknowledged: 5, ..joining(70) }).await.unwrap().into_inner();
     assert_eq!(again.next_sequence, 7, "no number is lost twice");
-    let books = world.batcher.books();
-    assert_eq!((books.produced, books.dropped.lost_at_restart), (7, 7));
+    let accounting = world.batcher.accounting();
+    assert_eq!((accounting.produced, accounting.dropped.lost_at_restart), (7, 7));
     let boast = client.join(JoinRequest { acknowledged: u64::MAX, ..joining(70) }).await.unwrap_err();
     assert_eq!(boast.code(), Code::InvalidArgument);
-    assert_eq!(world.batcher.books(), books);
+    assert_eq!(world.batcher.accounting(), accounting);
 }
 
 #[tokio::test]
@@ -74,9 +74,9 @@ async fn who_was_of_another_run_is_sent_away_and_charged_with_nothing() {
     let back = JoinRequest { actor: Some(0), acknowledged: 7, ..joining(71) };
     let refused = client.join(JoinRequest { run: Some(RUN + 1), ..back.clone() }).await.unwrap_err();
     assert_eq!(refused.code(), Code::FailedPrecondition, "{refused}");
-    assert_eq!(world.batcher.books().produced, 0);
+    assert_eq!(world.batcher.accounting().produced, 0);
     client.join(JoinRequest { run: Some(RUN), ..back }).await.unwrap();
-    assert_eq!(world.batcher.books().dropped.lost_at_restart, 7);
+    assert_eq!(world.batcher.accounting().dropped.lost_at_restart, 7);
 }
 
 #[tokio::test]
@@ -107,8 +107,8 @@ async fn a_newer_process_of_a_name_takes_the_older_ones_place() {
     assert_eq!(refused.code(), Code::Aborted);
     let mut unrolls = newer.stream().await;
     assert_eq!(unrolls.verdict(newer.unroll(0)).await, Verdict::Taken);
-    let books = newer.books().await;
-    assert_eq!((books.produced, books.in_flight), (1, 1), "what was refused had no number");
+    let accounting = newer.accounting().await;
+    assert_eq!((accounting.produced, accounting.in_flight), (1, 1), "what was refused had no number");
     let long = JoinRequest { name: "x".repeat(254), ..joining(73) };
     assert_eq!(newer.client.join(long).await.unwrap_err().code(), Code::InvalidArgument);
 }
@@ -153,7 +153,7 @@ async fn a_service_whose_parts_disagree_does_not_start() {
         id: RUN,
         run: "runs/test".into(),
         security: Security::default(),
-        limits: Limits::default(),
+        limits: ConnectionLimits::default(),
         experiment: world.experiment.clone(),
         spec: world.spec.clone(),
         assets: Vec::new(),

@@ -8,8 +8,8 @@ use std::time::Duration;
 use crate::support::{EPOCH, World, joining, within};
 use comic_learner::error::Misuse;
 use comic_learner::publish::Publisher;
+use comic_learner::security::{ConnectionLimits, Security};
 use comic_learner::service::quarantine::QuarantineOptions;
-use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared};
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{EvaluationReport, StatusRequest};
@@ -21,7 +21,8 @@ const LIMIT: Duration = Duration::from_secs(10);
 
 #[tokio::test]
 async fn connections_from_one_address() {
-    let world = World::limited(Limits { max_connections_per_address: 2, ..Limits::default() }).await;
+    let world =
+        World::limited(ConnectionLimits { max_connections_per_address: 2, ..ConnectionLimits::default() }).await;
     let (mut first, mut second) = (world.client().await, world.client().await);
     first.get_status(StatusRequest {}).await.unwrap();
     second.get_status(StatusRequest {}).await.unwrap();
@@ -64,7 +65,7 @@ async fn silence_from_the_beginning() {
 
 #[tokio::test]
 async fn actors_in_all() {
-    let world = World::limited(Limits { max_actors: 1, ..Limits::default() }).await;
+    let world = World::limited(ConnectionLimits { max_actors: 1, ..ConnectionLimits::default() }).await;
     let mut first = world.actor(70).await;
     let mut client = world.client().await;
     let refused = client.join(joining(71)).await.unwrap_err();
@@ -76,7 +77,7 @@ async fn actors_in_all() {
 
 #[tokio::test]
 async fn calls_in_flight() {
-    let world = World::limited(Limits { max_requests: 2, ..Limits::default() }).await;
+    let world = World::limited(ConnectionLimits { max_requests: 2, ..ConnectionLimits::default() }).await;
     let mut actor = world.actor(70).await;
     let streams = (actor.watch().await, actor.watch().await);
     let mut client = actor.client;
@@ -89,7 +90,8 @@ async fn calls_in_flight() {
 
 #[tokio::test]
 async fn bytes_of_a_message() {
-    let world = World::limited(Limits { max_message_bytes: Some(64 * 1024), ..Limits::default() }).await;
+    let world =
+        World::limited(ConnectionLimits { max_message_bytes: Some(64 * 1024), ..ConnectionLimits::default() }).await;
     let mut client = world.client().await;
     let report = |bytes| EvaluationReport {
         run: None,
@@ -106,8 +108,8 @@ async fn bytes_of_a_message() {
 async fn a_limit_through_which_no_unroll_fits_is_a_wrong_configuration() {
     let world = World::start().await;
     for (limits, option) in [
-        (Limits { max_message_bytes: Some(10), ..Limits::default() }, "--max-message-bytes"),
-        (Limits { max_ingest_bytes: 10, ..Limits::default() }, "--max-ingest-bytes"),
+        (ConnectionLimits { max_message_bytes: Some(10), ..ConnectionLimits::default() }, "--max-message-bytes"),
+        (ConnectionLimits { max_ingest_bytes: 10, ..ConnectionLimits::default() }, "--max-ingest-bytes"),
     ] {
         let setup = Setup {
             run: "runs/test".into(),

@@ -5,7 +5,7 @@
 use std::time::Duration;
 
 use bytes::Bytes;
-use comic_learner::security::Limits;
+use comic_learner::security::ConnectionLimits;
 use comic_proto::frame;
 use comic_proto::v1::{Queue, StatusRequest, Verdict};
 use comic_replay::Next;
@@ -21,7 +21,12 @@ const LIMIT: Duration = Duration::from_secs(30);
 
 /// A learner that has room for one message.
 async fn cramped() -> World {
-    World::limited(Limits { max_message_bytes: Some(MESSAGE), max_ingest_bytes: MESSAGE, ..Limits::default() }).await
+    World::limited(ConnectionLimits {
+        max_message_bytes: Some(MESSAGE),
+        max_ingest_bytes: MESSAGE,
+        ..ConnectionLimits::default()
+    })
+    .await
 }
 
 /// A stream that falls silent after these bytes; what it ends with.
@@ -64,13 +69,13 @@ async fn half_a_message_keeps_its_room_for_ten_seconds_and_not_longer() {
     unrolls.sender.send(other.unroll(0)).await.unwrap();
     // As many calls as it takes for the other to be read, if it is going to be.
     for _ in 0..300 {
-        assert_eq!(other.books().await.produced, 0, "there is no room for it");
+        assert_eq!(other.accounting().await.produced, 0, "there is no room for it");
     }
     assert_eq!(within(LIMIT, stalled).await.unwrap(), Code::DeadlineExceeded);
     let ack = within(LIMIT, unrolls.acks.message()).await.unwrap().unwrap();
     assert_eq!(ack.verdict(), Verdict::Taken);
-    let books = other.books().await;
-    assert_eq!((books.produced, books.unattributed), (1, 0), "it is that actor's to send again");
+    let accounting = other.accounting().await;
+    assert_eq!((accounting.produced, accounting.unattributed), (1, 0), "it is that actor's to send again");
     assert_eq!(read(&world, "comic_unrolls_late_total"), 1);
 }
 
@@ -114,6 +119,6 @@ async fn what_waits_for_a_batch_keeps_others_unread_and_all_have_their_turn() {
         let ack = within(LIMIT, unrolls.acks.message()).await.unwrap().unwrap();
         assert_eq!(ack.verdict(), Verdict::Taken);
     }
-    let books = filling.books().await;
-    assert_eq!((books.produced, books.trained, books.in_flight), (8, 6, 2));
+    let accounting = filling.accounting().await;
+    assert_eq!((accounting.produced, accounting.trained, accounting.in_flight), (8, 6, 2));
 }

@@ -31,7 +31,7 @@ async fn who_asks_while_the_learner_drains_is_told_to_come_back() {
     drains(actor.client.join(joining(71)).await.unwrap_err());
     assert_eq!(within(LIMIT, watch.message()).await.unwrap().unwrap().status(), ServingStatus::NotServing);
     assert!(world.shared.metrics_page().contains("comic_joins_total{result=\"draining\"} 1\n"));
-    assert!(actor.client.get_status(StatusRequest {}).await.is_ok(), "the books can still be read");
+    assert!(actor.client.get_status(StatusRequest {}).await.is_ok(), "the accounting can still be read");
     // The update that was under way was the last one: who was sent away may come and hear that.
     world.publisher.publish(1, Behaviour::Leave, &parameters(1, 0));
     let mut late = world.actor(71).await;
@@ -63,11 +63,11 @@ async fn an_unroll_that_waits_for_a_slot_is_let_go_unanswered() {
     }
     unrolls.sender.send(actor.unroll(2 * BATCH as u64)).await.unwrap();
     // A round trip on the same connection: by now the unroll has most likely arrived, and it waits.
-    actor.books().await;
+    actor.accounting().await;
     world.begin_shutdown();
     drains(within(LIMIT, unrolls.acks.message()).await.unwrap_err());
-    let books = world.batcher.books();
-    assert_eq!((books.produced, books.in_flight), (4, 4));
+    let accounting = world.batcher.accounting();
+    assert_eq!((accounting.produced, accounting.in_flight), (4, 4));
 }
 
 #[tokio::test]
@@ -78,7 +78,7 @@ async fn a_closed_batcher_ends_the_streams_of_unrolls_too() {
     world.batcher.close();
     unrolls.sender.send(actor.unroll(0)).await.unwrap();
     drains(within(LIMIT, unrolls.acks.message()).await.unwrap_err());
-    assert!(actor.client.get_status(StatusRequest {}).await.is_ok(), "the books can still be read");
+    assert!(actor.client.get_status(StatusRequest {}).await.is_ok(), "the accounting can still be read");
 }
 
 #[tokio::test]

@@ -24,10 +24,10 @@ async fn an_unroll_is_taken_acknowledged_and_handed_to_the_trainer() {
     let Next::Batch(batch) = world.batcher.next_batch_within(Duration::ZERO) else { panic!("no batch") };
     let rewards = batch.f32(Field::Reward);
     assert_eq!(rewards, [[0.0; 8], [1.0; 8]].concat());
-    assert_eq!(actor.books().await.in_flight, 2);
+    assert_eq!(actor.accounting().await.in_flight, 2);
     world.batcher.trained(batch);
-    let books = actor.books().await;
-    assert_eq!((books.produced, books.trained, books.in_flight), (2, 2, 0));
+    let accounting = actor.accounting().await;
+    assert_eq!((accounting.produced, accounting.trained, accounting.in_flight), (2, 2, 0));
 }
 
 #[tokio::test]
@@ -49,8 +49,8 @@ async fn an_invalid_unroll_is_refused_by_name_and_the_next_one_is_welcome() {
     let future = actor.unroll_with(3, |header| header.version = 1);
     assert_eq!(unrolls.verdict(future).await, Verdict::Invalid);
     assert_eq!(unrolls.verdict(actor.unroll(4)).await, Verdict::Taken);
-    let books = actor.books().await;
-    assert_eq!((books.produced, books.dropped_invalid, books.in_flight), (5, 4, 1));
+    let accounting = actor.accounting().await;
+    assert_eq!((accounting.produced, accounting.dropped_invalid, accounting.in_flight), (5, 4, 1));
 }
 
 #[tokio::test]
@@ -82,8 +82,8 @@ async fn an_unroll_without_a_header_is_refused_and_nobody_is_charged() {
     let mut unrolls = actor.stream().await;
     let ack = unrolls.send(UnrollMessage { header: None, payload: Bytes::new() }).await.unwrap();
     assert_eq!((ack.verdict(), ack.detail.as_str()), (Verdict::Invalid, "unroll has no header"));
-    let books = actor.books().await;
-    assert_eq!((books.produced, books.unattributed), (0, 1));
+    let accounting = actor.accounting().await;
+    assert_eq!((accounting.produced, accounting.unattributed), (0, 1));
 }
 
 #[tokio::test]
@@ -96,8 +96,8 @@ async fn what_is_sent_again_after_a_reconnect_is_taken_once() {
     let mut second = actor.stream().await;
     assert_eq!(second.verdict(actor.unroll(0)).await, Verdict::Duplicate);
     assert_eq!(second.verdict(actor.unroll(1)).await, Verdict::Taken);
-    let books = actor.books().await;
-    assert_eq!((books.produced, books.in_flight, books.duplicates), (2, 2, 1));
+    let accounting = actor.accounting().await;
+    assert_eq!((accounting.produced, accounting.in_flight, accounting.duplicates), (2, 2, 1));
 }
 
 #[tokio::test]
@@ -119,8 +119,8 @@ async fn old_unrolls_are_refused_as_stale_and_those_of_another_life_or_phase_as_
     let ack = unrolls.send(demonstration).await.unwrap();
     assert_eq!(ack.verdict(), Verdict::Superseded);
     assert!(ack.detail.contains("the policy's own unrolls"), "{}", ack.detail);
-    let books = actor.books().await;
-    assert_eq!((books.dropped_stale, books.dropped_superseded, books.in_flight), (1, 2, 0));
+    let accounting = actor.accounting().await;
+    assert_eq!((accounting.dropped_stale, accounting.dropped_superseded, accounting.in_flight), (1, 2, 0));
 }
 
 #[tokio::test]
@@ -131,7 +131,7 @@ async fn an_actor_that_has_not_joined_is_told_to() {
     let refused = unrolls.send(actor.unroll_with(0, |header| header.incarnation = 71)).await.unwrap_err();
     assert_eq!(refused.code(), Code::FailedPrecondition);
     assert!(refused.message().ends_with("join first"), "{}", refused.message());
-    assert_eq!(actor.books().await.unattributed, 1);
+    assert_eq!(actor.accounting().await.unattributed, 1);
 }
 
 #[tokio::test]
@@ -144,5 +144,5 @@ async fn a_message_beyond_the_layout_s_size_ends_the_stream_before_it_is_read() 
     assert_eq!(refused.code(), Code::OutOfRange);
     let mut unrolls = actor.stream().await;
     assert_eq!(unrolls.verdict(actor.unroll(0)).await, Verdict::Taken);
-    assert_eq!(actor.books().await.unattributed, 1);
+    assert_eq!(actor.accounting().await.unattributed, 1);
 }

@@ -8,10 +8,10 @@ use std::task::{Context, Poll, Waker};
 use bytes::Bytes;
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
-use comic_replay::{Batch, Batcher, Config, Ledger, Next, Order, Outcome, Phase};
+use comic_replay::{Batch, BatchOrder, Batcher, Config, Ledger, Next, Outcome, Phase};
 
 pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, oldest: 0, demonstration: false };
-pub(crate) const CONFIG: Config = Config { unrolls: 3, max_staleness: 4, ahead: 2, order: Order::Arrival };
+pub(crate) const CONFIG: Config = Config { unrolls: 3, max_staleness: 4, ahead: 2, order: BatchOrder::Arrival };
 /// Slots that fill up while nobody trains: the open batch and the full one.
 pub(crate) const SLOTS: usize = 2 * CONFIG.unrolls;
 
@@ -34,7 +34,7 @@ pub(crate) fn layout() -> Arc<UnrollLayout> {
 /// those that follow of none.
 pub(crate) const TASKS: [(&str, usize); 2] = [("tracking", 10), ("get-up", 10)];
 
-/// The books of these tasks are kept.
+/// The accounting of these tasks are kept.
 pub(crate) fn with_tasks(ledger: Ledger) -> Ledger {
     ledger.with_tasks(TASKS.map(|(name, clips)| (name.to_string(), clips)))
 }

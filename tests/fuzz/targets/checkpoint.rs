@@ -12,7 +12,7 @@ use comic_learner::train::statistics::ObservationStatistics;
 use comic_learner::tensors;
 use comic_learner::vmpo::VmpoLearner;
 use comic_networks::to_safetensors;
-use comic_replay::{Batcher, Config, Ledger, Order, Phase};
+use comic_replay::{Batcher, Config, Ledger, BatchOrder, Phase};
 use libfuzzer_sys::fuzz_target;
 use tch::Device;
 
@@ -36,7 +36,7 @@ fn run() -> Run {
     let mut state = learner.state();
     state.extend(statistics.state());
     let policy = to_safetensors(learner.policy_store()).expect("parameters are written");
-    let config = Config { unrolls: 2, max_staleness: 2, ahead: 0, order: Order::Arrival };
+    let config = Config { unrolls: 2, max_staleness: 2, ahead: 0, order: BatchOrder::Arrival };
     let batcher = Batcher::new(Arc::new(layout(&spec, &experiment)), config, Phase::default(), with_tasks(Ledger::new(), &spec));
     let text = |written: Result<Vec<u8>, serde_json::Error>| written.expect("JSON is written");
     let parts = [
@@ -46,7 +46,7 @@ fn run() -> Run {
         ("target.safetensors", policy),
         ("learner.safetensors", tensors::to_bytes(&state).expect("tensors are written")),
         ("progress.json", br#"{"epoch": 2, "version": 30, "updates": 29}"#.to_vec()),
-        ("books.json", text(serde_json::to_vec(&batcher.snapshot()))),
+        ("accounting.json", text(serde_json::to_vec(&batcher.snapshot()))),
     ];
     let sound = Snapshot { parts: parts.map(|(name, bytes)| (name.to_owned(), bytes)).into() };
     for (number, (name, bytes)) in sound.parts.iter().enumerate() {
@@ -87,7 +87,7 @@ fn with_tasks(ledger: Ledger, spec: &TaskSpec) -> Ledger {
 fn resume(run: &mut Run, snapshot: &Snapshot) -> Option<()> {
     Experiment::from_toml("experiment.toml", snapshot.text("experiment.toml").ok()?).ok()?;
     serde_json::from_slice::<TaskSpec>(snapshot.part("task.json").ok()?).ok()?;
-    let ledger = Ledger::restore(&serde_json::from_slice(snapshot.part("books.json").ok()?).ok()?).ok()?;
+    let ledger = Ledger::restore(&serde_json::from_slice(snapshot.part("accounting.json").ok()?).ok()?).ok()?;
     let _ = with_tasks(ledger, &run.spec).join(1, None);
     let mut state = tensors::from_bytes(snapshot.part("learner.safetensors").ok()?).ok()?;
     run.statistics.restore(&mut state).ok()?;

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use comic_fuzz::{experiment, layout, seed, spec};
 use comic_proto::v1::{UnrollHeader, UnrollMessage};
 use comic_proto::{Expected, Field, Pieces, ReceivedUnroll, UnrollBuffer, UnrollLayout, validate};
-use comic_replay::{Batcher, Config, Ledger, Order, Phase, TaskBooks};
+use comic_replay::{Batcher, Config, Ledger, BatchOrder, Phase, TaskAccounting};
 use futures::executor::block_on;
 use libfuzzer_sys::fuzz_target;
 use prost::Message as _;
@@ -51,14 +51,14 @@ fuzz_target!(init: {
     let Ok(ReceivedUnroll { header: Some(header), payload }) = received else { return };
     let expected = Expected { clips, epoch: 0, newest_version: 3 };
     if validate(layout, &header, &payload, &expected).is_ok() {
-        let config = Config { unrolls: 2, max_staleness: 2, ahead: 0, order: Order::Arrival };
+        let config = Config { unrolls: 2, max_staleness: 2, ahead: 0, order: BatchOrder::Arrival };
         let tasks = clips.iter().enumerate().map(|(task, clips)| (task.to_string(), *clips));
         let mut ledger = Ledger::new().with_tasks(tasks);
         let _ = ledger.join(header.incarnation, None);
         let batcher = Batcher::new(layout.clone(), config, Phase::default(), ledger);
         // The first of two: there is room.
         block_on(batcher.insert(&header, payload));
-        let books = batcher.books_by_task();
-        assert!(books.all.balance() && books.tasks.values().all(TaskBooks::balance));
+        let accounting = batcher.accounting_by_task();
+        assert!(accounting.all.balance() && accounting.tasks.values().all(TaskAccounting::balance));
     }
 });

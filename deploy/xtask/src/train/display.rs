@@ -162,11 +162,11 @@ fn number(value: Option<f64>, decimals: usize) -> String {
 }
 
 fn panel_text(line: &Line) -> String {
-    let books = line.books.as_ref().map_or_else(String::new, |books| {
-        let dropped: u64 = books.dropped.values().sum();
+    let accounting = line.accounting.as_ref().map_or_else(String::new, |accounting| {
+        let dropped: u64 = accounting.dropped.values().sum();
         format!(
             "\nunrolls produced {}   trained {}   dropped {dropped}   in flight {}",
-            books.produced, books.trained, books.in_flight
+            accounting.produced, accounting.trained, accounting.in_flight
         )
     });
     // In joint training a line for each task: their rewards have nothing to do with one another.
@@ -183,7 +183,7 @@ fn panel_text(line: &Line) -> String {
     format!(
         "environment steps {:>10}   steps/s {:>8}   updates {:>7}   unroll age {:>5}\n\
          reward per step {:>7}   latent KL {:>7} nats/step   episode length {:>6}   return {:>7}\n\
-         normalised reward {:>6}   survived {:>5}{tasks}{books}",
+         normalised reward {:>6}   survived {:>5}{tasks}{accounting}",
         line.environment_steps,
         number(line.steps_per_second, 0),
         line.updates,

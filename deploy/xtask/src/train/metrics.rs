@@ -30,7 +30,7 @@ pub(crate) struct Line {
     pub(crate) head_height: Option<f64>,
     /// Versions between the parameters that acted and those that were trained.
     pub(crate) unroll_age: Option<f64>,
-    pub(crate) books: Option<Books>,
+    pub(crate) accounting: Option<Accounting>,
     /// Whatever the learner minimises, by name.
     pub(crate) losses: BTreeMap<String, serde_json::Value>,
     /// In joint training the same of each task's own episodes.
@@ -56,7 +56,7 @@ pub(crate) fn read(path: &Path) -> Result<Vec<Line>> {
 /// produced = trained + dropped + in flight.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-pub(crate) struct Books {
+pub(crate) struct Accounting {
     pub(crate) produced: u64,
     pub(crate) trained: u64,
     pub(crate) dropped: BTreeMap<String, u64>,
@@ -72,13 +72,13 @@ mod tests {
         let line: Line = serde_json::from_str(
             r#"{"seconds":5.0,"environment_steps":4096,"updates":1,"version":1,"episode_length":null,
                 "reward_terms":{"com":null},"losses":{"latent_kl":4.5},
-                "books":{"produced":3,"trained":2,"dropped":{"stale":1},"in_flight":0}}"#,
+                "accounting":{"produced":3,"trained":2,"dropped":{"stale":1},"in_flight":0}}"#,
         )
         .unwrap();
         assert_eq!(line.environment_steps, 4096);
         assert!(line.episode_length.is_none());
         assert_eq!(line.latent_kl(), Some(4.5));
-        assert_eq!(line.books.unwrap().dropped["stale"], 1);
+        assert_eq!(line.accounting.unwrap().dropped["stale"], 1);
     }
 
     #[test]

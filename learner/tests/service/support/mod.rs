@@ -11,8 +11,8 @@ use bytes::Bytes;
 use comic_clips::Asset;
 use comic_experiment::{Experiment, TaskPart, TaskSpec, Unroll};
 use comic_learner::publish::Publisher;
+use comic_learner::security::{ConnectionLimits, Security};
 use comic_learner::service::quarantine::QuarantineOptions;
-use comic_learner::security::{Limits, Security};
 use comic_learner::service::{Setup, Shared, serve};
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{
@@ -20,7 +20,7 @@ use comic_proto::v1::{
     WatchRequest,
 };
 use comic_proto::{Access, Client, Field, PROTOCOL_VERSION, UnrollBuffer, UnrollLayout, UnrollShape};
-use comic_replay::{Batcher, Config, Ledger, Order, Phase};
+use comic_replay::{BatchOrder, Batcher, Config, Ledger, Phase};
 use futures::{Stream, StreamExt as _};
 use http::{Request, Response};
 use http_body::Frame;
@@ -58,33 +58,34 @@ impl World {
 
     /// With so many numbers of proprioception, and these assets.
     pub(crate) async fn start_with(proprioception: usize, assets: Vec<Asset>) -> Self {
-        Self::guarded(proprioception, assets, Security::default(), Limits::default()).await
+        Self::guarded(proprioception, assets, Security::default(), ConnectionLimits::default()).await
     }
 
     /// Behind these limits.
-    pub(crate) async fn limited(limits: Limits) -> Self {
+    pub(crate) async fn limited(limits: ConnectionLimits) -> Self {
         Self::guarded(8, Vec::new(), Security::default(), limits).await
     }
 
     /// Behind certificates and tokens.
     pub(crate) async fn secured(security: Security) -> Self {
-        Self::guarded(8, Vec::new(), security, Limits::default()).await
+        Self::guarded(8, Vec::new(), security, ConnectionLimits::default()).await
     }
 
     /// With a quarantine.
     pub(crate) async fn quarantining(quarantine: QuarantineOptions) -> Self {
-        Self::of(experiment(), 8, Vec::new(), Security::default(), Limits::default(), quarantine).await
+        Self::of(experiment(), 8, Vec::new(), Security::default(), ConnectionLimits::default(), quarantine).await
     }
 
     /// In lockstep, over so many environments.
     pub(crate) async fn in_lockstep(environments: usize) -> Self {
         let mut experiment = experiment();
         experiment.unroll = Unroll { lockstep: true, ahead: 0, batch: environments, ..experiment.unroll };
-        let (security, limits, quarantine) = (Security::default(), Limits::default(), QuarantineOptions::default());
+        let (security, limits, quarantine) =
+            (Security::default(), ConnectionLimits::default(), QuarantineOptions::default());
         Self::of(experiment, 8, Vec::new(), security, limits, quarantine).await
     }
 
-    async fn guarded(proprioception: usize, assets: Vec<Asset>, security: Security, limits: Limits) -> Self {
+    async fn guarded(proprioception: usize, assets: Vec<Asset>, security: Security, limits: ConnectionLimits) -> Self {
         Self::of(experiment(), proprioception, assets, security, limits, QuarantineOptions::default()).await
     }
 
@@ -93,7 +94,7 @@ impl World {
         proprioception: usize,
         assets: Vec<Asset>,
         security: Security,
-        limits: Limits,
+        limits: ConnectionLimits,
         quarantine: QuarantineOptions,
     ) -> Self {
         let spec = TaskSpec {
@@ -112,7 +113,7 @@ impl World {
             }],
         };
         let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
-        let config = Config { unrolls: BATCH, max_staleness: 5, ahead: 2, order: Order::Arrival };
+        let config = Config { unrolls: BATCH, max_staleness: 5, ahead: 2, order: BatchOrder::Arrival };
         let phase = Phase { epoch: EPOCH, version: 0, oldest: 0, demonstration: false };
         let batcher = Batcher::new(layout, config, phase, Ledger::new());
         let publisher = Publisher::new(EPOCH);
@@ -257,8 +258,8 @@ impl Actor {
         self.client.watch_parameters(request).await.unwrap().into_inner()
     }
 
-    pub(crate) async fn books(&mut self) -> comic_proto::v1::Books {
-        self.client.get_status(StatusRequest {}).await.unwrap().into_inner().books.unwrap()
+    pub(crate) async fn accounting(&mut self) -> comic_proto::v1::Accounting {
+        self.client.get_status(StatusRequest {}).await.unwrap().into_inner().accounting.unwrap()
     }
 }
 

@@ -7,7 +7,7 @@ mod common;
 
 use std::collections::{HashMap, HashSet};
 
-use comic_replay::{Batch, Batcher, Ledger, Outcome, Phase, Reason, Snapshot, TaskBooks};
+use comic_replay::{Batch, Batcher, Ledger, Outcome, Phase, Reason, Snapshot, TaskAccounting};
 use common::{Actor, CONFIG, PHASE, TASKS, batch_now, insert_now, layout, with_tasks};
 use proptest::prelude::*;
 
@@ -204,34 +204,38 @@ impl World {
     }
 
     fn check(&self) {
-        let books = self.batcher.books();
-        assert!(books.balance(), "{books:?}");
-        assert_eq!(books.produced, self.known.cursors.values().sum::<u64>(), "what the sequence numbers say");
-        assert_eq!(books.trained, self.known.trained.len() as u64);
-        assert_eq!(books.unattributed, self.known.refused);
-        assert!(books.in_flight <= 3 * CONFIG.unrolls as u64);
-        assert_eq!(self.batcher.snapshot().books, books);
+        let accounting = self.batcher.accounting();
+        assert!(accounting.balance(), "{accounting:?}");
+        assert_eq!(accounting.produced, self.known.cursors.values().sum::<u64>(), "what the sequence numbers say");
+        assert_eq!(accounting.trained, self.known.trained.len() as u64);
+        assert_eq!(accounting.unattributed, self.known.refused);
+        assert!(accounting.in_flight <= 3 * CONFIG.unrolls as u64);
+        assert_eq!(self.batcher.snapshot().accounting, accounting);
         self.check_tasks();
     }
 }
 
 impl World {
     fn check_tasks(&self) {
-        let books = self.batcher.books_by_task();
-        assert_eq!(books.all, self.batcher.books());
-        assert_eq!(books.tasks, self.batcher.snapshot().tasks);
+        let accounting = self.batcher.accounting_by_task();
+        assert_eq!(accounting.all, self.batcher.accounting());
+        assert_eq!(accounting.tasks, self.batcher.snapshot().tasks);
         for (index, (task, _)) in TASKS.iter().enumerate() {
-            let own = books.tasks[*task];
+            let own = accounting.tasks[*task];
             assert!(own.balance(), "{task}: {own:?}");
             assert_eq!(own.produced, self.known.decided[index], "{task}");
             let trained = self.known.trained.iter().filter(|(_, sequence)| task_of(*sequence) == index);
             assert_eq!(own.trained, trained.count() as u64, "{task}");
         }
-        let sum = |part: fn(&TaskBooks) -> u64| books.tasks.values().map(part).sum::<u64>();
+        let sum = |part: fn(&TaskAccounting) -> u64| accounting.tasks.values().map(part).sum::<u64>();
         let nobodys = self.known.trained.iter().filter(|(_, sequence)| task_of(*sequence) == TASKS.len()).count();
-        assert_eq!(sum(|books| books.trained) + nobodys as u64, books.all.trained, "together they are all");
-        assert!(sum(|books| books.in_flight) <= books.all.in_flight);
-        assert!(sum(|books| books.dropped.total()) <= books.all.dropped.total());
+        assert_eq!(
+            sum(|accounting| accounting.trained) + nobodys as u64,
+            accounting.all.trained,
+            "together they are all"
+        );
+        assert!(sum(|accounting| accounting.in_flight) <= accounting.all.in_flight);
+        assert!(sum(|accounting| accounting.dropped.total()) <= accounting.all.dropped.total());
     }
 }
 

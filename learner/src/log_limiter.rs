@@ -13,18 +13,18 @@ const REMEMBERED: usize = 1024;
 
 /// When each peer was last complained about, and how often it deserved it since.
 #[derive(Debug)]
-pub(crate) struct Complaints<K> {
+pub(crate) struct LogLimiter<K> {
     peers: Mutex<HashMap<K, (Instant, u64)>>,
 }
 
-impl<K> Default for Complaints<K> {
+impl<K> Default for LogLimiter<K> {
     fn default() -> Self {
         Self { peers: Mutex::default() }
     }
 }
 
-impl<K: Eq + Hash> Complaints<K> {
-    /// How many complaints about this peer went unreported before this one, if it is to be reported: once a minute.
+impl<K: Eq + Hash> LogLimiter<K> {
+    /// How many log_limiter about this peer went unreported before this one, if it is to be reported: once a minute.
     pub(crate) fn due(&self, peer: K) -> Option<u64> {
         self.due_at(peer, Instant::now())
     }
@@ -56,21 +56,21 @@ mod tests {
 
     #[test]
     fn a_peer_is_complained_about_once_a_minute_and_the_rest_is_counted() {
-        let (complaints, start) = (Complaints::default(), Instant::now());
-        assert_eq!(complaints.due_at(7, start), Some(0));
-        assert_eq!(complaints.due_at(7, start + QUIET / 2), None);
-        assert_eq!(complaints.due_at(8, start + QUIET / 2), Some(0), "another peer has its own minute");
-        assert_eq!(complaints.due_at(7, start + QUIET), Some(1));
+        let (log_limiter, start) = (LogLimiter::default(), Instant::now());
+        assert_eq!(log_limiter.due_at(7, start), Some(0));
+        assert_eq!(log_limiter.due_at(7, start + QUIET / 2), None);
+        assert_eq!(log_limiter.due_at(8, start + QUIET / 2), Some(0), "another peer has its own minute");
+        assert_eq!(log_limiter.due_at(7, start + QUIET), Some(1));
     }
 
     #[test]
     fn memory_is_bounded_and_recovers() {
-        let (complaints, start) = (Complaints::default(), Instant::now());
+        let (log_limiter, start) = (LogLimiter::default(), Instant::now());
         for peer in 0..5000 {
-            complaints.due_at(peer, start);
+            log_limiter.due_at(peer, start);
         }
-        assert_eq!(complaints.peers.lock().len(), REMEMBERED);
-        assert_eq!(complaints.due_at(5000, start), None);
-        assert_eq!(complaints.due_at(5000, start + QUIET), Some(0));
+        assert_eq!(log_limiter.peers.lock().len(), REMEMBERED);
+        assert_eq!(log_limiter.due_at(5000, start), None);
+        assert_eq!(log_limiter.due_at(5000, start + QUIET), Some(0));
     }
 }

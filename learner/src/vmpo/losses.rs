@@ -5,7 +5,7 @@ use tch::{Device, Kind, Tensor};
 /// Entries of the packed tensor.
 const COUNT: usize = 18;
 
-/// The report of gradient steps, still on the device: nothing waits for it until [`Losses::to_metrics`].
+/// The report of gradient steps, still on the device: nothing waits for it until [`Losses::to_values`].
 #[derive(Debug)]
 pub struct Losses {
     /// The scalars and the ηs, then how many steps were taken, and how many were skipped after the last of them.
@@ -15,7 +15,7 @@ pub struct Losses {
 }
 
 impl Losses {
-    /// Packs scalars in the order of [`Metrics`]' fields, the ηs, and whether the step was taken.
+    /// Packs scalars in the order of [`LossValues`]' fields, the ηs, and whether the step was taken.
     pub(crate) fn pack(entries: [&Tensor; COUNT], temperatures: &Tensor, taken: &Tensor) -> Self {
         let scalars = entries.map(|entry| entry.detach().reshape([1]).to_kind(Kind::Float));
         let taken = taken.reshape([1]).to_kind(Kind::Float);
@@ -40,10 +40,10 @@ impl Losses {
     }
 
     /// Reads the report from the device, in one transfer.
-    pub fn to_metrics(&self) -> Metrics {
+    pub fn to_values(&self) -> LossValues {
         let mut all = vec![f32::NAN; self.packed.numel()];
         let count = all.len();
-        // A failed transfer leaves NaN, which `Metrics::is_finite` reports.
+        // A failed transfer leaves NaN, which `LossValues::is_finite` reports.
         let _ = self.packed.to_device(Device::Cpu).f_copy_data(&mut all, count);
         let counts = all.split_off(count.saturating_sub(2));
         let temperatures = all.split_off(COUNT.min(all.len()));
@@ -68,7 +68,7 @@ impl Losses {
             variance_explained,
             valid_share,
         ] = all.try_into().unwrap_or([f32::NAN; COUNT]);
-        Metrics {
+        LossValues {
             total_loss,
             policy_loss,
             temperature_loss,
@@ -99,7 +99,7 @@ impl Losses {
 /// Gradient steps in numbers. Those of steps that were skipped are left out; where none was taken they are NaN, or what
 /// the one step made of its losses.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Metrics {
+pub struct LossValues {
     /// The loss that was differentiated.
     pub total_loss: f32,
     /// L_π.
@@ -134,7 +134,7 @@ pub struct Metrics {
     pub gradient_norm: f32,
     /// 1 − Var(G − V) / Var(G), of the return summed over reward terms.
     pub variance_explained: f32,
-    /// Share of the rows that are transitions, and in a warm start demonstrate something.
+    /// Assignment of the rows that are transitions, and in a warm start demonstrate something.
     pub valid_share: f32,
     /// Every η after the step: one, or one for each task.
     pub temperatures: Vec<f32>,
@@ -146,7 +146,7 @@ pub struct Metrics {
     pub skipped_last: u64,
 }
 
-impl Metrics {
+impl LossValues {
     /// Names and numbers, for a log line.
     pub fn entries(&self) -> [(&'static str, f32); COUNT] {
         [

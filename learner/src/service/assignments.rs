@@ -7,14 +7,14 @@ use super::lock;
 
 /// The environments of a run in lockstep, each one actor's at most.
 #[derive(Debug)]
-pub(super) struct Shares {
+pub(super) struct Assignments {
     /// By number: the incarnation that simulates it, or did before it went.
     owners: Mutex<Vec<Option<u64>>>,
 }
 
 /// Environments that an actor got.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Share {
+pub(super) struct Assignment {
     /// Their numbers, one at least.
     pub(super) environments: Range<u32>,
     /// Some of them were another actor's before, which is gone.
@@ -32,7 +32,7 @@ pub(super) enum Denied {
     Lost,
 }
 
-impl Shares {
+impl Assignments {
     /// So many environments, all nobody's.
     pub(super) fn new(environments: usize) -> Self {
         Self { owners: Mutex::new(vec![None; environments]) }
@@ -46,7 +46,7 @@ impl Shares {
         wanted: u64,
         returns: bool,
         expected: impl Fn(u64) -> bool,
-    ) -> Result<Share, Denied> {
+    ) -> Result<Assignment, Denied> {
         let mut owners = lock(&self.owners);
         let own = |owner: &Option<u64>| *owner == Some(incarnation);
         let free = |owner: &Option<u64>| owner.is_none_or(|owner| !expected(owner));
@@ -70,7 +70,7 @@ impl Shares {
         let first = owners.iter().position(own).unwrap_or_default();
         let count = owners.iter().filter(|owner| own(owner)).count();
         let left = owners.iter().filter(|owner| free(owner)).count();
-        Ok(Share { environments: first as u32..(first + count) as u32, inherited, left })
+        Ok(Assignment { environments: first as u32..(first + count) as u32, inherited, left })
     }
 
     /// Whether an environment is this actor's.
@@ -89,37 +89,37 @@ mod tests {
         true
     }
 
-    fn share(environments: Range<u32>, inherited: bool, left: usize) -> Result<Share, Denied> {
-        Ok(Share { environments, inherited, left })
+    fn share(environments: Range<u32>, inherited: bool, left: usize) -> Result<Assignment, Denied> {
+        Ok(Assignment { environments, inherited, left })
     }
 
     #[test]
     fn actors_get_what_is_left_in_turn_and_one_too_many_gets_nothing() {
-        let shares = Shares::new(8);
-        assert_eq!(shares.claim(70, 3, false, everybody), share(0..3, false, 5));
-        assert_eq!(shares.claim(71, 3, false, everybody), share(3..6, false, 2));
-        assert_eq!(shares.claim(72, 3, false, everybody), share(6..8, false, 0));
-        assert_eq!(shares.claim(73, 3, false, everybody), Err(Denied::Taken));
+        let assignments = Assignments::new(8);
+        assert_eq!(assignments.claim(70, 3, false, everybody), share(0..3, false, 5));
+        assert_eq!(assignments.claim(71, 3, false, everybody), share(3..6, false, 2));
+        assert_eq!(assignments.claim(72, 3, false, everybody), share(6..8, false, 0));
+        assert_eq!(assignments.claim(73, 3, false, everybody), Err(Denied::Taken));
     }
 
     #[test]
     fn who_comes_back_gets_what_it_had_and_nothing_else() {
-        let shares = Shares::new(8);
-        shares.claim(70, 3, false, everybody).unwrap();
-        assert_eq!(shares.claim(70, 8, true, everybody), share(0..3, false, 5));
-        assert_eq!(shares.claim(70, 8, false, everybody), share(0..3, false, 5), "its reply was lost on the way");
-        assert_eq!(shares.claim(71, 3, true, everybody), Err(Denied::Lost), "of an earlier life of the learner");
+        let assignments = Assignments::new(8);
+        assignments.claim(70, 3, false, everybody).unwrap();
+        assert_eq!(assignments.claim(70, 8, true, everybody), share(0..3, false, 5));
+        assert_eq!(assignments.claim(70, 8, false, everybody), share(0..3, false, 5), "its reply was lost on the way");
+        assert_eq!(assignments.claim(71, 3, true, everybody), Err(Denied::Lost), "of an earlier life of the learner");
     }
 
     #[test]
     fn what_a_lost_actor_had_is_inherited_and_lost_for_it_as_a_whole() {
-        let shares = Shares::new(8);
-        shares.claim(70, 4, false, everybody).unwrap();
-        shares.claim(71, 4, false, everybody).unwrap();
+        let assignments = Assignments::new(8);
+        assignments.claim(70, 4, false, everybody).unwrap();
+        assignments.claim(71, 4, false, everybody).unwrap();
         let without = |incarnation| incarnation != 70;
-        assert_eq!(shares.claim(72, 2, false, without), share(0..2, true, 2));
-        assert_eq!(shares.claim(70, 4, true, everybody), Err(Denied::Lost));
-        assert_eq!(shares.claim(73, 4, false, everybody), share(2..4, false, 0));
+        assert_eq!(assignments.claim(72, 2, false, without), share(0..2, true, 2));
+        assert_eq!(assignments.claim(70, 4, true, everybody), Err(Denied::Lost));
+        assert_eq!(assignments.claim(73, 4, false, everybody), share(2..4, false, 0));
     }
 
     proptest! {
@@ -129,10 +129,10 @@ mod tests {
             environments in 1_usize..12,
             claims in prop::collection::vec((0_u64..6, 0_u64..6, any::<bool>(), 0_u64..6), 0..40),
         ) {
-            let shares = Shares::new(environments);
+            let assignments = Assignments::new(environments);
             let mut simulated = std::collections::HashMap::<u64, Range<u32>>::new();
             for (incarnation, wanted, returns, absent) in claims {
-                let claimed = shares.claim(incarnation, wanted, returns, |owner| owner != absent || owner == incarnation);
+                let claimed = assignments.claim(incarnation, wanted, returns, |owner| owner != absent || owner == incarnation);
                 match claimed {
                     Ok(share) => {
                         prop_assert!(!share.environments.is_empty());
