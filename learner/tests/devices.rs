@@ -9,7 +9,7 @@ use std::sync::OnceLock;
 
 use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
 use comic_learner::device::Backend;
-use comic_learner::vmpo::{Losses, Metrics, VmpoLearner};
+use comic_learner::vmpo::{LossValues, Losses, VmpoLearner};
 use tch::Device;
 #[cfg(feature = "xla")]
 use vmpo_support::LENGTH;
@@ -49,7 +49,7 @@ fn experiments() -> Vec<(String, Experiment, TaskSpec)> {
     alone.chain(joint).collect()
 }
 
-fn step(learner: &mut VmpoLearner, unrolls: &Unrolls) -> Metrics {
+fn step(learner: &mut VmpoLearner, unrolls: &Unrolls) -> LossValues {
     // As of several gradient steps on a batch, whose order is another one.
     let order: Vec<usize> = (0..COUNT).rev().collect();
     let minibatch = unrolls.minibatch_on(learner.device()).select(&order);
