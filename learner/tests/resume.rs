@@ -11,7 +11,7 @@ use comic_experiment::{Experiment, TaskSpec, resolve};
 use comic_learner::checkpoint::{Snapshot, Store, find, read};
 use comic_learner::device::Backend;
 use comic_learner::publish::{Published, Publisher};
-use comic_learner::security::{Limits, Security};
+use comic_learner::security::{ConnectionLimits, Security};
 use comic_learner::service::quarantine::QuarantineOptions;
 use comic_learner::service::{self, Evaluation, Shared};
 use comic_learner::train::trainer::{Ending, Setup, Trainer};
@@ -141,7 +141,7 @@ fn live_evaluated(
         run: run.to_path_buf(),
         id: store.run().unwrap(),
         security: Security::default(),
-        limits: Limits::default(),
+        limits: ConnectionLimits::default(),
         experiment: experiment.clone(),
         spec: spec.clone(),
         assets: Vec::new(),
