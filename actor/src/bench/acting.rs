@@ -17,8 +17,8 @@ use crate::Error;
 use crate::acting::ForwardPass;
 use crate::mailbox::{Conduct, Directive};
 use crate::policy::TorchPolicy;
-use crate::seeds::derive;
 use crate::worker::{Progress, Worker};
+use comic_experiment::seed::derive;
 
 /// One thread against the physics alone.
 pub(super) fn policy(subject: &Subject) -> Result<Figure, Error> {

@@ -10,7 +10,7 @@ use comic_tasks::{Environment as _, Simulated};
 use super::figure::{Figure, Medians, interleave};
 use super::{ENVIRONMENTS, Subject};
 use crate::Error;
-use crate::seeds::derive;
+use comic_experiment::seed::derive;
 
 /// Images of a segment in the fast setting, and in dm_control's.
 const FAST: usize = 64;
