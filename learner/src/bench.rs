@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
+use comic_experiment::statistics::median;
 use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
 use comic_networks::{Layer, Sizes, low_level_layers, to_safetensors};
 use comic_proto::UnrollShape;
@@ -154,14 +155,14 @@ pub fn run(threads: usize, repeats: usize, subject: Subject, device: DeviceName)
             floors.push(floor);
         }
     }
-    let (value, floor) = (median(updates), median(floors));
+    let (value, floor) = (median(updates).unwrap_or(f64::NAN), median(floors).unwrap_or(f64::NAN));
     let mut line = json!({
         "figure": figure, "value": value, "unit": "ms", "floor": floor, "ratio": value / floor,
         "threads": threads, "repeats": repeats, "device": device.to_string(), "copy": median(copies),
         "read_back": median(reads), "compilations": backend.compilations()?,
     });
     if !one_tasks.is_empty() {
-        let one_task = median(one_tasks);
+        let one_task = median(one_tasks).unwrap_or(f64::NAN);
         line["one_task"] = json!(one_task);
         line["against_one_task"] = json!(value / one_task);
     }
@@ -325,9 +326,4 @@ fn milliseconds<T, E: Into<anyhow::Error>>(work: impl FnOnce() -> Result<T, E>) 
     let start = Instant::now();
     work().map_err(Into::into)?;
     Ok(start.elapsed().as_secs_f64() * 1e3)
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
 }

@@ -25,6 +25,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
 use clap::{Args, Subcommand};
+use comic_experiment::statistics::median;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::{UnrollLayout, UnrollShape};
 use serde_json::json;
@@ -145,7 +146,7 @@ impl Round {
 
 /// Prints one figure of these rounds and the floor's.
 fn show(figure: &str, rounds: &[Round], floors: &[Round], rest: serde_json::Value) {
-    let of = |rounds: &[Round], part: fn(&Round) -> f64| median(rounds.iter().map(part).collect());
+    let of = |rounds: &[Round], part: fn(&Round) -> f64| median(rounds.iter().map(part).collect()).unwrap_or(f64::NAN);
     let value = of(rounds, |round| round.megabytes_per_second);
     let floor = of(floors, |round| round.megabytes_per_second);
     let mut line = json!({
@@ -312,9 +313,4 @@ fn positive(text: &str) -> Result<f64, String> {
         Ok(number) if (1e-3..=1e6).contains(&number) => Ok(number),
         _ => Err("must be a number from 0.001 to 1000000".into()),
     }
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
 }

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::io::Write as _;
 use std::time::{Duration, Instant};
 
-use comic_experiment::LowLevelName;
+use comic_experiment::{LowLevelName, statistics::median};
 use serde::Serialize;
 
 use crate::Error;
@@ -65,13 +65,8 @@ pub(super) fn interleave<E>(budget: Duration, mut pair: impl FnMut() -> Result<(
         values.push(value);
         floors.push(floor);
     }
-    Ok(Medians { value: median(&mut values), floor: median(&mut floors) })
-}
-
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    let middle = values.len() / 2;
-    if values.len().is_multiple_of(2) { f64::midpoint(values[middle - 1], values[middle]) } else { values[middle] }
+    let of = |values| median(values).unwrap_or(f64::NAN);
+    Ok(Medians { value: of(values), floor: of(floors) })
 }
 
 #[cfg(test)]
@@ -87,6 +82,5 @@ mod tests {
         });
         let Medians { value, floor } = medians.unwrap();
         assert_eq!((value, floor), (5.0, 1.5));
-        assert_eq!(median(&mut [4.0, 1.0, 2.0, 3.0]), 2.5);
     }
 }

@@ -3,6 +3,8 @@
 use std::f64::consts::{PI, TAU};
 use std::ops::Range;
 
+use comic_experiment::statistics::median;
+
 use super::skeleton::BONES;
 use crate::JOINT_RANGES;
 use crate::body::joint;
@@ -89,23 +91,9 @@ fn unwrap(frames: &mut [[f64; 56]], joint: usize, clip: &Range<usize>) {
         }
         angles[joint] += offset;
     }
-    let turns = turns(median(frames[clip.clone()].iter().map(|angles| angles[joint]).collect()), joint);
+    let turns =
+        turns(median(frames[clip.clone()].iter().map(|angles| angles[joint]).collect()).unwrap_or_default(), joint);
     frames.iter_mut().for_each(|angles| angles[joint] -= turns);
-}
-
-/// The mean of the two middle values of an even count; 0 of nothing.
-pub(super) fn median(values: Vec<f64>) -> f64 {
-    percentile(values, 50.0)
-}
-
-/// Linear between neighbours, as numpy's default; 0 of nothing.
-pub(super) fn percentile(mut values: Vec<f64>, percent: f64) -> f64 {
-    values.sort_unstable_by(f64::total_cmp);
-    let Some(last) = values.len().checked_sub(1) else { return 0.0 };
-    let place = percent / 100.0 * last as f64;
-    let below = (place.floor() as usize).min(last);
-    let above = (below + 1).min(last);
-    values[below] + (place - below as f64) * (values[above] - values[below])
 }
 
 #[cfg(test)]
@@ -151,12 +139,5 @@ mod tests {
     fn thumbs_rest() {
         let (thumb, frames) = recorded("rthumbrx", &[9.0]);
         assert_eq!(fit(&frames, &(0..1)).joints[0][thumb], 0.3);
-    }
-
-    #[test]
-    fn percentiles_are_linear_between_neighbours() {
-        assert_eq!(percentile(vec![4.0, 1.0, 2.0], 50.0), 2.0);
-        assert_eq!(percentile(vec![4.0, 1.0], 25.0), 1.75);
-        assert_eq!(percentile(vec![], 50.0), 0.0);
     }
 }

@@ -1,6 +1,7 @@
 //! The floor under a recording, and feet that stand on it.
 
-use super::angles::percentile;
+use comic_experiment::statistics::percentile;
+
 use super::constants::Floor;
 use super::sole;
 use crate::JOINT_RANGES;
@@ -111,11 +112,12 @@ fn find(heights: &[f64]) -> Floor {
 
 /// The floor's height at each step, from the body's lowest points.
 fn baseline(heights: &[f64], floor: Floor) -> Vec<f64> {
+    let height = |heights: &[f64], percent| percentile(heights.to_vec(), percent).unwrap_or_default();
     match floor {
         Floor::Sliding { percent, half, smooth } => {
-            sliding(&sliding(heights, half, |window| percentile(window.to_vec(), percent)), smooth, mean)
+            sliding(&sliding(heights, half, |window| height(window, percent)), smooth, mean)
         }
-        Floor::Constant { percent } => vec![percentile(heights.to_vec(), percent); heights.len()],
+        Floor::Constant { percent } => vec![height(heights, percent); heights.len()],
     }
 }
 

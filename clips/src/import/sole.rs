@@ -1,6 +1,7 @@
 //! How far a subject's ankles hold the body's soles from level.
 
-use super::angles::median;
+use comic_experiment::statistics::median;
+
 use crate::body::{Frames, body, joint};
 use crate::spatial::{Quaternion, Vector, dot, norm, subtract};
 
@@ -45,7 +46,7 @@ pub(super) fn find(poses: impl Iterator<Item = (Vector, Quaternion, [f64; 56])>)
     }
     stood.map(|by_limit| {
         let pitches = by_limit.into_iter().find(|pitches| pitches.len() >= FEWEST)?;
-        Some((-median(pitches) * 2.0).round() / 2.0)
+        median(pitches).map(|pitch| (-pitch * 2.0).round() / 2.0)
     })
 }
 

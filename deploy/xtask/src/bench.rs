@@ -3,7 +3,7 @@
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, Result, bail};
-use comic_experiment::LowLevelName;
+use comic_experiment::{LowLevelName, statistics::median};
 use serde::{Deserialize, Serialize};
 
 use crate::{python, setup, workspace};
@@ -119,8 +119,9 @@ fn learner(threads: u16, arguments: &[String]) -> Result<()> {
     let Some(first) = ours.first() else { return Ok(()) };
     let mut lines = Vec::new();
     for (index, figure) in first.iter().enumerate() {
-        let of_rounds =
-            |part: fn(&Figure) -> f64| median(ours.iter().filter_map(|round| round.get(index)).map(part).collect());
+        let of_rounds = |part: fn(&Figure) -> f64| {
+            median(ours.iter().filter_map(|round| round.get(index)).map(part).collect()).unwrap_or(f64::NAN)
+        };
         let (value, floor) = (of_rounds(|figure| figure.value), of_rounds(|figure| figure.floor));
         let mut line = Figure { value, floor, ratio: value / floor, ..figure.clone() };
         for (name, number) in &mut line.rest {
@@ -132,7 +133,7 @@ fn learner(threads: u16, arguments: &[String]) -> Result<()> {
     if compares {
         let update = lines.iter().find(|figure| figure.figure == "learner.update");
         let update = update.context("comic-learner bench printed no learner.update")?.clone();
-        let floor = median(theirs);
+        let floor = median(theirs).unwrap_or(f64::NAN);
         let rest = serde_json::Map::new();
         lines.push(Figure { figure: "learner.pytorch".into(), floor, ratio: update.value / floor, rest, ..update });
     }
@@ -172,24 +173,4 @@ fn show(figures: &[Figure]) -> Result<()> {
         println!("{}", serde_json::to_string(figure)?);
     }
     Ok(())
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    match values.len() {
-        0 => f64::NAN,
-        length if length % 2 == 1 => values[length / 2],
-        length => (values[length / 2 - 1] + values[length / 2]) / 2.0,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_median_stands_in_the_middle_whatever_the_order() {
-        assert_eq!(median(vec![3.0, 1.0, 2.0]), 2.0);
-        assert_eq!(median(vec![4.0, 1.0, 2.0, 3.0]), 2.5);
-    }
 }
