@@ -2,7 +2,10 @@
 
 use std::sync::OnceLock;
 
-use crate::{Clip, Error, JOINT_RANGES, JOINTS, Motion, WalkerModel, nearest::hint};
+use crate::clip::{Clip, Motion};
+use crate::error::Error;
+use crate::humanoid::{JOINT_RANGES, JOINTS, WalkerModel};
+use crate::nearest::hint;
 
 /// Format: `data/make_builtin.py`; provenance: `data/README.md`, `data/builtin.json`.
 const BYTES: &[u8] = include_bytes!("../data/builtin.bin");

@@ -8,9 +8,14 @@ use std::{
 use comic_experiment::ClipSource;
 use sha2::{Digest, Sha256};
 
-use crate::{
-    Clip, Entry, Error, WalkerModel, builtin, file::ClipFile, file::Header, nearest::hint, pose_to_action, subset,
-};
+use crate::builtin;
+use crate::clip::Clip;
+use crate::entry::Entry;
+use crate::error::Error;
+use crate::file::{ClipFile, Header};
+use crate::humanoid::{WalkerModel, pose_to_action};
+use crate::nearest::hint;
+use crate::subsets::subset;
 
 const BUILTIN: &str = "builtin:";
 

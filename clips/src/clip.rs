@@ -1,6 +1,6 @@
 //! A clip in memory.
 
-use crate::WalkerModel;
+use crate::humanoid::WalkerModel;
 
 /// One clip, whole: `T` frames, `dt` apart.
 #[derive(Clone, Debug, PartialEq)]

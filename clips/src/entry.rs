@@ -2,7 +2,8 @@
 
 use std::ops::Range;
 
-use crate::{Error, WalkerModel};
+use crate::error::Error;
+use crate::humanoid::WalkerModel;
 
 /// Two time steps that differ by less than this (s) are the same.
 const TIMESTEP_TOLERANCE: f64 = 1e-9;

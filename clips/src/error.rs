@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use crate::WalkerModel;
+use crate::humanoid::WalkerModel;
 
 /// Every error of this crate; each message names file and item, and what to do.
 #[derive(Debug, thiserror::Error)]

@@ -1,8 +1,8 @@
 //! What follows from the pose by forward kinematics.
 
 use crate::body::{BODIES, Frames, ROOT, body};
+use crate::clip::{Features, Motion};
 use crate::spatial::{subtract, unrotate};
-use crate::{Features, Motion};
 
 /// dm_control's order of `appendages`: the four end effectors, then the head.
 const APPENDAGES: [usize; 5] = [body("rradius"), body("lradius"), body("rfoot"), body("lfoot"), body("head")];

@@ -9,7 +9,9 @@ use std::{
 
 use hdf5_reader::{FileStorage, Hdf5File, OpenOptions, Storage, error::Error as Hdf5Error, group::Group};
 
-use crate::{Clip, Error, Features, Motion, WalkerModel};
+use crate::clip::{Clip, Features, Motion};
+use crate::error::Error;
+use crate::humanoid::WalkerModel;
 
 /// Longest clip taken: 50 minutes at 0.03 s; the longest of CMU's has 6,371 frames. It bounds what a hostile
 /// `num_steps` can make us allocate (340 MB).

@@ -20,13 +20,14 @@ mod velocity;
 
 use std::f64::consts::FRAC_PI_2;
 use std::ops::Range;
-use std::path::PathBuf;
 
-pub use constants::{Constants, Floor, Taken};
+pub use constants::{Constants, Floor, Take, UsedConstants};
 pub use manifest::read_manifest;
 
+use crate::clip::{Clip, Features};
+use crate::error::Error;
+use crate::humanoid::WalkerModel;
 use crate::spatial::{Quaternion, Vector, about, multiply};
-use crate::{Clip, Error, Features, WalkerModel};
 use amc::Recording;
 use asf::Skeleton;
 use floor::Poses;
@@ -36,19 +37,6 @@ const DT: f64 = 0.03;
 /// The smoothing looks this many recorded frames beyond the ones in use.
 const SMOOTHING_REACH: usize = 2;
 
-/// A recording and what its clip shall be.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Take {
-    /// The clip's name.
-    pub name: String,
-    /// The subject's skeleton.
-    pub asf: PathBuf,
-    /// The recording.
-    pub amc: PathBuf,
-    /// What is known of it.
-    pub constants: Constants,
-}
-
 /// Converts a recording to a clip of the CMU humanoid V2020, 0.03 s a frame.
 ///
 /// Velocities are central differences, since what is compared with them is an instantaneous velocity. Everything but
@@ -56,7 +44,7 @@ pub struct Take {
 ///
 /// # Errors
 /// [`Error::Unreadable`], [`Error::Line`] and [`Error::Recording`] for files that are not CMU's; [`Error::Constant`].
-pub fn import(take: &Take) -> Result<(Clip, Taken), Error> {
+pub fn import(take: &Take) -> Result<(Clip, UsedConstants), Error> {
     let constants = &take.constants;
     constants.check()?;
     let skeleton = Skeleton::read(&take.asf)?;
@@ -94,7 +82,7 @@ pub fn import(take: &Take) -> Result<(Clip, Taken), Error> {
     let features = Features::of(&motion);
     let name = take.name.clone();
     let clip = Clip { name, model: WalkerModel::Cmu2020, dt: DT, motion, features: Some(features) };
-    Ok((clip, Taken { scale, sole_degrees, floor, arm_regularisation, frames, notes }))
+    Ok((clip, UsedConstants { scale, sole_degrees, floor, arm_regularisation, frames, notes }))
 }
 
 /// The recorded frames in use; there must be two poses in them, for a velocity.

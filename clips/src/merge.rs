@@ -4,7 +4,9 @@ use std::path::Path;
 
 use comic_experiment::ClipSource;
 
-use crate::{Catalogue, ClipWriter, Error};
+use crate::catalogue::Catalogue;
+use crate::error::Error;
+use crate::write::ClipWriter;
 
 /// Writes the clips of all `sources` into one new file, whole, in the order of the sources; returns how many. Built-in
 /// clips get their features by forward kinematics. Only what is used of a clip goes along: markers, props and dates of

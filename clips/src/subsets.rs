@@ -2,7 +2,8 @@
 
 use comic_experiment::SUBSETS;
 
-use crate::{Error, nearest::hint};
+use crate::error::Error;
+use crate::nearest::hint;
 
 const TEXT: &str = include_str!("../data/subsets.txt");
 

@@ -9,7 +9,8 @@ use hdf5_pure::{
 };
 use tempfile::NamedTempFile;
 
-use crate::{Clip, Error, Features, Motion};
+use crate::clip::{Clip, Features, Motion};
+use crate::error::Error;
 
 /// Bytes of datasets that are held in memory before they go to the file.
 const STAGED: usize = 64 << 20;

@@ -1,13 +1,13 @@
 //! The search through what a file has of a clip.
 
-use super::tally::Tally;
-use super::{
+use super::defect::{
     AIRBORNE, Defect, JOINT_EXCESS, JOINT_SPEED, Kind, LONGEST_FLIGHT, PENETRATION, ROOT_SPEED, ROOT_TURN, unreadable,
 };
+use super::tally::Tally;
 use crate::body::Frames;
 use crate::file::{NORM_TOLERANCE, Stored};
+use crate::humanoid::{JOINT_RANGES, JOINTS};
 use crate::spatial::{norm, normalize, rotation_between, subtract};
-use crate::{JOINT_RANGES, JOINTS};
 
 /// The pose, as far as it is there; frame by frame, where all its numbers are finite.
 pub(super) struct Columns {

@@ -1,6 +1,6 @@
 //! How often and how badly.
 
-use super::{Defect, Kind};
+use super::defect::{Defect, Kind};
 
 /// Frames in which something is wrong.
 #[derive(Clone, Debug, Default)]

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::lines::Lines;
 use super::skeleton::{BONES, Bone};
-use crate::Error;
+use crate::error::Error;
 
 /// Longest recording taken: 100,000 frames of 0.03 s, the longest clip that is read back.
 const FRAMES: usize = 360_000;

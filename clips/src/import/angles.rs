@@ -6,8 +6,8 @@ use std::ops::Range;
 use comic_experiment::statistics::median;
 
 use super::skeleton::BONES;
-use crate::JOINT_RANGES;
 use crate::body::joint;
+use crate::humanoid::JOINT_RANGES;
 
 /// Thumbs are noise in CMU's recordings; these angles (rad) are a resting hand's.
 const THUMBS: [(usize, f64); 4] =
@@ -101,7 +101,7 @@ mod tests {
     use super::*;
 
     fn recorded(name: &'static str, angles: &[f64]) -> (usize, Vec<[f64; 56]>) {
-        let place = crate::JOINTS.iter().position(|joint| *joint == name).unwrap();
+        let place = crate::humanoid::JOINTS.iter().position(|joint| *joint == name).unwrap();
         let frame = |angle: &f64| std::array::from_fn(|joint| if joint == place { *angle } else { 0.0 });
         (place, angles.iter().map(frame).collect())
     }

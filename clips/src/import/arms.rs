@@ -4,8 +4,8 @@
 //! clamped angles alone leave the wrist some 18 cm off.
 
 use super::angles::{excess, wrap};
-use crate::JOINT_RANGES;
 use crate::body::{Frames, body, joint};
+use crate::humanoid::JOINT_RANGES;
 use crate::spatial::{IDENTITY, Vector, cross, dot, subtract};
 
 /// m/rad: how much an angle's distance from the recorded one weighs against a point's.

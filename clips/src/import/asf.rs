@@ -4,8 +4,8 @@ use std::path::Path;
 
 use super::lines::Lines;
 use super::skeleton::Bone;
-use crate::Error;
 use crate::body::{self, Frames};
+use crate::error::Error;
 use crate::spatial::{about, matrix, multiply};
 
 /// Metres in an inch: files count lengths in units of an inch over the `length` under `:units`.

@@ -2,9 +2,23 @@
 
 use std::fmt;
 use std::ops::Range;
+use std::path::PathBuf;
 use std::str::FromStr;
 
-use crate::Error;
+use crate::error::Error;
+
+/// A recording and what its clip shall be.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Take {
+    /// The clip's name.
+    pub name: String,
+    /// The subject's skeleton.
+    pub asf: PathBuf,
+    /// The recording.
+    pub amc: PathBuf,
+    /// What is known of it.
+    pub constants: Constants,
+}
 
 /// The constants of an import; what is `None` is found from the recording.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -44,7 +58,7 @@ pub enum Floor {
 
 /// What an import took, given or found.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Taken {
+pub struct UsedConstants {
     /// See [`Constants::scale`].
     pub scale: f64,
     /// See [`Constants::sole_degrees`].
@@ -137,7 +151,7 @@ impl Constants {
     }
 }
 
-impl fmt::Display for Taken {
+impl fmt::Display for UsedConstants {
     /// As options of the command line.
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { scale, sole_degrees: [left, right], floor, arm_regularisation, frames, .. } = self;

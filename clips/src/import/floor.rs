@@ -4,8 +4,8 @@ use comic_experiment::statistics::percentile;
 
 use super::constants::Floor;
 use super::sole;
-use crate::JOINT_RANGES;
 use crate::body::{Frames, Geom, body, geoms, joint};
+use crate::humanoid::JOINT_RANGES;
 use crate::spatial::{Quaternion, Vector};
 
 /// m: how deep a sole may sink into the floor.

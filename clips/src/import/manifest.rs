@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::{Constants, Floor, Take};
-use crate::Error;
+use super::constants::{Constants, Floor, Take};
+use crate::error::Error;
 
 /// A manifest is short; what is longer is something else.
 const LONGEST: u64 = 16 << 20;

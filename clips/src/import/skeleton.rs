@@ -1,6 +1,6 @@
 //! The bones of CMU's skeletons that move, and what the V2020 body makes of them.
 
-use crate::JOINTS;
+use crate::humanoid::JOINTS;
 
 /// A bone and the angles an AMC file has of it, in the order of its `dof` line.
 ///

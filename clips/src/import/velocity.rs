@@ -1,7 +1,7 @@
 //! Velocities by central differences.
 
 use super::floor::Poses;
-use crate::Motion;
+use crate::clip::Motion;
 use crate::spatial::rotation_between;
 
 /// One frame fewer than there are poses, `dt` seconds apart: the last pose only serves the velocities. The first
