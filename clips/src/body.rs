@@ -84,8 +84,8 @@ pub(crate) fn geoms() -> &'static [Geom] {
 }
 
 impl Frames {
-    /// Forward kinematics for the root at `position` (m) and `quaternion`, and the hinges at `joints` (rad, in the order
-    /// of [`JOINTS`]). The order of operations is MuJoCo's (`mj_kinematics`), so quaternions get the same signs.
+    /// Forward kinematics for the root at `position` (m) and `quaternion`, and the hinges at `joints` (rad, in the
+    /// order of [`JOINTS`]). The order of operations is MuJoCo's (`mj_kinematics`), so quaternions get the same signs.
     pub(crate) fn of(position: &Vector, quaternion: &Quaternion, joints: &[f64; 56]) -> Self {
         let free = normalize(*quaternion);
         let mut frames = Self {

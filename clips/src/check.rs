@@ -1,7 +1,7 @@
-//! Defects of clips, all of them at once.
+//! A search for all defects of clips.
 //!
-//! The limits are this project's choice: no source fixes them. They are wide enough for what people do (a run, a jump
-//! from a height), also where it is scaled to the body's size.
+//! The limits are this project's choice; no publication defines them. They allow what people do (a run, a jump from a
+//! height), also after scaling to the size of the body.
 
 mod defect;
 mod stored;
@@ -21,26 +21,27 @@ pub use defect::{
 use defect::unreadable;
 use stored::Columns;
 
-/// A clip, searched.
+/// The result for one clip.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Checked {
     /// The clip's name.
     pub clip: String,
-    /// How many frames it has; 0 when that cannot be read.
+    /// Number of frames; 0 if it cannot be read.
     pub frames: usize,
-    /// Whether joints and floor were checked: only the V2020 body's are known.
+    /// Whether joints and floor were checked. That is possible only for the V2020 body.
     pub body_checked: bool,
-    /// The lowest and the highest of the heights of the body's lowest point, m, where the body was checked.
+    /// Minimum and maximum, over all frames, of the height of the body's lowest point, m. `None` if the body was not
+    /// checked.
     pub lowest_point: Option<[f64; 2]>,
     /// All defects, sorted by kind.
     pub defects: Vec<Defect>,
 }
 
-/// Searches every clip of a file, or those `chosen`.
+/// Checks the `chosen` clips of a file; all clips if `chosen` is empty.
 ///
 /// # Errors
-/// [`Error::Unreadable`], [`Error::Malformed`], [`Error::NoClips`] and [`Error::NoSuchClip`] when there is no clip to
-/// be found; what is wrong with a clip is no error but a [`Defect`].
+/// [`Error::Unreadable`], [`Error::Malformed`], [`Error::NoClips`] and [`Error::NoSuchClip`], if a clip cannot be
+/// found. A clip that is damaged is not an error: it has a [`Defect`].
 pub fn check(path: &Path, chosen: &[String]) -> Result<Vec<Checked>, Error> {
     let file = ClipFile::open(path)?;
     if file.names().is_empty() {

@@ -4,37 +4,37 @@ use serde::Serialize;
 
 use crate::error::Error;
 
-/// m: how deep a geom may sink into the floor, the plane z = 0.
+/// Greatest depth of a geom in the floor (the plane z = 0), m.
 pub const PENETRATION: f64 = 0.02;
-/// m: what is higher above the floor than this, is in the air.
+/// A body is in the air if its lowest point is higher than this, m.
 pub const AIRBORNE: f64 = 0.05;
-/// s: longest flight; a person's centre of mass that rises by 0.8 m is back after that time.
+/// Longest flight, s. A centre of mass that rises by 0.8 m comes down after this time.
 pub const LONGEST_FLIGHT: f64 = 0.8;
-/// rad: how far a joint may leave its range.
+/// Greatest angle of a joint beyond its range, rad.
 pub const JOINT_EXCESS: f64 = 0.01;
-/// m/s: fastest root; sprinters reach 12, and clips are scaled by up to 1.4.
+/// Greatest speed of the root, m/s. Sprinters reach 12, and clips are scaled by up to 1.4.
 pub const ROOT_SPEED: f64 = 17.0;
-/// rad/s: fastest turn of the root; skaters reach 30.
+/// Greatest angular speed of the root, rad/s. Skaters reach 30.
 pub const ROOT_TURN: f64 = 35.0;
-/// rad/s: fastest joint; kicks and throws of recorded clips reach 25.
+/// Greatest angular speed of a joint, rad/s. Kicks and throws in recorded clips reach 25.
 pub const JOINT_SPEED: f64 = 40.0;
 
-/// What is wrong.
+/// Kind of a defect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Kind {
-    /// A dataset or attribute is missing, mis-shaped or damaged; `detail` has the reason.
+    /// A dataset or attribute is missing, has the wrong shape, or is damaged. `detail` gives the reason.
     Unreadable,
-    /// NaN or infinity; `worst` is how many such numbers.
+    /// A number is NaN or infinite; `worst` is the count of such numbers.
     NotFinite,
-    /// A quaternion's norm is not 1; `worst` is how far off.
+    /// The norm of a quaternion is not 1; `worst` is the greatest difference from 1.
     QuaternionNorm,
-    /// A joint leaves its range by more than [`JOINT_EXCESS`]; `worst` in rad.
+    /// A joint is more than [`JOINT_EXCESS`] beyond its range; `worst` in rad.
     JointLimit,
     /// A geom is deeper in the floor than [`PENETRATION`]; `worst` in m.
     Penetration,
-    /// The whole body is above [`AIRBORNE`] for longer than [`LONGEST_FLIGHT`]; `worst` is its height in m.
+    /// The whole body is higher than [`AIRBORNE`] for longer than [`LONGEST_FLIGHT`]; `worst` is its height in m.
     Floating,
     /// The root or a joint moves faster from one frame to the next than [`ROOT_SPEED`], [`ROOT_TURN`] or
     /// [`JOINT_SPEED`]; `worst` in m/s or rad/s.
@@ -44,17 +44,17 @@ pub enum Kind {
 /// One defect of a clip.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Defect {
-    /// What is wrong.
+    /// The kind.
     pub kind: Kind,
-    /// Where: a dataset, a joint, a geom, or `root`.
+    /// The dataset, joint or geom that has the defect, or `root`.
     pub item: String,
-    /// In how many frames.
+    /// Number of frames with the defect.
     pub frames: usize,
-    /// The first of them.
+    /// The first of these frames.
     pub first_frame: usize,
-    /// The worst of it, in the kind's unit; 0 for what has no size.
+    /// The worst value, in the unit of the kind; 0 for kinds without a value.
     pub worst: f64,
-    /// In words.
+    /// A description for people.
     pub detail: String,
 }
 
