@@ -47,6 +47,8 @@ pub struct FinishedUnroll {
     pub episodes: Vec<EpisodeStatistics>,
     /// The environment's number.
     pub environment: u32,
+    /// Index of the unroll's task among the tasks of the experiment.
+    pub task: u32,
     /// Held until the learner has answered for it, if somebody waits for that.
     pub ticket: Option<Arc<Ticket>>,
 }
@@ -230,11 +232,21 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
             .enumerate()
             .map(|(index, lane)| {
                 let (payload, episodes) = lane.take_unroll(layout);
+                let task = lane.task();
                 if lane.at_episode_end() {
                     lane.begin_episode(&mut batch.row(index));
                 }
                 let environment = lane.number();
-                FinishedUnroll { payload, learner_epoch, version, demonstration, episodes, environment, ticket: None }
+                FinishedUnroll {
+                    payload,
+                    learner_epoch,
+                    version,
+                    demonstration,
+                    episodes,
+                    environment,
+                    task,
+                    ticket: None,
+                }
             })
             .collect()
     }

@@ -55,6 +55,7 @@ fn unrolls_pass_the_learners_validation() {
                 layout_hash: setup.layout.hash().to_vec(),
                 demonstration: unroll.demonstration,
                 episodes: unroll.episodes,
+                task: unroll.task,
                 ..UnrollHeader::default()
             };
             let expected = Expected { clips: &[setup.task.spec().clips.len()], epoch: 2, newest_version: 4 };

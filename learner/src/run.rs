@@ -193,7 +193,7 @@ fn prepare(
         Some(snapshot) => accounting(snapshot).map_err(|error| incompatible(&options.run, error))?,
         None => Ledger::new(),
     };
-    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));
+    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| task.name.clone()));
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
     let config = batches(&experiment.unroll);
     let batcher = Batcher::new(layout, config, Phase { epoch, ..Phase::default() }, ledger);

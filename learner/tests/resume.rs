@@ -132,7 +132,7 @@ fn live_evaluated(
     let ledger = resume.as_ref().map_or_else(Ledger::new, |snapshot| {
         Ledger::restore(&serde_json::from_slice(snapshot.part("accounting.json").unwrap()).unwrap()).unwrap()
     });
-    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));
+    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| task.name.clone()));
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
     let config = Config { unrolls: experiment.unroll.batch, max_staleness: 1000, ahead: 1, order: BatchOrder::Arrival };
     let batcher = Batcher::new(layout.clone(), config, Phase { epoch, ..Phase::default() }, ledger);
@@ -161,7 +161,8 @@ fn live_evaluated(
             for sequence in joined.next_sequence..unrolls {
                 let (actor, incarnation) = (joined.actor, INCARNATION);
                 let header = UnrollHeader { actor, incarnation, sequence, learner_epoch: epoch, ..Default::default() };
-                let header = UnrollHeader { version: batcher.phase().version, ..header };
+                let task = (sequence % spec.tasks.len() as u64) as u32;
+                let header = UnrollHeader { version: batcher.phase().version, task, ..header };
                 let mut unroll = recorded(&layout, &spec, sequence);
                 alter(sequence, &mut unroll);
                 match futures::executor::block_on(batcher.insert(&header, unroll.into_bytes())) {

@@ -44,4 +44,4 @@ pub use validate::{Expected, Invalid, MAX_SEQUENCE, validate};
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
 /// Version of the protocol, which `Join` compares; it changes whenever an old peer would misunderstand a new one.
-pub const PROTOCOL_VERSION: u32 = 2;
+pub const PROTOCOL_VERSION: u32 = 3;

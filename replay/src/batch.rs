@@ -60,11 +60,9 @@ impl Buffer {
         self.filled.get(slot) == Some(&false)
     }
 
-    /// The first row's clip of every unroll in it.
-    pub(crate) fn first_clips(&self) -> impl Iterator<Item = u32> {
-        let rows = self.clips.len() / self.filled.len().max(1);
-        let filled = self.filled.iter().enumerate().filter(|(_, filled)| **filled);
-        filled.map(move |(slot, _)| self.clips[slot * rows])
+    /// The task of every unroll in it.
+    pub(crate) fn tasks(&self) -> impl Iterator<Item = u32> {
+        self.filled.iter().zip(&self.headers).filter(|(filled, _)| **filled).map(|(_, header)| header.task)
     }
 
     /// Frees every slot.
@@ -90,18 +88,17 @@ impl Buffer {
         self.unrolls += 1;
     }
 
-    /// Lets go of the unrolls that are not `kept`; their slots are free. Gives the first clips of those that went.
+    /// Frees the slots of the unrolls that are not `kept`, and returns the tasks of those unrolls.
     pub(crate) fn retain(&mut self, kept: impl Fn(&UnrollHeader) -> bool) -> Vec<u32> {
-        let rows = self.clips.len() / self.filled.len().max(1);
-        let mut went = Vec::new();
-        for (slot, (filled, header)) in self.filled.iter_mut().zip(&self.headers).enumerate() {
+        let mut removed = Vec::new();
+        for (filled, header) in self.filled.iter_mut().zip(&self.headers) {
             if *filled && !kept(header) {
                 *filled = false;
                 self.unrolls -= 1;
-                went.push(self.clips[slot * rows]);
+                removed.push(header.task);
             }
         }
-        went
+        removed
     }
 
     /// Moves unrolls of `other` here, as far as there are free slots.
@@ -193,6 +190,11 @@ impl Batch {
     /// The headers, `[B]`, without the layout hash, which all of them share.
     pub fn headers(&self) -> &[UnrollHeader] {
         self.buffer.as_ref().map_or(&[], |buffer| &buffer.headers)
+    }
+
+    /// The task of each unroll, `[B]`: its index among the tasks of the experiment.
+    pub fn tasks(&self) -> Vec<usize> {
+        self.headers().iter().map(|header| header.task as usize).collect()
     }
 
     /// Ends its life in the accounting: trained on, or dropped for a reason.

@@ -33,8 +33,8 @@
 //!
 //! # Invariants
 //! - `produced = trained + dropped + in flight` whenever anyone looks; *in flight* is counted in the buffers, not
-//!   computed from the others. The same holds of every task's own accounting. An unroll is of the task that has its first
-//!   row's clip; one that is invalid, or of another epoch, is of no task.
+//!   computed from the others. The same holds of every task's own accounting. An unroll belongs to the task that its
+//!   header names; an unroll that is invalid, or of another epoch, counts for no task.
 //! - Memory is [`Config::ahead`] batches and the one at the trainer, whatever the number of actors.
 //! - No unroll is in two batches, or twice in one.
 

@@ -8,7 +8,7 @@ mod common;
 use std::collections::{HashMap, HashSet};
 
 use comic_replay::{Batch, Batcher, Ledger, Outcome, Phase, Reason, Snapshot, TaskAccounting};
-use common::{Actor, CONFIG, PHASE, TASKS, batch_now, insert_now, layout, with_tasks};
+use common::{Actor, CONFIG, PHASE, TASKS, batch_now, insert_now, layout, task_of, with_tasks};
 use proptest::prelude::*;
 
 const ACTORS: u64 = 3;
@@ -61,11 +61,6 @@ struct Known {
     /// Unrolls of each task, and of none, that the batcher took or dropped.
     decided: [u64; TASKS.len() + 1],
     refused: u64,
-}
-
-/// The task of an actor's unroll.
-fn task_of(sequence: u64) -> usize {
-    (sequence as usize / TASKS[0].1).min(TASKS.len())
 }
 
 struct World {
@@ -220,7 +215,7 @@ impl World {
         let accounting = self.batcher.accounting_by_task();
         assert_eq!(accounting.all, self.batcher.accounting());
         assert_eq!(accounting.tasks, self.batcher.snapshot().tasks);
-        for (index, (task, _)) in TASKS.iter().enumerate() {
+        for (index, task) in TASKS.iter().enumerate() {
             let own = accounting.tasks[*task];
             assert!(own.balance(), "{task}: {own:?}");
             assert_eq!(own.produced, self.known.decided[index], "{task}");

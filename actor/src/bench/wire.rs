@@ -109,6 +109,7 @@ fn still_unroll(layout: &UnrollLayout) -> FinishedUnroll {
         demonstration: false,
         episodes: Vec::new(),
         environment: 0,
+        task: 0,
         ticket: None,
     }
 }

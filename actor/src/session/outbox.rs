@@ -115,6 +115,7 @@ impl Outbox {
             demonstration: unroll.demonstration,
             episodes: unroll.episodes.clone(),
             environment: unroll.environment,
+            task: unroll.task,
         };
         span.in_scope(|| tracing::debug!(actor, "sent"));
         Some(UnrollMessage { header: Some(header), payload: unroll.payload.clone() })
@@ -168,6 +169,7 @@ mod tests {
             demonstration: false,
             episodes: Vec::new(),
             environment: 0,
+            task: 0,
             ticket: None,
         }
     }

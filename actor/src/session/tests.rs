@@ -31,6 +31,7 @@ fn unroll(number: u64) -> FinishedUnroll {
         demonstration: false,
         episodes: Vec::new(),
         environment: 0,
+        task: 0,
         ticket: None,
     }
 }

@@ -294,6 +294,7 @@ proptest! {
         for unroll in &unrolls {
             let rows = Rows { layout: &layout, payload: &unroll.payload };
             let task = rows.clip(0);
+            prop_assert_eq!(unroll.task, task, "each task has one clip");
             prop_assert_eq!(rows.place(0), expected, "no step is lost and none comes twice");
             prop_assert!(!padded || rows.one(Field::First, 0) == 1.0, "an episode that has waited begins the unroll");
             prop_assert_eq!(rows.row(Field::State, 0), vec![expected.1 as f32; 3], "and has nothing to remember");
@@ -319,6 +320,7 @@ proptest! {
             let header = comic_proto::v1::UnrollHeader {
                 layout_hash: layout.hash().to_vec(),
                 episodes: unroll.episodes.clone(),
+                task: unroll.task,
                 ..Default::default()
             };
             let checked = comic_proto::Expected { clips: &[1, 1, 1], epoch: 0, newest_version: 0 };

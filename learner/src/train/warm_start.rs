@@ -9,7 +9,6 @@ use rand::Rng;
 use rand::seq::index::sample;
 
 use crate::checkpoint::Name;
-use crate::train::minibatches::tasks_of_unrolls;
 use crate::train::trainer::{Trainer, Wait};
 use crate::vmpo::{Losses, MinibatchTensors};
 
@@ -106,7 +105,7 @@ impl Trainer {
             match self.next_batch()? {
                 Wait::Batch(batch) => {
                     // What has no reference has nothing to demonstrate: holding still is no example.
-                    let demonstrated = Demonstrated::among(&tasks_of_unrolls(&batch, &self.spec), |task| {
+                    let demonstrated = Demonstrated::among(&batch.tasks(), |task| {
                         self.spec.tasks.get(task).is_some_and(|task| task.demonstrated)
                     });
                     if !demonstrated.unrolls.is_empty() {

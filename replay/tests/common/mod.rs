@@ -30,13 +30,19 @@ pub(crate) fn layout() -> Arc<UnrollLayout> {
     Arc::new(UnrollLayout::new(shape))
 }
 
-/// Clips are numbered as sequences are here: an actor's first ten unrolls are of one task, the next ten of another, and
-/// those that follow of none.
-pub(crate) const TASKS: [(&str, usize); 2] = [("tracking", 10), ("get-up", 10)];
+/// An actor's first ten unrolls belong to the first task, its next ten to the second, and all later ones to no task.
+pub(crate) const TASKS: [&str; 2] = ["tracking", "get-up"];
+/// See [`TASKS`].
+pub(crate) const UNROLLS_OF_A_TASK: usize = 10;
+
+/// The index of the task of an actor's unroll; the number of tasks for no task.
+pub(crate) fn task_of(sequence: u64) -> usize {
+    (sequence as usize / UNROLLS_OF_A_TASK).min(TASKS.len())
+}
 
 /// The accounting of these tasks are kept.
 pub(crate) fn with_tasks(ledger: Ledger) -> Ledger {
-    ledger.with_tasks(TASKS.map(|(name, clips)| (name.to_string(), clips)))
+    ledger.with_tasks(TASKS.map(String::from))
 }
 
 pub(crate) fn batcher() -> Batcher {
@@ -66,6 +72,7 @@ impl Actor {
             demonstration: PHASE.demonstration,
             episodes: Vec::new(),
             environment: 0,
+            task: task_of(sequence) as u32,
         }
     }
 

@@ -228,6 +228,7 @@ impl Actor {
             demonstration: false,
             episodes: Vec::new(),
             environment: 0,
+            task: 0,
         };
         let mut unroll = UnrollBuffer::new(&self.layout);
         for t in 0..self.layout.shape().length {
