@@ -5,7 +5,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use comic_proto::v1::UnrollHeader;
-use comic_proto::{Field, Invalid, Pieces, UnrollLayout};
+use comic_proto::{Field, Invalid, PerField, Pieces, UnrollLayout};
 
 use crate::ledger::Reason;
 use crate::{Batcher, streaming};
@@ -13,8 +13,8 @@ use crate::{Batcher, streaming};
 /// The arrays of a batch: `[B, rows, width]` for each field. Made once and used again and again.
 #[derive(Debug)]
 pub(crate) struct Buffer {
-    /// In the order of [`Field::ALL`]; the clips and the images stay empty here.
-    floats: [Vec<f32>; Field::ALL.len()],
+    /// Empty for the clips and the images.
+    floats: PerField<Vec<f32>>,
     clips: Vec<u32>,
     images: Vec<u8>,
     /// By slot; in a free one stands what was there before.
@@ -28,7 +28,7 @@ impl Buffer {
     pub(crate) fn new(layout: &UnrollLayout, unrolls: usize) -> Self {
         let elements = |field: Field| layout.elements(field) * unrolls;
         Self {
-            floats: Field::ALL.map(|field| match field {
+            floats: PerField::from_fn(|field| match field {
                 Field::Clip | Field::Image => Vec::new(),
                 _ => vec![0.0; elements(field)],
             }),
@@ -79,7 +79,7 @@ impl Buffer {
             let bytes: &mut [u8] = match field {
                 Field::Clip => bytemuck::cast_slice_mut(&mut self.clips[place]),
                 Field::Image => &mut self.images[place],
-                _ => bytemuck::cast_slice_mut(&mut self.floats[field as usize][place]),
+                _ => bytemuck::cast_slice_mut(&mut self.floats[field][place]),
             };
             payload.copy_by(layout.range(field).start, bytes, streaming::copy);
         }
@@ -117,7 +117,7 @@ impl Buffer {
                 match field {
                     Field::Clip => self.clips[to].copy_from_slice(&other.clips[from]),
                     Field::Image => self.images[to].copy_from_slice(&other.images[from]),
-                    _ => self.floats[field as usize][to].copy_from_slice(&other.floats[field as usize][from]),
+                    _ => self.floats[field][to].copy_from_slice(&other.floats[field][from]),
                 }
             }
             self.headers[free] = std::mem::take(&mut other.headers[slot]);
@@ -174,7 +174,7 @@ impl Batch {
     /// A field of `f32`, `[B, rows, width]`; empty for [`Field::Clip`] and [`Field::Image`], which are
     /// [`clip`](Self::clip) and [`image`](Self::image).
     pub fn f32(&self, field: Field) -> &[f32] {
-        self.buffer.as_ref().map_or(&[], |buffer| &buffer.floats[field as usize])
+        self.buffer.as_ref().map_or(&[], |buffer| &buffer.floats[field])
     }
 
     /// The clips' indices, `[B, T+1]`.
