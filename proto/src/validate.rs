@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use thiserror::Error;
 
-use crate::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
+use crate::v1::{Behaviour, EpisodeEnd, EpisodeStatistics, UnrollHeader};
 use crate::{Field, Pieces, UnrollLayout};
 
 /// Sequence numbers lie below this. At a thousand unrolls a second an actor reaches it after thirty years; a larger
@@ -105,6 +105,12 @@ pub enum Invalid {
         /// The row of `valid`.
         row: usize,
     },
+    /// No behaviour, or one that this learner does not know.
+    #[error("the header names no known behaviour: {behaviour}")]
+    Behaviour {
+        /// As received.
+        behaviour: i32,
+    },
     /// A task that the experiment does not have.
     #[error("the header names task {task}, but the experiment has {tasks} tasks, counted from 0")]
     Task {
@@ -195,6 +201,9 @@ fn check_header(
     }
     if header.layout_hash != layout.hash() {
         return Err(Invalid::LayoutHash);
+    }
+    if header.behaviour() == Behaviour::Unspecified {
+        return Err(Invalid::Behaviour { behaviour: header.behaviour });
     }
     if header.learner_epoch > expected.epoch {
         return Err(Invalid::Epoch { found: header.learner_epoch, newest: expected.epoch });

@@ -4,7 +4,7 @@ use std::fmt;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use comic_proto::v1::UnrollHeader;
+use comic_proto::v1::{Behaviour, UnrollHeader};
 use comic_proto::{Pieces, UnrollLayout};
 use tokio::sync::Semaphore;
 
@@ -38,16 +38,23 @@ pub enum BatchOrder {
 }
 
 /// What the trainer wants at this moment.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Phase {
-    /// This life of the learner.
+    /// The learner's epoch.
     pub epoch: u64,
     /// The newest published version; versions count publications.
     pub version: u64,
-    /// Versions before this one acted on other terms and are superseded.
+    /// Unrolls of versions before this one are superseded: they were made under other conditions.
     pub oldest: u64,
-    /// Demonstrations instead of the policy's own unrolls.
-    pub demonstration: bool,
+    /// Unrolls of the other behaviour are superseded.
+    pub behaviour: Behaviour,
+}
+
+impl Phase {
+    /// The phase in which an epoch of the learner begins: nothing is published yet, and the policy acts.
+    pub fn begin(epoch: u64) -> Self {
+        Self { epoch, version: 0, oldest: 0, behaviour: Behaviour::Policy }
+    }
 }
 
 /// What became of an unroll.
@@ -186,7 +193,7 @@ impl Batcher {
     /// Says what is wanted from now on. What waits in the batcher for another epoch or phase is superseded.
     pub fn set_phase(&self, phase: Phase) {
         let mut state = self.lock();
-        let terms = |phase: Phase| (phase.epoch, phase.oldest, phase.demonstration);
+        let terms = |phase: Phase| (phase.epoch, phase.oldest, phase.behaviour);
         let over = terms(state.phase) != terms(phase);
         state.phase = phase;
         if !over {
@@ -300,8 +307,8 @@ impl Batcher {
         if let Some(outcome) = refuse_unaccountable(&mut state.ledger, header) {
             return Some(outcome);
         }
-        let Phase { epoch, version, oldest, demonstration } = state.phase;
-        let other = header.learner_epoch != epoch || header.demonstration != demonstration || header.version < oldest;
+        let Phase { epoch, version, oldest, behaviour } = state.phase;
+        let other = header.learner_epoch != epoch || header.behaviour() != behaviour || header.version < oldest;
         let reason = if other {
             Reason::Superseded
         } else if payload.len() != self.inner.layout.size() {

@@ -112,7 +112,7 @@ impl Outbox {
             learner_epoch: unroll.learner_epoch,
             version: unroll.version,
             layout_hash: self.layout_hash.clone(),
-            demonstration: unroll.demonstration,
+            behaviour: unroll.behaviour.into(),
             episodes: unroll.episodes.clone(),
             environment: unroll.environment,
             task: unroll.task,
@@ -158,6 +158,7 @@ impl Outbox {
 #[cfg(test)]
 mod tests {
     use bytes::Bytes;
+    use comic_proto::v1::Behaviour;
 
     use super::*;
 
@@ -166,7 +167,7 @@ mod tests {
             payload: Bytes::new(),
             learner_epoch: 1,
             version: 1,
-            demonstration: false,
+            behaviour: Behaviour::Policy,
             episodes: Vec::new(),
             environment: 0,
             task: 0,

@@ -337,8 +337,7 @@ impl Trainer {
     /// Tells actors and batcher of the newest version, for instance after a restart.
     fn announce(&self, behaviour: Behaviour) {
         let version = self.progress.version;
-        let demonstration = behaviour == Behaviour::Demonstrate;
-        self.batcher.set_phase(Phase { epoch: self.epoch, version, oldest: self.oldest, demonstration });
+        self.batcher.set_phase(Phase { epoch: self.epoch, version, oldest: self.oldest, behaviour });
         self.publisher.publish(version, behaviour, &self.target);
     }
 

@@ -56,7 +56,7 @@ impl Trainer {
     /// Gathers demonstrations, regresses on them, and leaves the checkpoint `warm-started`. `None` when the learner was
     /// asked to stop meanwhile; the warm start then begins anew next time.
     pub(crate) fn warm_start(&mut self) -> Result<Option<()>> {
-        self.publish(Behaviour::Demonstrate)?;
+        self.publish(Behaviour::Demonstration)?;
         tracing::info!(steps = self.experiment.warm_start.demonstration_steps, "gathering demonstrations");
         let Some(mut demonstrations) = self.gather()? else { return Ok(None) };
         if self.experiment.network.normaliser_steps > 0 {
@@ -116,7 +116,7 @@ impl Trainer {
                     self.absorb(&batch);
                     self.metrics.absorb(batch.headers(), 0);
                     if (demonstrations.len() as u64) < wanted {
-                        self.keep_step(Behaviour::Demonstrate);
+                        self.keep_step(Behaviour::Demonstration);
                     }
                     self.book(batch);
                 }

@@ -6,11 +6,11 @@ use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 
 use bytes::Bytes;
-use comic_proto::v1::UnrollHeader;
+use comic_proto::v1::{Behaviour, UnrollHeader};
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{Batch, BatchOrder, Batcher, Config, Ledger, Next, Outcome, Phase};
 
-pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, oldest: 0, demonstration: false };
+pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, oldest: 0, behaviour: Behaviour::Policy };
 pub(crate) const CONFIG: Config = Config { unrolls: 3, max_staleness: 4, ahead: 2, order: BatchOrder::Arrival };
 /// Slots that fill up while nobody trains: the open batch and the full one.
 pub(crate) const SLOTS: usize = 2 * CONFIG.unrolls;
@@ -69,7 +69,7 @@ impl Actor {
             learner_epoch: PHASE.epoch,
             version: PHASE.version,
             layout_hash: layout().hash().to_vec(),
-            demonstration: PHASE.demonstration,
+            behaviour: PHASE.behaviour.into(),
             episodes: Vec::new(),
             environment: 0,
             task: task_of(sequence) as u32,
