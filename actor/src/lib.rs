@@ -18,6 +18,7 @@
 //! are not acknowledged in a bounded window, and behind a full window the environments stand still.
 
 pub mod acting;
+pub mod acting_loop;
 pub mod bench;
 pub mod checkpoint;
 pub mod clips;

@@ -14,7 +14,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{mpsc, watch};
 
 use crate::Error;
-use crate::acting::{ActingSizes, ForwardPass, OneByOne};
+use crate::acting::{ForwardPass, OneByOne};
 use crate::dump::{Dumps, Watched};
 use crate::mailbox::Mailbox;
 use crate::policy::TorchPolicy;
@@ -174,7 +174,7 @@ fn build(
         parameters = policy.to_parameters()?.len() as u64;
         let policy: Box<dyn ForwardPass + Send> = match pace {
             Pace::Free => Box::new(policy),
-            Pace::Lockstep => Box::new(OneByOne::new(policy, ActingSizes::from(joined.layout.shape()))),
+            Pace::Lockstep => Box::new(OneByOne::new(policy, joined.layout.shape())),
         };
         let noise = experiment.warm_start.noise as f32;
         workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), noise, first, joined.seed));
