@@ -2,7 +2,7 @@
 //! with `--features xla`, which also wants to know where Python and its packages are.
 
 #[allow(dead_code, reason = "its own `main` is for crates that need no more")]
-#[path = "../deploy/rpath.rs"]
+#[path = "../setup/rpath.rs"]
 mod rpath;
 
 use std::path::{Path, PathBuf};

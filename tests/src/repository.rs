@@ -8,19 +8,8 @@ use std::process::Command;
 use anyhow::{Context, Result, bail};
 
 /// The crates' folders, as the root manifest lists them.
-pub const FOLDERS: [&str; 11] = [
-    "experiment",
-    "proto",
-    "clips",
-    "tasks",
-    "networks",
-    "replay",
-    "actor",
-    "learner",
-    "tests",
-    "deploy/setup",
-    "deploy/xtask",
-];
+pub const FOLDERS: [&str; 11] =
+    ["experiment", "proto", "clips", "tasks", "networks", "replay", "actor", "learner", "tests", "setup", "xtask"];
 
 /// The repository's root.
 pub fn root() -> PathBuf {

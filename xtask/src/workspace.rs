@@ -10,7 +10,7 @@ pub(crate) fn root() -> PathBuf {
     // Cargo says at run time where this package lies; the compiled-in path is for a copied binary.
     let package =
         std::env::var_os("CARGO_MANIFEST_DIR").map_or_else(|| env!("CARGO_MANIFEST_DIR").into(), PathBuf::from);
-    package.ancestors().nth(2).map_or_else(|| PathBuf::from("."), Path::to_path_buf)
+    package.parent().map_or_else(|| PathBuf::from("."), Path::to_path_buf)
 }
 
 /// The directory set-up fills.
