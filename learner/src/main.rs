@@ -5,7 +5,6 @@ use std::process::ExitCode;
 
 use anyhow::Context as _;
 use clap::Parser as _;
-use comic_learner::bench::Subject;
 use comic_learner::error::Misuse;
 use comic_learner::options::{Command, LogFormat, Options};
 use tracing_subscriber::EnvFilter;
@@ -29,18 +28,12 @@ fn main() -> ExitCode {
         LogFormat::Json => log.json().init(),
     }
     let ended = match &options.command {
-        Some(Command::Bench { threads, repeats, low_level, joint }) => {
-            let subject = if *joint { Subject::Joint } else { Subject::LowLevel(*low_level) };
-            let device = options.document.device.unwrap_or_default();
-            comic_learner::bench::run(*threads, *repeats, subject, device)
-        }
         Some(Command::Export { checkpoint, part, out }) => comic_learner::commands::export::run(checkpoint, *part, out),
         Some(Command::Sizes) => comic_learner::commands::sizes::table(&options.document)
             .and_then(|table| std::io::stdout().write_all(table.as_bytes()).context("cannot write to stdout")),
         Some(Command::Status(status)) => status.run(),
         Some(Command::Health(health)) => return health.run(),
         Some(Command::Certs(certs)) => certs.run(),
-        Some(Command::Load(load)) => load.run(),
         Some(Command::Metrics) => comic_learner::observe::telemetry::print_reference(),
         None => comic_learner::run::run(&options),
     };

@@ -50,7 +50,10 @@ pub fn run(options: &Options) -> Result<()> {
 }
 
 /// The threads that serve.
-pub(crate) fn service_runtime() -> Result<Runtime> {
+///
+/// # Errors
+/// When the system starts no more threads.
+pub fn service_runtime() -> Result<Runtime> {
     let workers = std::thread::available_parallelism().map_or(2, usize::from).clamp(1, 4);
     tokio::runtime::Builder::new_multi_thread()
         .worker_threads(workers)
@@ -131,7 +134,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
 }
 
 /// A connection is a file descriptor, and systems give 1024 unless asked for more.
-pub(crate) fn allow_descriptors(wanted: u64) {
+pub fn allow_descriptors(wanted: u64) {
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
     if current.is_none_or(|current| current >= wanted) {
         return;

@@ -173,7 +173,8 @@ pub struct Shared {
     assignments: Option<Assignments>,
     /// Of an actor whose command line says nothing else: threads, and environments of each.
     actor: (u64, u64),
-    pub(crate) telemetry: Arc<Telemetry>,
+    /// What Prometheus reads.
+    pub telemetry: Arc<Telemetry>,
     /// From the signal on: nobody else comes in.
     draining: watch::Sender<bool>,
     closing: watch::Sender<bool>,
@@ -320,12 +321,12 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 /// Bytes that a stream may have under way unread, unless an operator says otherwise: one unroll's message, so that it comes
 /// in one frame, as good as whole, or waits at its actor. What is cut, where a window ends, has to be copied to be joined,
 /// keeps the buffers of both its halves, and costs twice the processor time.
-pub(crate) fn window(layout: &UnrollLayout) -> u32 {
+pub fn window(layout: &UnrollLayout) -> u32 {
     u32::try_from(layout.size().saturating_add(HEADER)).unwrap_or(u32::MAX).clamp(SMALLEST_WINDOW, LARGEST_WINDOW)
 }
 
 /// HTTP/2 as actors meet it, with so many bytes unread on a stream.
-pub(crate) fn server(window: u32) -> Server {
+pub fn server(window: u32) -> Server {
     Server::builder()
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))

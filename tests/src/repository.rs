@@ -8,8 +8,20 @@ use std::process::Command;
 use anyhow::{Context, Result, bail};
 
 /// The crates' folders, as the root manifest lists them.
-pub const FOLDERS: [&str; 11] =
-    ["experiment", "proto", "clips", "tasks", "networks", "replay", "actor", "learner", "tests", "setup", "xtask"];
+pub const FOLDERS: [&str; 12] = [
+    "experiment",
+    "proto",
+    "clips",
+    "tasks",
+    "networks",
+    "replay",
+    "actor",
+    "learner",
+    "bench",
+    "tests",
+    "setup",
+    "xtask",
+];
 
 /// The repository's root.
 pub fn root() -> PathBuf {

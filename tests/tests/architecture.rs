@@ -67,13 +67,11 @@ fn places(sources: &[Source], holds: impl Fn(&str) -> bool) -> Vec<String> {
     lines.filter(|(_, _, line)| holds(line)).map(|(source, number, _)| format!("{}:{number}", source.path)).collect()
 }
 
-/// Benchmarks name their subject; whatever acts or learns takes the low level as it comes.
 #[test]
 fn neither_actor_nor_learner_asks_which_low_level_acts() -> Result<()> {
     let mut sources = sources()?;
     sources.retain(|source| ["actor/src/", "learner/src/"].iter().any(|crate_| source.path.starts_with(crate_)));
     ensure!(!sources.is_empty(), "the crates are not where this test looks for them");
-    sources.retain(|source| !source.path.contains("/bench"));
     let found = places(&sources, |line| line.contains(concat!("LowLevel", "Name::")) || line.contains(".low_level"));
     let found: Vec<_> = found.into_iter().filter(|place| !place.starts_with("learner/src/options.rs")).collect();
     ensure!(found.is_empty(), "{found:?}");

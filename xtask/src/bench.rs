@@ -1,4 +1,4 @@
-//! `cargo xtask bench`: the figures of the README, one JSON line each.
+//! `cargo xtask bench`: the figures of docs/benchmarks.md, one JSON line each.
 
 use std::process::{Command, Stdio};
 
@@ -7,26 +7,30 @@ use comic_experiment::LowLevelName;
 use serde::{Deserialize, Serialize};
 
 use crate::{python, setup, workspace};
+use median::median;
+
+#[path = "../../bench/src/median.rs"]
+mod median;
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
-    /// Which side
+    /// What is measured
     side: Side,
-    /// libtorch's threads in the learner's update, ours and PyTorch's
+    /// libtorch's threads in the learner's update and in PyTorch's
     #[arg(long, default_value_t = 2)]
     threads: u16,
-    /// Arguments for the program's own bench
+    /// Arguments for comic-bench-actor or comic-bench-learner
     #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
     arguments: Vec<String>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Side {
-    /// Environments, policies, threads, resets, the wire
+    /// Environments, policies, threads, resets, the path of an unroll
     Actor,
     /// The update, against its matrix products and against PyTorch
     Learner,
-    /// Images of what the humanoid sees
+    /// Images of the humanoid's camera
     Vision,
     /// Unrolls into batches, from 32 connections and from 1000
     Ingest,
@@ -44,7 +48,7 @@ struct Figure {
     unit: String,
     floor: f64,
     ratio: f64,
-    /// What else the program says of it.
+    /// The other members of the program's line.
     #[serde(flatten)]
     rest: serde_json::Map<String, serde_json::Value>,
 }
@@ -52,8 +56,8 @@ struct Figure {
 /// Rounds in which our update and PyTorch's take turns.
 const ROUNDS: usize = 3;
 
-/// Low levels beside the MLP, which has figures for everything.
-fn others() -> impl Iterator<Item = &'static str> {
+/// All low levels but the MLP, whose figures bear no name.
+fn other_low_levels() -> impl Iterator<Item = &'static str> {
     LowLevelName::ALL.into_iter().filter(|name| *name != LowLevelName::Mlp).map(LowLevelName::name)
 }
 
@@ -61,85 +65,88 @@ fn others() -> impl Iterator<Item = &'static str> {
 pub(crate) fn run(options: &Options) -> Result<()> {
     setup::run(&setup::Options::default())?;
     workspace::build()?;
+    let arguments = &options.arguments;
     match options.side {
         Side::Actor => {
-            let bench = |arguments: &[String]| {
-                show(&figures(Command::new(workspace::program("comic-actor")?).arg("bench").args(arguments))?)
-            };
-            bench(&options.arguments)?;
-            let mut others = others().filter(|_| options.arguments.is_empty());
-            others.try_for_each(|name| bench(&["policy", "--low-level", name].map(String::from)))
+            actor(arguments)?;
+            let mut others = other_low_levels().filter(|_| arguments.is_empty());
+            others.try_for_each(|name| actor(&["policy", "--low-level", name].map(String::from)))
         }
-        Side::Vision => {
-            let mut bench = Command::new(workspace::program("comic-actor")?);
-            show(&figures(bench.args(["bench", "vision"]).args(&options.arguments))?)
-        }
+        Side::Vision => actor(&[&["vision".to_owned()], &arguments[..]].concat()),
         Side::Learner => {
-            let arguments = &options.arguments;
             learner(options.threads, arguments)?;
-            if chooses(arguments) {
+            if chooses_network(arguments) {
                 return Ok(());
             }
-            let others = others().map(|name| vec!["--low-level".to_owned(), name.to_owned()]);
-            let mut ways = others.chain([vec!["--joint".to_owned()]]);
-            ways.try_for_each(|way| learner(options.threads, &[way, arguments.clone()].concat()))
+            let others = other_low_levels().map(|name| vec!["--low-level".to_owned(), name.to_owned()]);
+            let mut networks = others.chain([vec!["--joint".to_owned()]]);
+            networks.try_for_each(|network| learner(options.threads, &[network, arguments.clone()].concat()))
         }
-        Side::Ingest => load("ingest", &options.arguments),
-        Side::Publish => load("publish", &options.arguments),
-        Side::Swarm => load("swarm", &options.arguments),
+        Side::Ingest => service("ingest", arguments),
+        Side::Publish => service("publish", arguments),
+        Side::Swarm => service("swarm", arguments),
     }
 }
 
-/// The service under actors that are not real; each figure is printed when it is there.
-fn load(figure: &str, arguments: &[String]) -> Result<()> {
-    let mut load = Command::new(workspace::program("comic-learner")?);
-    // Thousands of actors come and go: what the log says of each is no news.
-    load.args(["load", figure]).args(arguments).env("RUST_LOG", "warn");
-    workspace::run(&mut load)
+fn actor(arguments: &[String]) -> Result<()> {
+    workspace::run(Command::new(workspace::program("comic-bench-actor")?).args(arguments))
 }
 
-/// Whether these choose something else to measure than the MLP on one task.
-fn chooses(arguments: &[String]) -> bool {
+/// The service under simulated actors. The program prints each figure when it is measured.
+fn service(figure: &str, arguments: &[String]) -> Result<()> {
+    workspace::run(Command::new(workspace::program("comic-bench-learner")?).arg(figure).args(arguments))
+}
+
+/// Whether the arguments choose another network than the MLP on one task.
+fn chooses_network(arguments: &[String]) -> bool {
     arguments.iter().any(|argument| argument.starts_with("--low-level") || argument == "--joint")
 }
 
-/// Our update and the same update in Python PyTorch, by turns, so that a busy moment of the machine meets both.
+/// Our update and the same update in Python PyTorch. They take turns, so that other programs slow down both.
 fn learner(threads: u16, arguments: &[String]) -> Result<()> {
-    // The other script knows the MLP alone.
-    let compares = !chooses(arguments);
+    // The Python script has the MLP only.
+    let compares = !chooses_network(arguments);
     let mut ours = Vec::new();
     let mut theirs = Vec::new();
     for _ in 0..ROUNDS {
-        let mut bench = Command::new(workspace::program("comic-learner")?);
-        ours.push(figures(bench.args(["bench", "--threads", &threads.to_string()]).args(arguments))?);
+        let mut bench = Command::new(workspace::program("comic-bench-learner")?);
+        ours.push(figures(bench.args(["update", "--threads", &threads.to_string()]).args(arguments))?);
         if compares {
             theirs.push(pytorch(threads)?);
         }
     }
-    let Some(first) = ours.first() else { return Ok(()) };
-    let mut lines = Vec::new();
-    for (index, figure) in first.iter().enumerate() {
-        let of_rounds =
-            |part: fn(&Figure) -> f64| median(ours.iter().filter_map(|round| round.get(index)).map(part).collect());
-        let (value, floor) = (of_rounds(|figure| figure.value), of_rounds(|figure| figure.floor));
-        let mut line = Figure { value, floor, ratio: value / floor, ..figure.clone() };
-        for (name, number) in &mut line.rest {
-            let rounds = ours.iter().filter_map(|round| round.get(index)?.rest.get(name)?.as_f64()).collect();
-            *number = median(rounds).into();
-        }
-        lines.push(line);
-    }
+    let mut lines = medians(&ours);
     if compares {
         let update = lines.iter().find(|figure| figure.figure == "learner.update");
-        let update = update.context("comic-learner bench printed no learner.update")?.clone();
+        let update = update.context("comic-bench-learner printed no learner.update")?.clone();
         let floor = median(theirs);
         let rest = serde_json::Map::new();
         lines.push(Figure { figure: "learner.pytorch".into(), floor, ratio: update.value / floor, rest, ..update });
     }
-    show(&lines)
+    for figure in lines {
+        println!("{}", serde_json::to_string(&figure)?);
+    }
+    Ok(())
 }
 
-/// Milliseconds of the update written plainly in Python PyTorch, same shapes and threads.
+/// The figures of the first round, with the median of every number over all rounds.
+fn medians(rounds: &[Vec<Figure>]) -> Vec<Figure> {
+    let Some(first) = rounds.first() else { return Vec::new() };
+    let mut lines = Vec::new();
+    for (index, figure) in first.iter().enumerate() {
+        let same = || rounds.iter().filter_map(move |round| round.get(index));
+        let (value, floor) =
+            (median(same().map(|figure| figure.value).collect()), median(same().map(|figure| figure.floor).collect()));
+        let mut line = Figure { value, floor, ratio: value / floor, ..figure.clone() };
+        for (name, member) in line.rest.iter_mut().filter(|(_, member)| member.is_number()) {
+            *member = median(same().filter_map(|figure| figure.rest.get(name)?.as_f64()).collect()).into();
+        }
+        lines.push(line);
+    }
+    lines
+}
+
+/// Milliseconds of the same update in Python PyTorch, with the same shapes and threads.
 fn pytorch(threads: u16) -> Result<f64> {
     #[derive(Deserialize)]
     struct Answer {
@@ -167,29 +174,19 @@ fn output(command: &mut Command) -> Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-fn show(figures: &[Figure]) -> Result<()> {
-    for figure in figures {
-        println!("{}", serde_json::to_string(figure)?);
-    }
-    Ok(())
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    match values.len() {
-        0 => f64::NAN,
-        length if length % 2 == 1 => values[length / 2],
-        length => (values[length / 2 - 1] + values[length / 2]) / 2.0,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn the_median_stands_in_the_middle_whatever_the_order() {
-        assert_eq!(median(vec![3.0, 1.0, 2.0]), 2.0);
-        assert_eq!(median(vec![4.0, 1.0, 2.0, 3.0]), 2.5);
+    fn every_number_of_a_figure_is_the_median_of_its_rounds() {
+        let figure = |value: f64, copy: f64| -> Figure {
+            let line = serde_json::json!({
+                "figure": "f", "value": value, "unit": "ms", "floor": 1.0, "ratio": value, "copy": copy, "device": "cpu"
+            });
+            serde_json::from_value(line).unwrap()
+        };
+        let found = medians(&[vec![figure(5.0, 2.0)], vec![figure(1.0, 9.0)], vec![figure(4.0, 3.0)]]);
+        assert_eq!(found, [Figure { value: 4.0, ratio: 4.0, ..figure(4.0, 3.0) }]);
     }
 }

@@ -1,4 +1,4 @@
-//! The service with a stand-in for the device, and the two floors.
+//! The service with a stand-in for the trainer, and the two floors.
 
 use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
@@ -10,6 +10,11 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result};
 use bytes::Bytes;
 use clap::{Args, ValueEnum};
+use comic_learner::publish::Publisher;
+use comic_learner::run::{allow_descriptors, service_runtime};
+use comic_learner::security::{ConnectionLimits, Security, Tls};
+use comic_learner::service::quarantine::QuarantineOptions;
+use comic_learner::service::{Setup, Shared, serve, server, window};
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
 use comic_proto::v1::{self, Behaviour, UnrollAck, UnrollMessage, Verdict};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Next, Phase};
@@ -21,32 +26,29 @@ use tokio::sync::watch;
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::process::obey;
-use crate::publish::Publisher;
-use crate::run::service_runtime;
-use crate::security::{ConnectionLimits, Security, Tls};
-use crate::service::quarantine::QuarantineOptions;
-use crate::service::{Setup, Shared, serve, server, window};
+use super::paper::{experiment, positive};
+use super::process::answer_requests;
 
 const EPOCH: u64 = 1;
 
+/// Run a server
 #[derive(Debug, Args)]
-pub(super) struct Options {
+pub struct Host {
     #[arg(long, value_enum)]
     kind: Kind,
-    /// Bytes of a version.
+    /// Bytes of a version
     #[arg(long, default_value_t = 0)]
     parameters: usize,
-    /// Seconds between versions; none but those asked for otherwise.
-    #[arg(long, value_parser = super::positive)]
+    /// Seconds between versions; without it a version is published only on request
+    #[arg(long, value_parser = positive)]
     publish_every: Option<f64>,
-    /// Seconds of an update.
-    #[arg(long, value_parser = super::positive)]
+    /// Seconds of an update
+    #[arg(long, value_parser = positive)]
     update: Option<f64>,
-    /// Serve by TLS with the certificates that `comic-learner certs` made there.
+    /// Serve by TLS with the certificates that `comic-learner certs` made in this directory
     #[arg(long)]
     tls: Option<PathBuf>,
-    /// Updates between versions.
+    /// Updates between versions
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     target_period: Option<u64>,
 }
@@ -57,37 +59,41 @@ enum Kind {
     Learner,
     /// A stream of unrolls that drops what it reads.
     Tonic,
-    /// Sockets that are written to.
+    /// Sockets to which the host writes.
     Sockets,
 }
 
-impl Options {
-    pub(super) fn run(&self) -> Result<()> {
+impl Host {
+    /// Serves, and answers requests on standard input until it ends.
+    ///
+    /// # Errors
+    /// An address that cannot be used; standard input or output that fails.
+    pub fn run(&self) -> Result<()> {
         let runtime = service_runtime()?;
         let listener = runtime.block_on(TcpListener::bind((Ipv4Addr::LOCALHOST, 0)))?;
         println!("{}", json!({ "listening": listener.local_addr()?.to_string() }));
         match self.kind {
             Kind::Learner => {
-                let learner = Stand::new(self)?;
-                runtime.spawn(serve(listener, learner.shared.clone(), std::future::pending()));
-                learner.start(self)?;
-                obey(|order| learner.answer(order))
+                let stand_in = StandIn::new(self)?;
+                runtime.spawn(serve(listener, stand_in.shared.clone(), std::future::pending()));
+                stand_in.start(self)?;
+                answer_requests(|request| stand_in.answer(request))
             }
             Kind::Tonic => {
                 let bytes = Arc::<AtomicU64>::default();
-                let layout = super::experiment()?.2;
+                let layout = experiment()?.2;
                 let service = LearnerServer::new(Bare(bytes.clone())).max_decoding_message_size(layout.message_limit());
                 let incoming = TcpListenerStream::new(listener).inspect(|socket| {
                     let _ = socket.as_ref().map(|socket| socket.set_nodelay(true));
                 });
                 runtime.spawn(server(window(&layout)).add_service(service).serve_with_incoming(incoming));
-                obey(|_| json!({ "bytes": bytes.load(Relaxed) }))
+                answer_requests(|_| json!({ "bytes": bytes.load(Relaxed) }))
             }
             Kind::Sockets => {
                 let (newest, versions) = watch::channel(0_u64);
                 runtime.spawn(write_to_all(listener, versions, Bytes::from(vec![1; self.parameters])));
-                obey(|order| {
-                    if order == "publish" {
+                answer_requests(|request| {
+                    if request == "publish" {
                         newest.send_modify(|version| *version += 1);
                     }
                     json!({})
@@ -97,18 +103,18 @@ impl Options {
     }
 }
 
-/// The learner, with something that takes batches in the trainer's place.
+/// The learner with a thread that takes batches in place of the trainer.
 #[derive(Clone, Debug)]
-struct Stand {
+struct StandIn {
     shared: Arc<Shared>,
     batcher: Batcher,
     publisher: Publisher,
     payload: Bytes,
 }
 
-impl Stand {
-    fn new(options: &Options) -> Result<Self> {
-        let (experiment, spec, layout) = super::experiment()?;
+impl StandIn {
+    fn new(options: &Host) -> Result<Self> {
+        let (experiment, spec, layout) = experiment()?;
         let config = Config {
             unrolls: experiment.unroll.batch,
             max_staleness: experiment.unroll.max_staleness,
@@ -123,9 +129,9 @@ impl Stand {
             max_requests: 262_144,
             ..ConnectionLimits::default()
         };
-        crate::run::allow_descriptors(16_384);
+        allow_descriptors(16_384);
         let shared = Shared::new(Setup {
-            run: "runs/load".into(),
+            run: "runs/bench".into(),
             id: 0,
             security: security(options.tls.as_deref())?,
             limits,
@@ -139,12 +145,12 @@ impl Stand {
         Ok(Self { shared, batcher, publisher, payload: Bytes::from(vec![1; options.parameters]) })
     }
 
-    fn start(&self, options: &Options) -> Result<()> {
+    fn start(&self, options: &Host) -> Result<()> {
         if let Some(every) = options.publish_every {
-            let stand = self.clone();
+            let stand_in = self.clone();
             spawn("publishing", move || {
                 loop {
-                    stand.publish();
+                    stand_in.publish();
                     thread::sleep(Duration::from_secs_f64(every));
                 }
             })?;
@@ -152,9 +158,9 @@ impl Stand {
         if options.target_period.is_some() {
             self.publish();
         }
-        let (stand, update, period) =
+        let (stand_in, update, period) =
             (self.clone(), Duration::from_secs_f64(options.update.unwrap_or_default()), options.target_period);
-        spawn("training", move || stand.train(update, period))
+        spawn("training", move || stand_in.train(update, period))
     }
 
     fn train(&self, update: Duration, period: Option<u64>) {
@@ -185,8 +191,8 @@ impl Stand {
         self.publisher.publish(version, Behaviour::Policy, &self.payload);
     }
 
-    fn answer(&self, order: &str) -> Value {
-        if order == "publish" {
+    fn answer(&self, request: &str) -> Value {
+        if request == "publish" {
             self.publish();
         }
         let accounting = self.batcher.accounting();
@@ -200,7 +206,7 @@ impl Stand {
     }
 }
 
-/// Whatever the environment says of tokens.
+/// TLS where it is asked for; no tokens.
 fn security(certificates: Option<&Path>) -> Result<Security> {
     let serving = |directory: &Path| Tls::new(&directory.join("server.pem"), &directory.join("server-key.pem"), None);
     Ok(Security { tls: certificates.map(serving).transpose()?, tokens: None })
@@ -210,7 +216,7 @@ fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> Result<()> {
     thread::Builder::new().name(name.into()).spawn(work).map(drop).context("cannot start a thread")
 }
 
-/// Counts the bytes of unrolls, and nothing else.
+/// A service that counts the bytes of unrolls and does nothing else.
 #[derive(Debug)]
 struct Bare(Arc<AtomicU64>);
 
@@ -270,7 +276,7 @@ async fn write_to_all(listener: TcpListener, versions: watch::Receiver<u64>, pay
         let (mut versions, payload) = (versions.clone(), payload.clone());
         tokio::spawn(async move {
             let _ = socket.set_nodelay(true);
-            // A greeting: who reads it was accepted.
+            // The greeting: a client that reads it was accepted.
             if socket.write_u8(0).await.is_err() {
                 return;
             }

@@ -1,6 +1,6 @@
-//! The cheapest reader of parameters there can be: HTTP/2 by hand, windows without end, every byte dropped.
+//! A reader of parameters that drops every byte: HTTP/2 by hand, with the largest windows.
 //!
-//! A client that decodes costs more than the server, and on one machine that is what one would measure.
+//! A client that decodes costs more than the server. On one machine a measurement would show the client alone.
 
 use anyhow::Result;
 use comic_proto::frame;
@@ -22,23 +22,22 @@ const END_HEADERS: u8 = 4;
 const LARGEST_WINDOW: u32 = 0x7fff_ffff;
 const FIRST_WINDOW: u32 = 65_535;
 
-/// Reads what the learner broadcasts to an actor that has joined, and gives `count` the bytes of parameters, until the
-/// connection ends.
+/// Reads the parameters of an actor that has joined until the connection ends, and calls `count` with their bytes.
 pub(super) async fn read(mut socket: TcpStream, incarnation: u64, mut count: impl FnMut(u64)) -> Result<()> {
     socket.set_nodelay(true)?;
     socket.write_all(&opening(incarnation)).await?;
     let (mut buffer, mut filled) = (vec![0; BUFFER], 0);
-    // Of the frame that is being passed over.
+    // Bytes of the present frame that are still to be skipped.
     let mut left = 0;
     loop {
         let read = socket.read(&mut buffer[filled..]).await?;
-        anyhow::ensure!(read > 0, "the learner ended the connection");
+        anyhow::ensure!(read > 0, "the learner closed the connection");
         filled += read;
         let mut place = 0;
         loop {
-            let passed = left.min(filled - place);
-            place += passed;
-            left -= passed;
+            let skipped = left.min(filled - place);
+            place += skipped;
+            left -= skipped;
             let Some(header) = buffer[place..filled].first_chunk::<HEADER>() else { break };
             let length = u32::from_be_bytes([0, header[0], header[1], header[2]]) as usize;
             let (kind, flags) = (header[3], header[4]);
@@ -52,13 +51,13 @@ pub(super) async fn read(mut socket: TcpStream, incarnation: u64, mut count: imp
             }
             (place, left) = (place + HEADER, length);
         }
-        // The beginning of a header, or of a ping, waits for the rest.
+        // The beginning of a header, or of a ping, stays until the rest arrives.
         buffer.copy_within(place..filled, 0);
         filled -= place;
     }
 }
 
-/// The preface, windows that never close, and the call.
+/// The preface, the settings with the largest windows, and the call.
 fn opening(incarnation: u64) -> Vec<u8> {
     let mut opening = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec();
     let setting = |name: u16, value: u32| [&name.to_be_bytes()[..], &value.to_be_bytes()].concat();
@@ -70,7 +69,7 @@ fn opening(incarnation: u64) -> Vec<u8> {
     opening
 }
 
-/// RFC 7541: method, scheme and the other names from the static table, values as they are.
+/// RFC 7541: the names come from the static table; the values are literals.
 fn headers() -> Vec<u8> {
     let text = |text: &str| [&[text.len() as u8], text.as_bytes()].concat();
     let (method_post, scheme_http) = ([0x83], [0x86]);

@@ -1,23 +1,23 @@
-//! Whether resets leak.
+//! Whether resets leak memory.
 
 use std::fs;
 use std::sync::Arc;
 use std::time::Instant;
 
+use anyhow::{Context as _, Result};
 use comic_clips::Catalogue;
 
 use super::Subject;
 use super::figure::{Figure, Medians};
-use crate::Error;
 
-/// Resets after which the allocator has what it needs.
+/// Resets after which the allocator has reserved what it needs.
 const WARM: usize = 1_000;
-/// Resets after which nothing more may be held.
+/// All resets; the memory must not have grown after the first of them.
 const RESETS: usize = 10_000;
 
-/// The process's resident memory after many resets, against that after a tenth of them. Corridors are drawn and compiled
-/// at every one.
-pub(super) fn memory(subject: &Subject) -> Result<[Figure; 2], Error> {
+/// The process's resident memory after many resets, against that after a tenth of them. Every reset draws and compiles a
+/// new corridor.
+pub(super) fn memory(subject: &Subject) -> Result<[Figure; 2]> {
     let mut experiment = subject.experiment.clone();
     experiment.gaps.corridor.arena_steps = 0;
     experiment.walls.corridor.arena_steps = 0;
@@ -34,17 +34,17 @@ pub(super) fn memory(subject: &Subject) -> Result<[Figure; 2], Error> {
     let last = milliseconds(WARM);
     let note = "resident memory after 10,000 resets, arenas compiled at each; floor: after 1,000";
     let memory = Figure::new("actor.memory", "MiB", Medians { value: resident()?, floor }, note);
-    // What is held need not be much to be walked through at every reset.
-    let note = "a reset of the last thousand, its arena compiled; floor: of the first thousand";
+    // A small list that grows, and that every reset walks through, shows in the time.
+    let note = "a reset of the last thousand, with its arena compiled; floor: of the first thousand";
     Ok([memory, Figure::new("actor.memory.reset", "ms", Medians { value: last, floor: first }, note)])
 }
 
 /// Resident memory, MiB.
-fn resident() -> Result<f64, Error> {
+fn resident() -> Result<f64> {
     const PATH: &str = "/proc/self/status";
-    let status = fs::read_to_string(PATH).map_err(Error::file(PATH))?;
+    let status = fs::read_to_string(PATH).with_context(|| format!("cannot read {PATH}"))?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
     let kibibytes = line.and_then(|line| line.trim().trim_end_matches(" kB").parse::<f64>().ok());
-    let kibibytes = kibibytes.ok_or_else(|| Error::Usage(format!("{PATH} tells no resident memory")))?;
+    let kibibytes = kibibytes.with_context(|| format!("{PATH} has no resident memory"))?;
     Ok(kibibytes / 1024.0)
 }

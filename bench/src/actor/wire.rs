@@ -1,10 +1,14 @@
-//! What an unroll costs on its way from a worker into a batch.
+//! The path of an unroll from a worker into a batch.
 
 use std::pin::Pin;
 use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use anyhow::{Context as _, Result, anyhow, ensure};
+use comic_actor::mailbox::Mailbox;
+use comic_actor::session::{self, Limits};
+use comic_actor::worker::FinishedUnroll;
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
 use comic_proto::v1::*;
 use comic_proto::{Access, Expected, Field, Pieces, UnrollBuffer, UnrollLayout, UnrollShape, validate};
@@ -17,18 +21,14 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::Subject;
 use super::figure::{Figure, Medians, interleave};
-use crate::Error;
-use crate::mailbox::Mailbox;
-use crate::session::{self, Limits};
-use crate::worker::FinishedUnroll;
 
-/// Updates' worth of unrolls in a segment.
+/// A segment has the unrolls of so many updates.
 const UPDATES: usize = 2;
 
-/// Session, loopback, validation and batcher share one thread, so its processor time is that of them all. At one
-/// update a second it is spent once a second.
-pub(super) fn wire(subject: &Subject) -> Result<Figure, Error> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(Error::Thread)?;
+/// Session, loopback, validation and batcher share one thread, whose processor time is measured. The floor is the second
+/// between two updates at one update a second.
+pub(super) fn wire(subject: &Subject) -> Result<Figure> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start tokio")?;
     let (spec, experiment) = (subject.task.spec(), &subject.experiment);
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, experiment)));
     let phase = Phase { epoch: 1, version: 1, oldest: 0, demonstration: false };
@@ -50,7 +50,7 @@ pub(super) fn wire(subject: &Subject) -> Result<Figure, Error> {
     let reply = JoinReply {
         learner_epoch: 1,
         experiment: experiment.to_toml()?,
-        task_spec: toml::to_string(spec).map_err(|error| Error::Usage(error.to_string()))?,
+        task_spec: toml::to_string(spec)?,
         layout_hash: layout.hash().to_vec(),
         ..JoinReply::default()
     };
@@ -59,18 +59,18 @@ pub(super) fn wire(subject: &Subject) -> Result<Figure, Error> {
     let unroll = still_unroll(&layout);
     let medians = interleave(subject.budget, || {
         let elapsed = runtime.block_on(send(&address, &unroll, unrolls))?;
-        Ok::<_, Error>((elapsed.as_secs_f64() * 1000.0 / UPDATES as f64, 1000.0))
+        Ok::<_, anyhow::Error>((elapsed.as_secs_f64() * 1000.0 / UPDATES as f64, 1000.0))
     });
     batcher.close();
-    trainer.join().map_err(|_| Error::WorkerPanicked)?;
+    trainer.join().map_err(|_| anyhow!("the thread that takes batches panicked"))?;
     let Medians { value, floor } = medians?;
     let note = "ms of one core for the unrolls of one update (encode, loopback, decode, validate, batch); floor: the \
                 second between updates, so the ratio is the share of an actor's time";
     Ok(Figure::new("actor.wire", "ms/update", Medians { value, floor }, note))
 }
 
-/// The calling thread's processor time, which other programs on the machine do not lengthen; wall-clock time where the
-/// kernel does not tell.
+/// The calling thread's processor time, which other programs on the machine do not lengthen. Wall-clock time where the
+/// kernel reports none.
 enum Clock {
     Processor(Duration),
     Wall(Instant),
@@ -89,7 +89,7 @@ impl Clock {
     }
 }
 
-/// The first number of Linux's `schedstat` is nanoseconds on a processor.
+/// The first number of Linux's `schedstat`: nanoseconds on a processor.
 fn processor_time() -> Option<Duration> {
     let text = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
     text.split_whitespace().next()?.parse().ok().map(Duration::from_nanos)
@@ -113,8 +113,8 @@ fn still_unroll(layout: &UnrollLayout) -> FinishedUnroll {
     }
 }
 
-/// Processor time of this thread from the first unroll handed over to the last acknowledgement.
-async fn send(address: &str, unroll: &FinishedUnroll, unrolls: usize) -> Result<Duration, Error> {
+/// Processor time of this thread from the first unroll sent to the last acknowledgement.
+async fn send(address: &str, unroll: &FinishedUnroll, unrolls: usize) -> Result<Duration> {
     let (_stop, stopped) = watch::channel(false);
     let options = session::Options {
         learner: address.to_string(),
@@ -135,20 +135,18 @@ async fn send(address: &str, unroll: &FinishedUnroll, unrolls: usize) -> Result<
         }
     }
     drop(sender);
-    let settled = session.await.map_err(|_| Error::WorkerPanicked)??;
-    if settled.taken != unrolls as u64 {
-        return Err(Error::Usage(format!("{settled:?} of {unrolls} unrolls: nothing was measured")));
-    }
+    let settled = session.await.context("the session panicked")??;
+    ensure!(settled.taken == unrolls as u64, "not all of {unrolls} unrolls were taken: {settled:?}");
     Ok(begin.elapsed())
 }
 
-async fn serve(receiver: Receiver) -> Result<String, Error> {
-    let listener = TcpListener::bind("127.0.0.1:0").await.map_err(Error::Thread)?;
-    let address = format!("http://{}", listener.local_addr().map_err(Error::Thread)?);
+async fn serve(receiver: Receiver) -> Result<String> {
+    let listener = TcpListener::bind("127.0.0.1:0").await?;
+    let address = format!("http://{}", listener.local_addr()?);
     let limit = receiver.batcher.layout().message_limit();
     let service = LearnerServer::new(receiver).max_decoding_message_size(limit);
-    // Windows and frames that hold an unroll of 200 KB: with a stream window of 256 KiB and the default frames of
-    // 16 KiB the same costs five times as much.
+    // An unroll of 200 KB fits into the windows and frames. With a stream window of 256 KiB and the default frames of
+    // 16 KiB the cost is five times as high.
     let router = tonic::transport::Server::builder()
         .initial_stream_window_size(512 * 1024)
         .initial_connection_window_size(1024 * 1024)
@@ -158,7 +156,7 @@ async fn serve(receiver: Receiver) -> Result<String, Error> {
     Ok(address)
 }
 
-/// The learner's way in, and nothing behind it.
+/// The learner's validation and batcher without its trainer.
 struct Receiver {
     batcher: Batcher,
     reply: JoinReply,

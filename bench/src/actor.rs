@@ -1,7 +1,8 @@
-//! The figures of `comic-actor bench`: one JSON line each, medians of short interleaved segments.
+//! Environments, policies, resets, images, and the path of an unroll into a batch. Each figure is the median of short
+//! segments, in which value and floor take turns, so that other programs on the machine slow down both.
 //!
-//! A figure stands beside its floor, measured in the same run: the physics alone, on the same model and the very same
-//! controls and starts (a tape records them). Other programs on the machine then slow both down alike.
+//! The floor of most figures is the physics alone: the same model with the same starts and controls, which a recording
+//! environment ([`tape`]) keeps.
 
 mod acting;
 mod figure;
@@ -14,35 +15,34 @@ mod wire;
 use std::sync::Arc;
 use std::time::Duration;
 
+use anyhow::{Context as _, Result};
 use clap::{Args, ValueEnum};
 use comic_clips::Catalogue;
 use comic_experiment::{Experiment, LowLevelName, TaskName};
 use comic_tasks::{Simulated, Task};
 
-use crate::Error;
-
-/// Environments a thread wherever a policy acts.
+/// Environments of a thread.
 const ENVIRONMENTS: usize = 16;
 
-/// Measures how fast an actor is.
+/// Measure how fast an actor is
 ///
-/// `ratio` is always value / floor. `actor.env`, `actor.policy`: steps/s, resets included, against the same controls
-/// through the physics alone. `actor.threads`: steps/s of two threads against one. `actor.reset`: ms. `actor.wire`: ms
-/// of one core that an update's worth of unrolls costs between a worker and a batch, against one second.
-/// `actor.vision`: ms an image. `actor.memory`: MiB held after 10,000 resets against those after 1,000, and
-/// `actor.memory.reset` what one of the last thousand cost against one of the first.
+/// `ratio` is value / floor. `actor.env` and `actor.policy`: steps/s with resets, against the same controls through the
+/// physics alone. `actor.threads`: steps/s of two threads, against one. `actor.reset`: ms. `actor.wire`: ms of one core
+/// for sending the unrolls of one update from a worker into a batch, against one second. `actor.vision`: ms of an image.
+/// `actor.memory`: resident MiB after 10,000 resets, against those after 1,000. `actor.memory.reset`: ms of one of the
+/// last thousand resets, against one of the first.
 #[derive(Args, Clone, Debug)]
 pub struct Bench {
-    /// Seconds for each figure.
+    /// Seconds for each figure
     #[arg(long, default_value_t = 15.0)]
     seconds: f64,
-    /// The task: tracking, go-to-target, gaps, walls, get-up or ball-catch.
+    /// The task: tracking, go-to-target, gaps, walls, get-up or ball-catch
     #[arg(long, default_value_t = TaskName::Tracking)]
     task: TaskName,
-    /// The low level of what acts: mlp, lstm, mixture or product; another than the MLP adds its name to the figure's.
+    /// The low level of the policy: mlp, lstm, mixture or product. All but mlp add their name to the figure's
     #[arg(long, default_value_t = LowLevelName::Mlp)]
     low_level: LowLevelName,
-    /// Only these figures.
+    /// Figures to measure [default: all but vision and memory]
     #[arg(value_enum)]
     figures: Vec<Name>,
 }
@@ -59,7 +59,7 @@ enum Name {
     Memory,
 }
 
-/// What all figures are measured on: the paper's networks, one built-in walk or another task.
+/// What is measured: the paper's networks on one task.
 struct Subject {
     experiment: Experiment,
     task: Arc<dyn Task>,
@@ -67,8 +67,8 @@ struct Subject {
 }
 
 impl Subject {
-    fn environment(&self, seed: u64) -> Result<Box<dyn Simulated>, comic_tasks::Error> {
-        Arc::clone(&self.task).environment(seed)
+    fn environment(&self, seed: u64) -> Result<Box<dyn Simulated>> {
+        Ok(Arc::clone(&self.task).environment(seed)?)
     }
 }
 
@@ -76,16 +76,16 @@ impl Bench {
     /// Measures and prints.
     ///
     /// # Errors
-    /// Whatever keeps it from that.
-    pub fn run(&self) -> Result<(), Error> {
-        let budget = Duration::try_from_secs_f64(self.seconds)
-            .map_err(|error| Error::Usage(format!("--seconds {}: {error}", self.seconds)))?;
+    /// A task that cannot be built; an error of MuJoCo, OpenGL or libtorch.
+    pub fn run(&self) -> Result<()> {
+        let budget =
+            Duration::try_from_secs_f64(self.seconds).with_context(|| format!("--seconds {}", self.seconds))?;
         let paper = comic_experiment::resolve(&format!("tracking-{}", self.low_level), &[])?;
         let experiment = Experiment { task: self.task, ..paper };
         let catalogue = Catalogue::open(&experiment.clips)?;
         let task = comic_tasks::build(&experiment, &catalogue)?;
         let subject = Subject { experiment, task, budget };
-        // Images need OpenGL, which a machine that only counts steps may lack, and memory minutes: when asked for.
+        // Images need OpenGL, which not every machine has. Memory takes minutes.
         let wanted = |name: &&Name| match self.figures.as_slice() {
             [] => !matches!(name, Name::Vision | Name::Memory),
             figures => figures.contains(name),
@@ -101,7 +101,7 @@ impl Bench {
                 Name::Memory => memory::memory(&subject)?.into(),
             };
             for figure in figures {
-                figure.of(self.low_level).print()?;
+                figure.named_after(self.low_level).print()?;
             }
         }
         Ok(())

@@ -3,6 +3,7 @@
 use std::convert::Infallible;
 use std::time::Instant;
 
+use anyhow::Result;
 use comic_tasks::floor::{FloorState, RawFloor};
 use comic_tasks::{Environment as _, Outcome};
 use rand::{Rng as _, SeedableRng as _};
@@ -11,15 +12,14 @@ use rand_pcg::Pcg64;
 use super::Subject;
 use super::figure::{Figure, Medians, interleave};
 use super::tape::Recorded;
-use crate::Error;
 
-/// Control steps of a segment: a fifth of a second, and as many as a corridor is used for before the next is compiled.
+/// Control steps of a segment: a fifth of a second of computing. A corridor is compiled anew after as many.
 const STEPS: usize = 512;
 /// Resets of a segment.
 const RESETS: usize = 32;
 
 /// One environment under uniformly random actions, observations and resets included.
-pub(super) fn environment(subject: &Subject) -> Result<Figure, Error> {
+pub(super) fn environment(subject: &Subject) -> Result<Figure> {
     let spec = subject.task.spec();
     let (mut environment, tape) = Recorded::new(subject.environment(1)?);
     let mut floor = RawFloor::default();
@@ -48,7 +48,7 @@ pub(super) fn environment(subject: &Subject) -> Result<Figure, Error> {
 }
 
 /// A reset with its first observation, against `mj_resetData` and `mj_forward`.
-pub(super) fn reset(subject: &Subject) -> Result<Figure, Error> {
+pub(super) fn reset(subject: &Subject) -> Result<Figure> {
     let spec = subject.task.spec();
     let mut environment = subject.environment(1)?;
     let mut floor = RawFloor::default();

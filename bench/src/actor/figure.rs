@@ -1,15 +1,16 @@
-//! One line of output, and the medians behind it.
+//! One line of output, and the medians in it.
 
 use std::borrow::Cow;
 use std::io::Write as _;
 use std::time::{Duration, Instant};
 
+use anyhow::{Context as _, Result};
 use comic_experiment::LowLevelName;
 use serde::Serialize;
 
-use crate::Error;
+use crate::median::median;
 
-/// Segments below which a median means little.
+/// The smallest number of segments of a median.
 const FEWEST_SEGMENTS: usize = 5;
 
 #[derive(Clone, Debug, Serialize)]
@@ -33,29 +34,28 @@ impl Figure {
         Self { figure: Cow::Borrowed(figure), value, unit, floor, ratio: value / floor, note }
     }
 
-    /// Of a policy with this low level: the MLP's figures bear no name.
-    pub(super) fn of(mut self, low_level: LowLevelName) -> Self {
+    /// Adds the name of the policy's low level, unless it is the MLP.
+    pub(super) fn named_after(mut self, low_level: LowLevelName) -> Self {
         if low_level != LowLevelName::Mlp {
             self.figure = format!("{}.{low_level}", self.figure).into();
         }
         self
     }
 
-    pub(super) fn print(&self) -> Result<(), Error> {
-        let line = serde_json::to_string(self)
-            .map_err(|error| Error::Usage(format!("cannot write a figure as JSON: {error}")))?;
-        writeln!(std::io::stdout(), "{line}").map_err(Error::file("standard output"))
+    pub(super) fn print(&self) -> Result<()> {
+        let line = serde_json::to_string(self)?;
+        writeln!(std::io::stdout(), "{line}").context("cannot write to standard output")
     }
 }
 
-/// Of value and floor, each the median of its own segments.
+/// The median of the value's segments and that of the floor's.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Medians {
     pub(super) value: f64,
     pub(super) floor: f64,
 }
 
-/// Repeats a pair of segments (value, floor) for as long as the budget lasts; the first pair warms up and is dropped.
+/// Repeats a pair of segments (value, floor) until the budget is used up. The first pair warms up and is not counted.
 pub(super) fn interleave<E>(budget: Duration, mut pair: impl FnMut() -> Result<(f64, f64), E>) -> Result<Medians, E> {
     pair()?;
     let begin = Instant::now();
@@ -65,13 +65,7 @@ pub(super) fn interleave<E>(budget: Duration, mut pair: impl FnMut() -> Result<(
         values.push(value);
         floors.push(floor);
     }
-    Ok(Medians { value: median(&mut values), floor: median(&mut floors) })
-}
-
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    let middle = values.len() / 2;
-    if values.len().is_multiple_of(2) { f64::midpoint(values[middle - 1], values[middle]) } else { values[middle] }
+    Ok(Medians { value: median(values), floor: median(floors) })
 }
 
 #[cfg(test)]
@@ -79,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn medians_forget_the_warm_up_and_the_outliers() {
+    fn medians_leave_out_the_warm_up_and_the_outliers() {
         let mut calls = 0.0;
         let medians = interleave::<()>(Duration::ZERO, || {
             calls += 1.0;
@@ -87,6 +81,5 @@ mod tests {
         });
         let Medians { value, floor } = medians.unwrap();
         assert_eq!((value, floor), (5.0, 1.5));
-        assert_eq!(median(&mut [4.0, 1.0, 2.0, 3.0]), 2.5);
     }
 }

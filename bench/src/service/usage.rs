@@ -1,25 +1,25 @@
-//! What a process has used, as Linux tells it.
+//! What a process has used, as Linux reports it.
 
 use std::fs;
 
 use serde::{Deserialize, Serialize};
 
-/// Of the process that asks.
+/// The usage of the calling process.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub(super) struct Usage {
-    /// Of all its threads, in itself and in the kernel.
+    /// User and system time of all threads.
     pub(super) cpu_seconds: f64,
-    /// Bytes.
+    /// Resident memory, bytes.
     pub(super) resident: f64,
-    /// Bytes, the most so far.
+    /// The largest resident memory so far, bytes.
     pub(super) peak: f64,
 }
 
 impl Usage {
     pub(super) fn now() -> Self {
         let stat = fs::read_to_string("/proc/self/stat").unwrap_or_default();
-        // The name, the one field that may hold spaces, ends with the last parenthesis; user and system time are the
-        // 12th and 13th after it.
+        // Only the program's name may contain spaces, and it ends at the last parenthesis. User and system time are the
+        // 12th and 13th fields after it.
         let after_name = stat.rsplit_once(')').map_or("", |(_, rest)| rest);
         let ticks: f64 =
             after_name.split_whitespace().skip(11).take(2).filter_map(|field| field.parse::<f64>().ok()).sum();
@@ -41,7 +41,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_process_that_works_has_used_something() {
+    fn work_is_counted_as_time_and_memory() {
         let before = Usage::now();
         let memory = vec![1_u8; 64 << 20];
         let start = std::time::Instant::now();

@@ -1,4 +1,4 @@
-//! Who an actor of the crowd is, and what it still answers for, across connections.
+//! The identity of a simulated actor, and its unrolls without an acknowledgement. Both last over lost connections.
 
 use std::collections::VecDeque;
 
@@ -7,35 +7,35 @@ use bytes::Bytes;
 use comic_proto::v1::{JoinReply, UnrollAck, UnrollHeader, UnrollMessage};
 use tokio::sync::mpsc;
 
-/// One life: it lasts over lost connections, as an actor's does.
+/// One incarnation of an actor.
 #[derive(Debug)]
 pub(super) struct Identity {
-    /// The index that the learner gave it.
+    /// The index that the learner assigned.
     pub(super) actor: Option<u64>,
     pub(super) incarnation: u64,
     next_sequence: u64,
-    /// Unrolls that were not acknowledged.
+    /// Headers of the unrolls in flight.
     waiting: VecDeque<UnrollHeader>,
 }
 
 impl Identity {
-    /// A new life with an old index, if there is one.
+    /// A new incarnation, with the index of the last one if there was one.
     pub(super) fn new(actor: Option<u64>) -> Self {
         Self { actor, incarnation: rand::random(), next_sequence: 0, waiting: VecDeque::new() }
     }
 
-    /// What was under way when the last connection was lost is sent again, as it was.
+    /// Sends the unrolls again that were in flight when the last connection was lost, unchanged.
     pub(super) fn send_again(
         &self,
         up: &mpsc::Sender<UnrollMessage>,
         reply: &JoinReply,
         payload: &Bytes,
     ) -> Result<()> {
-        let of = |header: &UnrollHeader| UnrollHeader { actor: reply.actor, ..header.clone() };
-        self.waiting.iter().try_for_each(|header| send(up, of(header), payload))
+        let readdressed = |header: &UnrollHeader| UnrollHeader { actor: reply.actor, ..header.clone() };
+        self.waiting.iter().try_for_each(|header| send(up, readdressed(header), payload))
     }
 
-    /// Sends unrolls made with `version` until so many are under way.
+    /// Sends unrolls of `version` until `window` of them are in flight.
     pub(super) fn fill(
         &mut self,
         up: &mpsc::Sender<UnrollMessage>,
@@ -61,13 +61,13 @@ impl Identity {
         Ok(())
     }
 
-    /// Answers for this one no more.
+    /// Removes an acknowledged unroll from those in flight.
     pub(super) fn settle(&mut self, ack: &UnrollAck) {
         self.waiting.retain(|header| header.sequence != ack.sequence);
     }
 }
 
-/// As many as are acknowledged: there is room, or the connection is lost.
+/// The channel has room for every unroll in flight, so it refuses only when the connection is lost.
 fn send(up: &mpsc::Sender<UnrollMessage>, header: UnrollHeader, payload: &Bytes) -> Result<()> {
     let message = UnrollMessage { header: Some(header), payload: payload.clone() };
     up.try_send(message).context("the stream of unrolls is lost")

@@ -1,30 +1,31 @@
-//! Recording what an environment was told, and playing it to the physics alone.
+//! Records the resets and actions of an environment, and plays them to the physics alone.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use comic_tasks::floor::{FloorState, RawFloor};
 use comic_tasks::{Environment, Episode, Simulated, Step};
+use parking_lot::Mutex;
 
 /// Physics steps in a control step of 0.03 s.
 pub(super) const SUBSTEPS: usize = 6;
 
-/// Resets (with the states they led to) and controls, in order.
+/// Resets, with the states after them, and actions, in order.
 #[derive(Debug, Default)]
 struct Recording {
-    /// A reset, or a step that takes the next action.
+    /// A state after a reset, or none for a step, which takes the next action.
     events: Vec<Option<FloorState>>,
     actions: Vec<f32>,
     width: usize,
 }
 
-/// A handle on a recording.
+/// A shared handle of a recording.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Tape(Arc<Mutex<Recording>>);
 
 impl Tape {
-    /// Plays what was recorded since the last time, and returns the number of steps.
+    /// Plays what was recorded since the last call, and returns the number of steps.
     pub(super) fn play(&self, floor: &mut RawFloor) -> usize {
-        let recording = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
+        let recording = std::mem::take(&mut *self.0.lock());
         let mut actions = recording.actions.chunks_exact(recording.width.max(1));
         let mut steps = 0;
         for event in recording.events {
@@ -42,7 +43,7 @@ impl Tape {
     }
 }
 
-/// An environment that keeps a tape.
+/// An environment that records.
 #[derive(Debug)]
 pub(super) struct Recorded {
     environment: Box<dyn Simulated>,
@@ -56,8 +57,8 @@ impl Recorded {
     }
 
     fn record(&self, write: impl FnOnce(&mut Recording)) {
-        // Nobody else holds the lock while this environment is stepped: it costs some twenty nanoseconds.
-        write(&mut self.tape.0.lock().unwrap_or_else(PoisonError::into_inner));
+        // No other thread holds the lock while the environment is stepped, so it costs about twenty nanoseconds.
+        write(&mut self.tape.0.lock());
     }
 }
 
