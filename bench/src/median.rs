@@ -1,7 +1,7 @@
 //! The median, which a few slow measurements do not move. Shared with `cargo xtask bench`, which includes this file.
 
 /// The median of `values`: the mean of the two in the middle where their number is even, NaN where there are none.
-pub fn median(mut values: Vec<f64>) -> f64 {
+pub(super) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     let middle = values.len() / 2;
     match values.get(middle) {
