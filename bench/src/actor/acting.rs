@@ -8,10 +8,11 @@ use std::time::Instant;
 use anyhow::{Result, anyhow};
 use bytes::Bytes;
 use comic_actor::acting::ForwardPass;
-use comic_actor::mailbox::{Conduct, Directive};
+use comic_actor::mailbox::Directive;
 use comic_actor::policy::TorchPolicy;
 use comic_actor::seeds::derive;
 use comic_actor::worker::{Progress, Worker};
+use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
 use comic_tasks::floor::RawFloor;
 use comic_tasks::{Environment, Simulated};
@@ -63,7 +64,7 @@ fn worker<E: Environment>(subject: &Subject, environments: Vec<E>, seed: u64) ->
     let policy = TorchPolicy::untrained(spec, experiment, seed, || Ok([0.0; 56]))?;
     let parameters = Bytes::from(policy.to_parameters()?);
     let mut worker = Worker::new(environments, policy, layout, 0.0, 0, seed);
-    worker.adopt(&Arc::new(Directive { learner_epoch: 1, version: 1, conduct: Conduct::Policy, parameters }))?;
+    worker.adopt(&Arc::new(Directive { learner_epoch: 1, version: 1, behaviour: Behaviour::Policy, parameters }))?;
     Ok(worker)
 }
 

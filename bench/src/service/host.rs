@@ -121,7 +121,7 @@ impl StandIn {
             ahead: experiment.unroll.ahead,
             order: BatchOrder::Arrival,
         };
-        let batcher = Batcher::new(Arc::new(layout), config, Phase { epoch: EPOCH, ..Phase::default() }, Ledger::new());
+        let batcher = Batcher::new(Arc::new(layout), config, Phase::begin(EPOCH), Ledger::new());
         let publisher = Publisher::new(EPOCH);
         let limits = ConnectionLimits {
             max_actors: 65_536,
