@@ -8,6 +8,7 @@
 //!   refusing unknown fields with the nearest known name.
 //! - [`find_field`] knows a field by the end of its name, [`Experiment::difference`] the field in which two differ.
 //! - [`TaskSpec`] is what networks, wire and learner know of a task: sizes and names.
+//! - [`seed`] derives independent seeds, [`statistics`] has the median; every crate uses the same ones.
 //!
 //! Every default is the paper's: (S) the CoMic supplement, (V) V-MPO, (D) a decision of this project where both are
 //! silent. A preset that deviates says so in its own file.
@@ -20,7 +21,9 @@ mod lines;
 mod network;
 pub mod presets;
 mod resolve;
+pub mod seed;
 mod spec;
+pub mod statistics;
 mod tasks;
 
 pub use device::*;

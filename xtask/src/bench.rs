@@ -7,10 +7,7 @@ use comic_experiment::LowLevelName;
 use serde::{Deserialize, Serialize};
 
 use crate::{python, setup, workspace};
-use median::median;
 
-#[path = "../../bench/src/median.rs"]
-mod median;
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -127,6 +124,11 @@ fn learner(threads: u16, arguments: &[String]) -> Result<()> {
         println!("{}", serde_json::to_string(&figure)?);
     }
     Ok(())
+}
+
+/// The median of `values`, NaN where there are none.
+fn median(values: Vec<f64>) -> f64 {
+    comic_experiment::statistics::median(values).unwrap_or(f64::NAN)
 }
 
 /// The figures of the first round, with the median of every number over all rounds.

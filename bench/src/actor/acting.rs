@@ -10,7 +10,7 @@ use bytes::Bytes;
 use comic_actor::acting::ForwardPass;
 use comic_actor::mailbox::Directive;
 use comic_actor::policy::TorchPolicy;
-use comic_actor::seeds::derive;
+use comic_experiment::seed::derive;
 use comic_actor::worker::{Progress, Worker};
 use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Result;
-use comic_actor::seeds::derive;
+use comic_experiment::seed::derive;
 use comic_experiment::{Experiment, TaskName, Vision};
 use comic_tasks::vision::IMAGE_BYTES;
 use comic_tasks::{Environment as _, Simulated};

@@ -1,7 +1,7 @@
 //! Networks, multipliers and optimiser, stepped together.
 
 use comic_experiment::{Experiment, Network, Optimiser, Prior, TaskSpec, Vmpo};
-use comic_networks::{Acting, ActionDistribution, Memory, NormaliserStatistics, Policy, Routing, Value};
+use comic_networks::{Acting, ActionDistribution, NormaliserStatistics, Policy, RecurrentState, Routing, Value};
 use comic_proto::UnrollShape;
 use tch::{Device, Kind, Tensor, nn};
 
@@ -279,7 +279,7 @@ impl VmpoLearner {
             &observation.first_steps(length),
             &minibatch.previous_latent,
             &minibatch.latent_noise,
-            Memory { state: &minibatch.state, first: Some(&first) },
+            RecurrentState { state: &minibatch.state, first: Some(&first) },
         );
         let targets = returns(reward, discount, valid, &values, self.vmpo.discount, self.vmpo.lambda);
         let (targets, values) = (rows(&targets), rows(&values.narrow(1, 0, length)));

@@ -9,7 +9,7 @@ use crate::layers::linear;
 /// each; then Linear → LayerNorm → tanh like every first layer. Small enough for two cores; the supplement is silent on
 /// images under V-MPO (its ResNet is that of the off-policy transfer).
 #[derive(Debug)]
-pub(crate) struct Sight {
+pub(crate) struct ImageEncoder {
     first: nn::Conv2D,
     second: nn::Conv2D,
     output: nn::Linear,
@@ -22,7 +22,7 @@ const SIZE: i64 = IMAGE_SIZE as i64;
 /// What the second convolution gives: 32 channels of 6×6 from 64×64.
 const SECOND: i64 = 32 * 6 * 6;
 
-impl Sight {
+impl ImageEncoder {
     pub(crate) fn new(path: &nn::Path, features: i64) -> Self {
         let convolution = |name: &str, input: i64, output: i64, size: i64, stride: i64| {
             let bound = 1.0 / ((input * size * size) as f64).sqrt();
@@ -43,7 +43,7 @@ impl Sight {
         }
     }
 
-    /// Width of what [`Sight::forward`] gives.
+    /// Width of what [`ImageEncoder::forward`] gives.
     pub(crate) fn output(&self) -> i64 {
         self.features
     }
