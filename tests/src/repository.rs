@@ -8,7 +8,7 @@ use std::process::Command;
 use anyhow::{Context, Result, bail};
 
 /// The crates' folders, as the root manifest lists them.
-pub const FOLDERS: [&str; 11] = [
+pub const FOLDERS: [&str; 12] = [
     "experiment",
     "proto",
     "clips",
@@ -17,9 +17,10 @@ pub const FOLDERS: [&str; 11] = [
     "replay",
     "actor",
     "learner",
+    "bench",
     "tests",
-    "deploy/setup",
-    "deploy/xtask",
+    "setup",
+    "xtask",
 ];
 
 /// The repository's root.

@@ -67,13 +67,11 @@ fn places(sources: &[Source], holds: impl Fn(&str) -> bool) -> Vec<String> {
     lines.filter(|(_, _, line)| holds(line)).map(|(source, number, _)| format!("{}:{number}", source.path)).collect()
 }
 
-/// Benchmarks name their subject; whatever acts or learns takes the low level as it comes.
 #[test]
 fn neither_actor_nor_learner_asks_which_low_level_acts() -> Result<()> {
     let mut sources = sources()?;
     sources.retain(|source| ["actor/src/", "learner/src/"].iter().any(|crate_| source.path.starts_with(crate_)));
     ensure!(!sources.is_empty(), "the crates are not where this test looks for them");
-    sources.retain(|source| !source.path.contains("/bench"));
     let found = places(&sources, |line| line.contains(concat!("LowLevel", "Name::")) || line.contains(".low_level"));
     let found: Vec<_> = found.into_iter().filter(|place| !place.starts_with("learner/src/options.rs")).collect();
     ensure!(found.is_empty(), "{found:?}");
@@ -106,9 +104,7 @@ fn files_are_renamed_durably() -> Result<()> {
     let found = places(&sources()?, |line| line.contains(concat!("fs::", "rename(")));
     let others: Vec<_> = found
         .iter()
-        .filter(|place| {
-            !["learner/src/checkpoint", "deploy/setup/src/extract.rs"].iter().any(|at| place.starts_with(at))
-        })
+        .filter(|place| !["learner/src/checkpoint", "setup/src/extract.rs"].iter().any(|at| place.starts_with(at)))
         .collect();
     ensure!(others.is_empty(), "renames elsewhere: {others:?}");
     Ok(())

@@ -1,19 +1,12 @@
 //! From a batch as the wire has it to minibatches on the device.
 
 use anyhow::Result;
-use comic_experiment::TaskSpec;
 use comic_proto::Field;
 use comic_replay::Batch;
 use rand::seq::SliceRandom as _;
 
 use crate::train::trainer::Trainer;
 use crate::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors};
-
-/// The task of each unroll: that of its clips.
-pub(crate) fn tasks_of_unrolls(batch: &Batch, spec: &TaskSpec) -> Vec<usize> {
-    let rows = batch.layout.rows(Field::Clip).max(1);
-    batch.clip().iter().step_by(rows).map(|clip| spec.task_of(*clip as usize)).collect()
-}
 
 impl Trainer {
     /// The batch on the device, `[B, T(+1), …]`.
@@ -23,7 +16,6 @@ impl Trainer {
 
     /// The same, of which only those rows count, `[B, T]`, whose `valid` is 1.
     pub(crate) fn masked_tensors(&self, batch: &Batch, valid: &[f32]) -> Result<MinibatchTensors> {
-        let tasks = tasks_of_unrolls(batch, &self.spec);
         let shape =
             MinibatchShape { unrolls: batch.unrolls, tasks: self.spec.tasks.len(), unroll: *batch.layout.shape() };
         let source = MinibatchSource {
@@ -42,7 +34,7 @@ impl Trainer {
             state: batch.f32(Field::State),
             clip: batch.clip(),
             image: batch.image(),
-            tasks: &tasks,
+            tasks: &batch.tasks(),
         };
         Ok(MinibatchTensors::new(&source, &shape, self.learner.device())?)
     }
