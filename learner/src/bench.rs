@@ -5,12 +5,15 @@ use std::time::Instant;
 use anyhow::{Context as _, Result};
 use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
 use comic_networks::{Layer, Sizes, low_level_layers, to_safetensors};
-use comic_proto::UnrollShape;
+use comic_proto::{Field, FieldMap, UnrollLayout, UnrollShape};
 use serde_json::json;
 use tch::{Device, Kind, Tensor};
 
+use crate::algorithm::Algorithm as _;
+use crate::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
+use crate::algorithm::shape::MinibatchShape;
 use crate::device::Backend;
-use crate::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
+use crate::vmpo::VmpoLearner;
 
 /// One linear layer's products: rows × inputs → outputs, and whether the gradient flows on to its input.
 struct Product {
@@ -242,77 +245,43 @@ fn floor(spec: &TaskSpec, experiment: &Experiment, device: Device) -> Floor {
     floor
 }
 
-/// A batch of made-up unrolls, as it lies in memory when it has come over the wire.
+/// A batch of generated unrolls, as it lies in memory after it came over the wire.
 struct Recorded {
     shape: MinibatchShape,
-    floats: [Vec<f32>; 13],
+    floats: FieldMap<Vec<f32>>,
     clips: Vec<u32>,
     tasks: Vec<usize>,
 }
 
 impl Recorded {
     fn new(spec: &TaskSpec, experiment: &Experiment) -> Result<Self> {
-        let shape = UnrollShape::new(spec, experiment);
-        let unrolls = experiment.unroll.batch;
-        let (rows, observations) = (unrolls * shape.length, unrolls * (shape.length + 1));
-        let (components, weights) = (shape.components, if shape.components > 1 { shape.components } else { 0 });
-        let random = |count: usize| {
-            Vec::<f32>::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu))).context("random numbers")
-        };
+        let layout = UnrollLayout::new(UnrollShape::new(spec, experiment));
+        let (unroll, unrolls) = (*layout.shape(), experiment.unroll.batch);
+        let floats = FieldMap::try_from_fn(|field| {
+            let count = layout.elements(field) * unrolls;
+            Ok::<_, anyhow::Error>(match field {
+                Field::Discount | Field::Valid => vec![1.0; count],
+                Field::Std => vec![0.7; count],
+                Field::LogWeights => vec![-(unroll.components as f32).ln(); count],
+                Field::First | Field::State => vec![0.0; count],
+                Field::Clip | Field::Image => Vec::new(),
+                _ => Vec::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu)))
+                    .context("random numbers")?,
+            })
+        })?;
         // Unrolls of all tasks in turn; in the bench every task has one clip.
-        let tasks: Vec<usize> = (0..unrolls).map(|unroll| unroll % spec.tasks.len()).collect();
+        let tasks: Vec<usize> = (0..unrolls).map(|index| index % spec.tasks.len()).collect();
         Ok(Self {
-            floats: [
-                random(observations * shape.proprioception)?,
-                random(observations * shape.task)?,
-                random(rows * shape.latent)?,
-                random(rows * shape.latent)?,
-                random(rows * shape.action)?,
-                random(rows * components * shape.action)?,
-                vec![0.7; rows * components * shape.action],
-                vec![-(components as f32).ln(); rows * weights],
-                random(rows * shape.reward_terms)?,
-                vec![1.0; rows],
-                vec![1.0; rows],
-                vec![0.0; observations],
-                vec![0.0; unrolls * shape.state],
-            ],
-            clips: tasks.iter().flat_map(|task| vec![*task as u32; shape.length + 1]).collect(),
+            floats,
+            clips: tasks.iter().flat_map(|task| vec![*task as u32; layout.rows(Field::Clip)]).collect(),
             tasks,
-            shape: MinibatchShape { unrolls, tasks: spec.tasks.len(), unroll: shape },
+            shape: MinibatchShape { unrolls, tasks: spec.tasks.len(), unroll },
         })
     }
 
     fn to_tensors(&self, device: Device) -> Result<MinibatchTensors> {
-        let [
-            proprioception,
-            task,
-            previous_latent,
-            latent_noise,
-            action,
-            mean,
-            std,
-            log_weights,
-            reward,
-            discount,
-            valid,
-            first,
-            state,
-        ] = &self.floats;
         let source = MinibatchSource {
-            proprioception,
-            task,
-            previous_latent,
-            latent_noise,
-            action,
-            mean,
-            std,
-            log_weights,
-            reward,
-            discount,
-            valid,
-            first,
-            state,
+            floats: self.floats.map(Vec::as_slice),
             clip: &self.clips,
             image: &[],
             tasks: &self.tasks,

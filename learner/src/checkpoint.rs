@@ -371,7 +371,10 @@ mod tests {
     fn a_device_that_fails_is_no_wrong_checkpoint() {
         let failed = |error: anyhow::Error| incompatible(Path::new("runs/a"), error.context("cannot be restored"));
         assert!(!failed(tch::TchError::Torch("out of memory".into()).into()).is::<Misuse>());
-        assert!(!failed(crate::vmpo::Error::from(tch::TchError::Torch("out of memory".into())).into()).is::<Misuse>());
+        assert!(
+            !failed(crate::algorithm::error::Error::from(tch::TchError::Torch("out of memory".into())).into())
+                .is::<Misuse>()
+        );
         assert!(failed(anyhow::anyhow!("the checkpoint does not fit")).is::<Misuse>());
     }
 

@@ -4,6 +4,7 @@
 //! - [`v1`] is generated from `comic/v1/learner.proto`: messages, client and server.
 //! - [`UnrollLayout`] says where each [`Field`] of an unroll lies in the payload, and hashes that into what both sides
 //!   compare. It follows from an [`UnrollShape`], and that from the experiment and the task's spec alone.
+//! - [`FieldMap`] is one value for each field.
 //! - [`UnrollBuffer`] is an unroll that an actor writes.
 //! - [`ReceivedUnroll`] is one that a learner receives, in the [`Pieces`] in which it came.
 //! - [`Access`] is a client's way to a learner: URL, TLS, and the [`Token`] it shows.
@@ -20,6 +21,7 @@ compile_error!("the payload of an unroll is little-endian and is copied, not con
 
 mod access;
 mod buffer;
+mod field_map;
 mod frame;
 mod layout;
 mod pieces;
@@ -34,6 +36,7 @@ pub mod v1 {
 
 pub use access::{Access, AccessError, Authorised, Bearer, Client, FRAME_BYTES, chain, distrusted};
 pub use buffer::UnrollBuffer;
+pub use field_map::FieldMap;
 pub use frame::frame;
 pub use layout::{Field, UnrollLayout, UnrollShape};
 pub use pieces::{Malformed, Pieces, ReceivedUnroll};

@@ -2,12 +2,13 @@
 
 use anyhow::Result;
 use comic_experiment::TaskSpec;
-use comic_proto::Field;
+use comic_proto::{Field, FieldMap};
 use comic_replay::Batch;
 use rand::seq::SliceRandom as _;
 
+use crate::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
+use crate::algorithm::shape::MinibatchShape;
 use crate::train::trainer::Trainer;
-use crate::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors};
 
 /// The task of each unroll: that of its clips.
 pub(crate) fn tasks_of_unrolls(batch: &Batch, spec: &TaskSpec) -> Vec<usize> {
@@ -26,24 +27,8 @@ impl Trainer {
         let tasks = tasks_of_unrolls(batch, &self.spec);
         let shape =
             MinibatchShape { unrolls: batch.unrolls, tasks: self.spec.tasks.len(), unroll: *batch.layout.shape() };
-        let source = MinibatchSource {
-            proprioception: batch.f32(Field::Proprioception),
-            task: batch.f32(Field::Task),
-            previous_latent: batch.f32(Field::PreviousLatent),
-            latent_noise: batch.f32(Field::LatentNoise),
-            action: batch.f32(Field::Action),
-            mean: batch.f32(Field::Mean),
-            std: batch.f32(Field::Std),
-            log_weights: batch.f32(Field::LogWeights),
-            reward: batch.f32(Field::Reward),
-            discount: batch.f32(Field::Discount),
-            valid,
-            first: batch.f32(Field::First),
-            state: batch.f32(Field::State),
-            clip: batch.clip(),
-            image: batch.image(),
-            tasks: &tasks,
-        };
+        let floats = FieldMap::from_fn(|field| if field == Field::Valid { valid } else { batch.f32(field) });
+        let source = MinibatchSource { floats, clip: batch.clip(), image: batch.image(), tasks: &tasks };
         Ok(MinibatchTensors::new(&source, &shape, self.learner.device())?)
     }
 
