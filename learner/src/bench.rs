@@ -5,7 +5,7 @@ use std::time::Instant;
 use anyhow::{Context as _, Result};
 use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
 use comic_networks::{Layer, Sizes, low_level_layers, to_safetensors};
-use comic_proto::{Field, FieldMap, UnrollLayout, UnrollShape};
+use comic_proto::{Field, PerField, UnrollLayout, UnrollShape};
 use serde_json::json;
 use tch::{Device, Kind, Tensor};
 
@@ -248,7 +248,7 @@ fn floor(spec: &TaskSpec, experiment: &Experiment, device: Device) -> Floor {
 /// A batch of generated unrolls, as it lies in memory after it came over the wire.
 struct Recorded {
     shape: MinibatchShape,
-    floats: FieldMap<Vec<f32>>,
+    floats: PerField<Vec<f32>>,
     clips: Vec<u32>,
     tasks: Vec<usize>,
 }
@@ -257,9 +257,10 @@ impl Recorded {
     fn new(spec: &TaskSpec, experiment: &Experiment) -> Result<Self> {
         let layout = UnrollLayout::new(UnrollShape::new(spec, experiment));
         let (unroll, unrolls) = (*layout.shape(), experiment.unroll.batch);
-        let floats = FieldMap::try_from_fn(|field| {
+        let mut floats = PerField::from_fn(|_| Vec::new());
+        for (field, values) in floats.iter_mut() {
             let count = layout.elements(field) * unrolls;
-            Ok::<_, anyhow::Error>(match field {
+            *values = match field {
                 Field::Discount | Field::Valid => vec![1.0; count],
                 Field::Std => vec![0.7; count],
                 Field::LogWeights => vec![-(unroll.components as f32).ln(); count],
@@ -267,8 +268,8 @@ impl Recorded {
                 Field::Clip | Field::Image => Vec::new(),
                 _ => Vec::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu)))
                     .context("random numbers")?,
-            })
-        })?;
+            };
+        }
         // Unrolls of all tasks in turn; in the bench every task has one clip.
         let tasks: Vec<usize> = (0..unrolls).map(|index| index % spec.tasks.len()).collect();
         Ok(Self {
@@ -281,7 +282,7 @@ impl Recorded {
 
     fn to_tensors(&self, device: Device) -> Result<MinibatchTensors> {
         let source = MinibatchSource {
-            floats: self.floats.map(Vec::as_slice),
+            floats: self.floats.each_ref().map(|_, values| values.as_slice()),
             clip: &self.clips,
             image: &[],
             tasks: &self.tasks,

@@ -7,10 +7,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, anyhow, bail};
-use bytes::Bytes;
 use comic_clips::Catalogue;
 use comic_experiment::{Difference, Experiment, InitialPose, TaskSpec, Unroll};
-use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Phase};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -112,9 +110,9 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
         }
     };
     if let Ok(Ok(Ending::Budget)) = &ending
-        && let Some(newest) = publisher.newest()
+        && publisher.newest().is_some()
     {
-        publisher.publish(newest.version, Behaviour::Leave, &Bytes::new());
+        publisher.end_run();
         let trained = batcher.accounting().trained > began;
         tokio::time::sleep(if trained { FAREWELL } else { LATE_FAREWELL }).await;
     }
@@ -193,10 +191,10 @@ fn prepare(
         Some(snapshot) => accounting(snapshot).map_err(|error| incompatible(&options.run, error))?,
         None => Ledger::new(),
     };
-    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));
+    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| task.name.clone()));
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
     let config = batches(&experiment.unroll);
-    let batcher = Batcher::new(layout, config, Phase { epoch, ..Phase::default() }, ledger);
+    let batcher = Batcher::new(layout, config, Phase::begin(epoch), ledger);
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {
         run: options.run.clone(),

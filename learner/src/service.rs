@@ -37,7 +37,6 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, ensure};
 use comic_clips::Asset;
 use comic_experiment::{Experiment, TaskSpec};
-use comic_proto::v1::Behaviour;
 use comic_proto::v1::learner_server::LearnerServer;
 use comic_proto::{FILE_DESCRIPTOR_SET, UnrollLayout, UnrollShape};
 use comic_replay::Batcher;
@@ -277,7 +276,7 @@ impl Shared {
 
     /// What streams end with when the server closes: `None` once the run is over, which actors were told.
     fn parting(&self) -> Option<Status> {
-        let over = self.publisher.newest().is_some_and(|newest| newest.behaviour == Behaviour::Leave);
+        let over = self.publisher.newest().is_some_and(|newest| newest.run_over);
         (!over).then(calls::draining)
     }
 

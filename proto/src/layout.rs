@@ -6,6 +6,8 @@ use std::ops::Range;
 use comic_experiment::{Experiment, TaskSpec};
 use sha2::{Digest, Sha256};
 
+use crate::PerField;
+
 /// Bytes of an element of every field but the image, whose elements are bytes.
 const ELEMENT: usize = 4;
 /// Room in a message for everything of fixed size around payload and episode statistics.
@@ -198,17 +200,17 @@ impl fmt::Display for Field {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UnrollLayout {
     shape: UnrollShape,
-    ranges: [(usize, usize); Field::ALL.len()],
+    ranges: PerField<(usize, usize)>,
     hash: [u8; 32],
 }
 
 impl UnrollLayout {
     /// The layout of unrolls of this shape.
     pub fn new(shape: UnrollShape) -> Self {
-        let mut ranges = [(0, 0); Field::ALL.len()];
+        let mut ranges = PerField::default();
         let mut description = format!("comic unroll layout 3, little-endian, T={}\n", shape.length);
         let mut start = 0usize;
-        for (range, field) in ranges.iter_mut().zip(Field::ALL) {
+        for (field, range) in ranges.iter_mut() {
             let (rows, width) = (field.rows(shape.length), field.width(&shape));
             let end = start.saturating_add(rows.saturating_mul(width).saturating_mul(field.element_bytes()));
             *range = (start, end);
@@ -236,7 +238,7 @@ impl UnrollLayout {
 
     /// The bytes of a payload in which this field lies.
     pub fn range(&self, field: Field) -> Range<usize> {
-        let (start, end) = self.ranges[field as usize];
+        let (start, end) = self.ranges[field];
         start..end
     }
 

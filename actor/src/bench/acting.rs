@@ -6,6 +6,7 @@ use std::thread;
 use std::time::Instant;
 
 use bytes::Bytes;
+use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
 use comic_tasks::floor::RawFloor;
 use comic_tasks::{Environment, Simulated};
@@ -15,7 +16,7 @@ use super::tape::Recorded;
 use super::{ENVIRONMENTS, Subject};
 use crate::Error;
 use crate::acting::ForwardPass;
-use crate::mailbox::{Conduct, Directive};
+use crate::mailbox::Directive;
 use crate::policy::TorchPolicy;
 use crate::seeds::derive;
 use crate::worker::{Progress, Worker};
@@ -63,7 +64,7 @@ fn worker<E: Environment>(subject: &Subject, environments: Vec<E>, seed: u64) ->
     let policy = TorchPolicy::untrained(spec, experiment, seed, || Ok([0.0; 56]))?;
     let parameters = Bytes::from(policy.to_parameters()?);
     let mut worker = Worker::new(environments, policy, layout, 0.0, 0, seed);
-    worker.adopt(&Arc::new(Directive { learner_epoch: 1, version: 1, conduct: Conduct::Policy, parameters }))?;
+    worker.adopt(&Arc::new(Directive { learner_epoch: 1, version: 1, behaviour: Behaviour::Policy, parameters }))?;
     Ok(worker)
 }
 

@@ -31,7 +31,7 @@ pub(super) fn wire(subject: &Subject) -> Result<Figure, Error> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(Error::Thread)?;
     let (spec, experiment) = (subject.task.spec(), &subject.experiment);
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, experiment)));
-    let phase = Phase { epoch: 1, version: 1, oldest: 0, demonstration: false };
+    let phase = Phase { epoch: 1, version: 1, oldest: 0, behaviour: Behaviour::Policy };
     let config = Config {
         unrolls: experiment.unroll.batch,
         max_staleness: experiment.unroll.max_staleness,
@@ -106,9 +106,10 @@ fn still_unroll(layout: &UnrollLayout) -> FinishedUnroll {
         payload,
         learner_epoch: 1,
         version: 1,
-        demonstration: false,
+        behaviour: Behaviour::Policy,
         episodes: Vec::new(),
         environment: 0,
+        task: 0,
         ticket: None,
     }
 }

@@ -3,7 +3,7 @@
 use std::ops::Index;
 
 use comic_networks::Routing;
-use comic_proto::{Field, FieldMap};
+use comic_proto::{Field, PerField};
 use tch::{Device, Tensor};
 
 use crate::algorithm::error::Error;
@@ -14,7 +14,7 @@ use crate::device::upload;
 #[derive(Clone, Debug)]
 pub struct MinibatchSource<'a> {
     /// Every field of `f32`; empty for [`Field::Clip`] and [`Field::Image`].
-    pub floats: FieldMap<&'a [f32]>,
+    pub floats: PerField<&'a [f32]>,
     /// [`Field::Clip`].
     pub clip: &'a [u32],
     /// [`Field::Image`]; empty when the task has no camera.
@@ -31,7 +31,7 @@ pub struct MinibatchSource<'a> {
 /// are made, so no formula can use them. Its observation stays, because a truncated episode is bootstrapped there.
 #[derive(Debug)]
 pub struct MinibatchTensors {
-    fields: FieldMap<Tensor>,
+    fields: PerField<Tensor>,
     shape: MinibatchShape,
     /// One more than the largest clip index: known on the host, so no step has to ask the device.
     clips: usize,
@@ -71,12 +71,15 @@ impl MinibatchTensors {
         };
         let valid = uploaded(Field::Valid)?;
         let mask = valid.gt(0.5).unsqueeze(-1);
-        let fields = FieldMap::try_from_fn(|field| match field.blank(&shape.unroll) {
-            _ if field == Field::Valid => Ok(valid.shallow_clone()),
-            Some(blank) => Ok(uploaded(field)?.f_where_scalarother(&mask, blank)?),
-            None if field == Field::Discount => Ok(uploaded(field)? * &valid),
-            None => uploaded(field),
-        })?;
+        let mut fields = PerField::from_fn(|_| Tensor::new());
+        for (field, tensor) in fields.iter_mut() {
+            *tensor = match (field, field.blank(&shape.unroll)) {
+                (Field::Valid, _) => valid.shallow_clone(),
+                (Field::Discount, _) => uploaded(field)? * &valid,
+                (_, Some(blank)) => uploaded(field)?.f_where_scalarother(&mask, blank)?,
+                (_, None) => uploaded(field)?,
+            };
+        }
         Ok(Self {
             fields,
             shape: *shape,
@@ -119,7 +122,7 @@ impl MinibatchTensors {
             routing: Routing::blocked(&tasks, self.shape.tasks, self.device()),
             tasks,
             shape: MinibatchShape { unrolls: unrolls.len(), ..self.shape },
-            fields: self.fields.map(|tensor| tensor.index_select(0, &indices)),
+            fields: self.fields.each_ref().map(|_, tensor| tensor.index_select(0, &indices)),
             clips: self.clips,
         }
     }

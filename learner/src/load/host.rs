@@ -115,7 +115,7 @@ impl Stand {
             ahead: experiment.unroll.ahead,
             order: BatchOrder::Arrival,
         };
-        let batcher = Batcher::new(Arc::new(layout), config, Phase { epoch: EPOCH, ..Phase::default() }, Ledger::new());
+        let batcher = Batcher::new(Arc::new(layout), config, Phase::begin(EPOCH), Ledger::new());
         let publisher = Publisher::new(EPOCH);
         let limits = ConnectionLimits {
             max_actors: 65_536,

@@ -7,7 +7,7 @@ use comic_learner::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
 use comic_learner::algorithm::shape::MinibatchShape;
 use comic_learner::vmpo::VmpoLearner;
 use comic_networks::{Acting, Memory, Routing};
-use comic_proto::{Field, FieldMap, UnrollShape};
+use comic_proto::{Field, PerField, UnrollShape};
 use tch::{Device, Kind, Tensor};
 
 pub(crate) const UNROLLS: usize = 6;
@@ -247,7 +247,7 @@ impl Unrolls {
             Field::State => &self.state,
             Field::Clip | Field::Image => &[],
         };
-        MinibatchSource { floats: FieldMap::from_fn(floats), clip: &self.clip, image: &[], tasks: &self.tasks }
+        MinibatchSource { floats: PerField::from_fn(floats), clip: &self.clip, image: &[], tasks: &self.tasks }
     }
 
     pub(crate) fn minibatch(&self) -> MinibatchTensors {
