@@ -47,3 +47,13 @@ pub enum Error {
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),
 }
+
+impl From<Error> for crate::error::Error {
+    fn from(error: Error) -> Self {
+        match error {
+            Error::Torch(error) => Self::Torch(error),
+            Error::Networks(error) => Self::Networks(error),
+            error => Self::Update(Box::new(error)),
+        }
+    }
+}
