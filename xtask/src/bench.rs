@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::{python, setup, workspace};
 
-
 #[derive(clap::Args)]
 pub(crate) struct Options {
     /// What is measured

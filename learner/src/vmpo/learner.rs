@@ -1,7 +1,7 @@
 //! Networks, multipliers and optimiser, stepped together.
 
 use comic_experiment::{Experiment, Prior, TaskSpec};
-use comic_networks::{Acting, ActionDistribution, RecurrentState, NormaliserStatistics, Policy, Value, to_safetensors};
+use comic_networks::{Acting, ActionDistribution, NormaliserStatistics, Policy, RecurrentState, Value, to_safetensors};
 use comic_proto::{Field, UnrollShape};
 use tch::{Device, Kind, Tensor, nn};
 
