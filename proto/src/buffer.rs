@@ -2,7 +2,9 @@
 
 use bytes::Bytes;
 
-use crate::{Field, Invalid, UnrollLayout};
+use crate::field::Field;
+use crate::layout::UnrollLayout;
+use crate::validate::Invalid;
 
 /// An unroll that an actor writes row by row and sends as one payload.
 ///

@@ -20,7 +20,9 @@
 compile_error!("the payload of an unroll is little-endian and is copied, not converted");
 
 mod access;
+mod access_error;
 mod buffer;
+mod field;
 mod frame;
 mod layout;
 mod per_field;
@@ -34,10 +36,12 @@ pub mod v1 {
     tonic::include_proto!("comic.v1");
 }
 
-pub use access::{Access, AccessError, Authorised, Bearer, Client, FRAME_BYTES, chain, distrusted};
+pub use access::{Access, Authorised, Bearer, Client, FRAME_BYTES, chain, distrusted};
+pub use access_error::AccessError;
 pub use buffer::UnrollBuffer;
+pub use field::{Field, UnrollShape};
 pub use frame::frame;
-pub use layout::{Field, UnrollLayout, UnrollShape};
+pub use layout::UnrollLayout;
 pub use per_field::PerField;
 pub use pieces::{Malformed, Pieces, ReceivedUnroll};
 pub use token::{TOKEN_VARIABLE, Token};

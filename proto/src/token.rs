@@ -3,7 +3,7 @@
 use std::fmt;
 use std::path::Path;
 
-use crate::AccessError;
+use crate::access_error::AccessError;
 
 /// The environment variable that holds a token where no file does.
 pub const TOKEN_VARIABLE: &str = "COMIC_TOKEN";

@@ -4,8 +4,10 @@ use std::ops::Range;
 
 use thiserror::Error;
 
+use crate::field::Field;
+use crate::layout::UnrollLayout;
+use crate::pieces::Pieces;
 use crate::v1::{Behaviour, EpisodeEnd, EpisodeStatistics, UnrollHeader};
-use crate::{Field, Pieces, UnrollLayout};
 
 /// Sequence numbers lie below this. At a thousand unrolls a second an actor reaches it after thirty years; a larger
 /// one is a broken header, and one such number taken seriously would spoil the accounting.

@@ -1,61 +1,21 @@
 //! Where network tasks and the trainer meet.
 
 use std::fmt;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use comic_proto::v1::{Behaviour, UnrollHeader};
+use comic_proto::v1::UnrollHeader;
 use comic_proto::{Pieces, UnrollLayout};
+use parking_lot::{Condvar, Mutex, MutexGuard};
 use tokio::sync::Semaphore;
 
-use crate::batch::{Batch, Buffer};
-use crate::ledger::{Accounting, JoinError, Joined, Ledger, Reason, Sighting};
-use crate::snapshot::Snapshot;
-use crate::tasks::AccountingByTask;
-
-/// What does not change while a batcher lives.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Config {
-    /// B: unrolls a batch, at least 1.
-    pub unrolls: usize,
-    /// An unroll may be so many published versions old, when it comes and when its batch is handed out.
-    pub max_staleness: u64,
-    /// Batches that may be assembled while one is trained on. With 0 nothing is taken meanwhile, and what waits is as
-    /// fresh as can be; with 1 the next batch is ready when the trainer is.
-    pub ahead: usize,
-    /// In which order unrolls stand in a batch.
-    pub order: BatchOrder,
-}
-
-/// Which slot of a batch an unroll takes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum BatchOrder {
-    /// The next one: first come, first served.
-    Arrival,
-    /// That of its environment's number. A batch has one unroll of each of B environments, and no order of arrival can
-    /// be told from it.
-    Environment,
-}
-
-/// What the trainer wants at this moment.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Phase {
-    /// The learner's epoch.
-    pub epoch: u64,
-    /// The newest published version; versions count publications.
-    pub version: u64,
-    /// Unrolls of versions before this one are superseded: they were made under other conditions.
-    pub oldest: u64,
-    /// Unrolls of the other behaviour are superseded.
-    pub behaviour: Behaviour,
-}
-
-impl Phase {
-    /// The phase in which an epoch of the learner begins: nothing is published yet, and the policy acts.
-    pub fn begin(epoch: u64) -> Self {
-        Self { epoch, version: 0, oldest: 0, behaviour: Behaviour::Policy }
-    }
-}
+use crate::accounting::{Accounting, AccountingByTask, Reason};
+use crate::batch::{Batch, TakeBack};
+use crate::buffer::Buffer;
+use crate::config::{BatchOrder, Config};
+use crate::ledger::{JoinError, Joined, Ledger, SequenceStatus};
+use crate::phase::Phase;
+use crate::snapshot::LedgerSnapshot;
 
 /// What became of an unroll.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -231,13 +191,13 @@ impl Batcher {
                 state.ledger.hand_out(buffer.tasks());
                 self.settle(&mut state);
                 drop(state);
-                return Next::Batch(Batch::new(self.inner.layout.clone(), buffer, self.clone()));
+                return Next::Batch(Batch::new(self.inner.layout.clone(), buffer, Box::new(self.clone())));
             }
             let left = deadline.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
             if left.is_zero() {
                 return Next::Elapsed;
             }
-            state = self.inner.filled.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+            self.inner.filled.wait_for(&mut state, left);
         }
     }
 
@@ -263,7 +223,7 @@ impl Batcher {
     }
 
     /// Accounting and accounts for a checkpoint.
-    pub fn snapshot(&self) -> Snapshot {
+    pub fn snapshot(&self) -> LedgerSnapshot {
         let state = self.lock();
         state.ledger.snapshot(state.waiting())
     }
@@ -285,18 +245,8 @@ impl Batcher {
         self.lock().closed
     }
 
-    /// Takes a buffer back from a [`Batch`] whose unrolls were trained on, or dropped for a reason.
-    pub(crate) fn take_back(&self, mut buffer: Buffer, end: Option<Reason>) {
-        let mut state = self.lock();
-        buffer.tasks().for_each(|task| state.ledger.take_back(task, end));
-        buffer.clear();
-        state.free.push(buffer);
-        self.settle(&mut state);
-    }
-
     fn lock(&self) -> MutexGuard<'_, State> {
-        // Nothing in here panics half-way through a change; a poisoned lock means a bug elsewhere, not broken accounting.
-        self.inner.state.lock().unwrap_or_else(PoisonError::into_inner)
+        self.inner.state.lock()
     }
 
     /// Applies every rule that keeps an unroll out of a batch. `None`, and nothing recorded, if there is none.
@@ -377,6 +327,16 @@ impl Batcher {
     }
 }
 
+impl TakeBack for Batcher {
+    fn take_back(&self, mut buffer: Buffer, dropped: Option<Reason>) {
+        let mut state = self.lock();
+        buffer.tasks().for_each(|task| state.ledger.take_back(task, dropped));
+        buffer.clear();
+        state.free.push(buffer);
+        self.settle(&mut state);
+    }
+}
+
 impl State {
     /// Tasks of the unrolls that wait for the trainer.
     fn waiting(&self) -> impl Iterator<Item = u32> {
@@ -385,17 +345,17 @@ impl State {
 }
 
 fn refuse_unaccountable(ledger: &mut Ledger, header: &UnrollHeader) -> Option<Outcome> {
-    match ledger.sight(header.actor, header.incarnation, header.sequence) {
-        Sighting::New => None,
-        Sighting::Duplicate => {
+    match ledger.status(header.actor, header.incarnation, header.sequence) {
+        SequenceStatus::New => None,
+        SequenceStatus::Duplicate => {
             ledger.repeat();
             Some(Outcome::Duplicate)
         }
-        Sighting::Broken => {
+        SequenceStatus::OutOfRange => {
             ledger.refuse();
             Some(Outcome::Invalid)
         }
-        Sighting::Unknown => {
+        SequenceStatus::Unknown => {
             ledger.refuse();
             Some(Outcome::NotJoined)
         }

@@ -3,84 +3,10 @@
 use std::collections::{BTreeMap, HashMap};
 
 use comic_proto::MAX_SEQUENCE;
-use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::tasks::{AccountingByTask, TaskAccounting, Tasks};
-
-/// Sums over every unroll ever produced for this run.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Accounting {
-    /// Unrolls the sequence numbers speak of.
-    pub produced: u64,
-    /// Unrolls trained on.
-    pub trained: u64,
-    /// Unrolls that never will be, by reason.
-    pub dropped: Dropped,
-    /// Unrolls in a batch that is open, full, or being trained on.
-    pub in_flight: u64,
-    /// Messages that repeated an unroll already accounted for; not in the sum.
-    pub duplicates: u64,
-    /// Messages refused without an account to charge; not in the sum.
-    pub unattributed: u64,
-}
-
-impl Accounting {
-    /// Whether `produced = trained + dropped + in flight`.
-    pub fn balance(&self) -> bool {
-        self.dropped.add_to([self.trained, self.in_flight]) == Some(self.produced)
-    }
-}
-
-/// Dropped unrolls by reason.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Dropped {
-    /// Made with parameters older than the experiment allows.
-    pub stale: u64,
-    /// Failed validation.
-    pub invalid: u64,
-    /// Made in another epoch, or for a phase that is over.
-    pub superseded: u64,
-    /// Taken by, or sent to, a life of the learner that ended before it trained on them.
-    pub lost_at_restart: u64,
-}
-
-impl Dropped {
-    /// All reasons together.
-    pub fn total(&self) -> u64 {
-        self.stale + self.invalid + self.superseded + self.lost_at_restart
-    }
-
-    /// These and all reasons together, if a u64 can hold that.
-    pub(crate) fn add_to(&self, others: [u64; 2]) -> Option<u64> {
-        let reasons = [self.stale, self.invalid, self.superseded, self.lost_at_restart];
-        others.into_iter().chain(reasons).try_fold(0u64, u64::checked_add)
-    }
-
-    pub(crate) fn count(&mut self, reason: Reason, unrolls: u64) {
-        *match reason {
-            Reason::Stale => &mut self.stale,
-            Reason::Invalid => &mut self.invalid,
-            Reason::Superseded => &mut self.superseded,
-            Reason::LostAtRestart => &mut self.lost_at_restart,
-        } += unrolls;
-    }
-}
-
-/// Why an unroll is not trained on.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Reason {
-    /// See [`Dropped::stale`].
-    Stale,
-    /// See [`Dropped::invalid`].
-    Invalid,
-    /// See [`Dropped::superseded`].
-    Superseded,
-    /// See [`Dropped::lost_at_restart`].
-    LostAtRestart,
-}
+use crate::accounting::{Accounting, AccountingByTask, Reason, TaskAccounting};
+use crate::tasks::Tasks;
 
 /// What an actor gets by joining.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -118,13 +44,13 @@ pub(crate) struct Entry {
 
 /// What the accounts say about a number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Sighting {
+pub(crate) enum SequenceStatus {
     /// Not accounted for yet.
     New,
     /// Accounted for.
     Duplicate,
     /// No number an actor can have reached.
-    Broken,
+    OutOfRange,
     /// Nobody's.
     Unknown,
 }
@@ -237,17 +163,17 @@ impl Ledger {
         self.entries.len()
     }
 
-    pub(crate) fn sight(&self, actor: u64, incarnation: u64, sequence: u64) -> Sighting {
+    pub(crate) fn status(&self, actor: u64, incarnation: u64, sequence: u64) -> SequenceStatus {
         match self.entries.get(&actor) {
-            Some(entry) if entry.incarnation != incarnation => Sighting::Unknown,
-            Some(_) if sequence >= MAX_SEQUENCE => Sighting::Broken,
-            Some(entry) if sequence < entry.next_sequence => Sighting::Duplicate,
-            Some(_) => Sighting::New,
-            None => Sighting::Unknown,
+            Some(entry) if entry.incarnation != incarnation => SequenceStatus::Unknown,
+            Some(_) if sequence >= MAX_SEQUENCE => SequenceStatus::OutOfRange,
+            Some(entry) if sequence < entry.next_sequence => SequenceStatus::Duplicate,
+            Some(_) => SequenceStatus::New,
+            None => SequenceStatus::Unknown,
         }
     }
 
-    /// Accounts for a number that [`sight`](Self::sight) called new. False, and nothing changed, if it is not, or if
+    /// Accounts for a number that [`status`](Self::status) called new. False, and nothing changed, if it is not, or if
     /// the sum of all numbers would leave its range (then no other sum can). `clip` is the unroll's first, if it is known.
     pub(crate) fn record(&mut self, actor: u64, sequence: u64, task: Option<u32>) -> bool {
         let Some(entry) = self.entries.get_mut(&actor) else { return false };

@@ -4,7 +4,7 @@
 //! - [`Batcher`] is the meeting point: network tasks [`insert`](Batcher::insert) unrolls, the trainer's thread takes
 //!   [`Batch`]es and gives them back with [`trained`](Batcher::trained).
 //! - [`Ledger`] knows every actor's account: which sequence number comes next, and what became of the earlier ones.
-//! - [`Accounting`] are the sums, [`TaskAccounting`] those of one task; [`Snapshot`] is accounting and accounts in a checkpoint.
+//! - [`Accounting`] are the sums, [`TaskAccounting`] those of one task; [`LedgerSnapshot`] is accounting and accounts in a checkpoint.
 //!
 //! # The rules
 //! An actor process is an *incarnation*, a number it draws once. Joining opens an account, `(actor index, incarnation,
@@ -25,7 +25,7 @@
 //!    at restart.
 //! 5. While an unroll waits for a slot nothing is recorded. Dropping the waiting future leaves no trace, and the
 //!    rules are applied at the moment the slot is there: another copy may have been faster.
-//! 6. Restoring a [`Snapshot`] counts what was in flight in it as lost at restart, and leaves the accounts as they
+//! 6. Restoring a [`LedgerSnapshot`] counts what was in flight in it as lost at restart, and leaves the accounts as they
 //!    were: an unroll numbered below the account's next sequence is never trained on again.
 //! 7. At most [`Ledger::CAPACITY`] accounts are open. One more closes the account heard of least recently: its sums
 //!    stay in the accounting, and its incarnation cannot come back (joining is refused, a new process gets a new account).
@@ -38,15 +38,21 @@
 //! - Memory is [`Config::ahead`] batches and the one at the trainer, whatever the number of actors.
 //! - No unroll is in two batches, or twice in one.
 
+mod accounting;
 mod batch;
 mod batcher;
+mod buffer;
+mod config;
 mod ledger;
+mod phase;
 mod snapshot;
 mod streaming;
 mod tasks;
 
+pub use accounting::{Accounting, AccountingByTask, Dropped, Reason, TaskAccounting};
 pub use batch::Batch;
-pub use batcher::{BatchOrder, Batcher, Config, Next, Outcome, Phase};
-pub use ledger::{Accounting, Dropped, JoinError, Joined, Ledger, Reason};
-pub use snapshot::{Account, Error, Snapshot};
-pub use tasks::{AccountingByTask, TaskAccounting};
+pub use batcher::{Batcher, Next, Outcome};
+pub use config::{BatchOrder, Config};
+pub use ledger::{JoinError, Joined, Ledger};
+pub use phase::Phase;
+pub use snapshot::{Account, Error, LedgerSnapshot};

@@ -6,8 +6,8 @@ use comic_proto::MAX_SEQUENCE;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::ledger::{Accounting, Entry, Ledger, Reason};
-use crate::tasks::{AccountingByTask, TaskAccounting};
+use crate::accounting::{Accounting, AccountingByTask, Reason, TaskAccounting};
+use crate::ledger::{Entry, Ledger};
 
 /// One open account.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -24,7 +24,7 @@ pub struct Account {
 /// The ledger at one moment, as plain data.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Snapshot {
+pub struct LedgerSnapshot {
     /// The sums, what was in flight included.
     pub accounting: Accounting,
     /// The same of each task, by its name.
@@ -63,7 +63,7 @@ pub enum Error {
 }
 
 impl Ledger {
-    pub(crate) fn snapshot(&self, waiting: impl Iterator<Item = u32>) -> Snapshot {
+    pub(crate) fn snapshot(&self, waiting: impl Iterator<Item = u32>) -> LedgerSnapshot {
         let mut entries: Vec<_> = self.entries.iter().collect();
         entries.sort_by_key(|(_, entry)| entry.heard);
         let accounts = entries
@@ -76,14 +76,14 @@ impl Ledger {
             .collect();
         let AccountingByTask { all: accounting, mut tasks } = self.accounting(waiting);
         tasks.extend(self.others.iter().map(|(task, accounting)| (task.clone(), *accounting)));
-        Snapshot { accounting, tasks, next_actor: self.next_actor, accounts }
+        LedgerSnapshot { accounting, tasks, next_actor: self.next_actor, accounts }
     }
 
     /// The ledger a new life of the learner starts with: what was in flight at the snapshot is lost at restart.
     ///
     /// # Errors
     /// [`Error`] when the snapshot contradicts itself.
-    pub fn restore(snapshot: &Snapshot) -> Result<Self, Error> {
+    pub fn restore(snapshot: &LedgerSnapshot) -> Result<Self, Error> {
         let mut ledger = Self::new();
         let (mut incarnations, mut in_accounts) = (HashSet::new(), 0u64);
         for (account, heard) in snapshot.accounts.iter().zip(1..) {

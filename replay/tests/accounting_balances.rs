@@ -8,7 +8,7 @@ mod common;
 use std::collections::{HashMap, HashSet};
 
 use comic_proto::v1::Behaviour;
-use comic_replay::{Batch, Batcher, Ledger, Outcome, Phase, Reason, Snapshot, TaskAccounting};
+use comic_replay::{Batch, Batcher, Ledger, LedgerSnapshot, Outcome, Phase, Reason, TaskAccounting};
 use common::{Actor, CONFIG, PHASE, TASKS, batch_now, insert_now, layout, task_of, with_tasks};
 use proptest::prelude::*;
 
@@ -77,7 +77,7 @@ struct World {
     incarnations: u64,
     taken: Vec<Batch>,
     known: Known,
-    checkpoint: (Snapshot, Known),
+    checkpoint: (LedgerSnapshot, Known),
 }
 
 impl World {

@@ -4,11 +4,13 @@
 
 mod common;
 
-use comic_replay::{Accounting, Batcher, Dropped, Error, Joined, Ledger, Outcome, Phase, Snapshot, TaskAccounting};
+use comic_replay::{
+    Accounting, Batcher, Dropped, Error, Joined, Ledger, LedgerSnapshot, Outcome, Phase, TaskAccounting,
+};
 use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, layout, with_tasks};
 
 /// The next life of the learner, from what a checkpoint file would hold.
-fn restarted(snapshot: &Snapshot) -> Batcher {
+fn restarted(snapshot: &LedgerSnapshot) -> Batcher {
     let stored = serde_json::to_string(snapshot).unwrap();
     let ledger = Ledger::restore(&serde_json::from_str(&stored).unwrap()).unwrap();
     Batcher::new(layout(), CONFIG, Phase { epoch: PHASE.epoch + 1, ..PHASE }, with_tasks(ledger))
@@ -133,7 +135,7 @@ fn a_snapshot_that_contradicts_itself_is_refused() {
     let actor = Actor::join(&before, 5);
     assert_eq!(actor.send(&before, 0), Some(Outcome::Taken));
     let good = before.snapshot();
-    let refusal = |change: fn(&mut Snapshot)| {
+    let refusal = |change: fn(&mut LedgerSnapshot)| {
         let mut snapshot = good.clone();
         change(&mut snapshot);
         Ledger::restore(&snapshot).err()
@@ -142,18 +144,18 @@ fn a_snapshot_that_contradicts_itself_is_refused() {
     assert!(matches!(refusal(|snapshot| snapshot.accounting.trained += 1), Some(Error::Unbalanced { .. })));
     assert!(matches!(refusal(|snapshot| snapshot.accounting.dropped.stale = u64::MAX), Some(Error::Unbalanced { .. })));
     assert!(matches!(refusal(|snapshot| snapshot.accounts[0].next_sequence = 2), Some(Error::Unbalanced { .. })));
-    let repeated = |snapshot: &mut Snapshot| snapshot.accounts.push(snapshot.accounts[0]);
+    let repeated = |snapshot: &mut LedgerSnapshot| snapshot.accounts.push(snapshot.accounts[0]);
     assert_eq!(refusal(repeated), Some(Error::Account { actor: 0 }));
     assert_eq!(refusal(|snapshot| snapshot.next_actor = 0), Some(Error::Account { actor: 0 }));
     assert_eq!(refusal(|snapshot| snapshot.next_actor = u64::MAX), Some(Error::Account { actor: u64::MAX }));
-    let unbalanced = |snapshot: &mut Snapshot| snapshot.tasks.get_mut("tracking").unwrap().trained += 1;
+    let unbalanced = |snapshot: &mut LedgerSnapshot| snapshot.tasks.get_mut("tracking").unwrap().trained += 1;
     assert!(matches!(refusal(unbalanced), Some(Error::UnbalancedTask { .. })));
-    let too_many = |snapshot: &mut Snapshot| {
+    let too_many = |snapshot: &mut LedgerSnapshot| {
         let own = TaskAccounting { produced: 1, trained: 1, ..TaskAccounting::default() };
         snapshot.tasks.insert("get-up".into(), own);
     };
     assert!(matches!(refusal(too_many), Some(Error::UnbalancedTask { .. })), "more than all tasks have");
-    let trained = |snapshot: &mut Snapshot| {
+    let trained = |snapshot: &mut LedgerSnapshot| {
         let own = snapshot.tasks.get_mut("tracking").unwrap();
         (own.trained, own.in_flight) = (own.in_flight, 0);
     };
