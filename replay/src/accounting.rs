@@ -1,24 +1,24 @@
-//! The sums: what became of all unrolls, and of those of each task.
+//! The sums over all unrolls, and over the unrolls of each task.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-/// Sums over every unroll ever produced for this run.
+/// Sums over all unrolls that were produced for this run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Accounting {
-    /// Unrolls the sequence numbers speak of.
+    /// Unrolls that were produced, according to their sequence numbers.
     pub produced: u64,
     /// Unrolls trained on.
     pub trained: u64,
-    /// Unrolls that never will be, by reason.
+    /// Dropped unrolls by reason.
     pub dropped: Dropped,
-    /// Unrolls in a batch that is open, full, or being trained on.
+    /// Unrolls in a batch that is open, full, or at the trainer.
     pub in_flight: u64,
-    /// Messages that repeated an unroll already accounted for; not in the sum.
+    /// Messages that repeated an unroll of the accounting; not part of the sum.
     pub duplicates: u64,
-    /// Messages refused without an account to charge; not in the sum.
+    /// Messages that were refused because they belong to no account; not part of the sum.
     pub unattributed: u64,
 }
 
@@ -33,28 +33,29 @@ impl Accounting {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Dropped {
-    /// Made with parameters older than the experiment allows.
+    /// The parameters were older than the experiment allows.
     pub stale: u64,
-    /// Failed validation.
+    /// The validation failed.
     pub invalid: u64,
-    /// Made in another epoch, or for a phase that is over.
+    /// Made in another epoch, or in a phase that has ended.
     pub superseded: u64,
-    /// Taken by, or sent to, a life of the learner that ended before it trained on them.
+    /// Received by or sent to an earlier learner epoch that ended before it trained on them.
     pub lost_at_restart: u64,
 }
 
 impl Dropped {
-    /// All reasons together.
+    /// The sum over all reasons.
     pub fn total(&self) -> u64 {
         self.stale + self.invalid + self.superseded + self.lost_at_restart
     }
 
-    /// These and all reasons together, if a u64 can hold that.
+    /// The sum of `others` and all reasons; `None` if a u64 overflows.
     pub(crate) fn add_to(&self, others: [u64; 2]) -> Option<u64> {
         let reasons = [self.stale, self.invalid, self.superseded, self.lost_at_restart];
         others.into_iter().chain(reasons).try_fold(0u64, u64::checked_add)
     }
 
+    /// Adds unrolls with this reason.
     pub(crate) fn count(&mut self, reason: Reason, unrolls: u64) {
         *match reason {
             Reason::Stale => &mut self.stale,
@@ -65,7 +66,7 @@ impl Dropped {
     }
 }
 
-/// Why an unroll is not trained on.
+/// The reason why an unroll was dropped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Reason {
     /// See [`Dropped::stale`].
@@ -78,20 +79,20 @@ pub enum Reason {
     LostAtRestart,
 }
 
-/// Sums over the unrolls that are known to be of one task: `produced = trained + dropped + in flight`.
+/// Sums over the unrolls of one task: `produced = trained + dropped + in flight`.
 ///
-/// What nobody can tell the task of is in [`Accounting`] alone (numbers that were lost, invalid messages, and what another life of
-/// the learner had asked for), so the tasks together come to no more than those.
+/// Unrolls without a known task are only in [`Accounting`]: lost numbers, invalid messages, and unrolls of another
+/// learner epoch. So the sum over the tasks is at most the total.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskAccounting {
-    /// Unrolls that were decided about.
+    /// Unrolls that were accepted or dropped.
     pub produced: u64,
     /// Unrolls trained on.
     pub trained: u64,
-    /// Unrolls that never will be, by reason.
+    /// Dropped unrolls by reason.
     pub dropped: Dropped,
-    /// Unrolls in a batch that is open, full, or being trained on.
+    /// Unrolls in a batch that is open, full, or at the trainer.
     pub in_flight: u64,
 }
 
@@ -102,11 +103,11 @@ impl TaskAccounting {
     }
 }
 
-/// Everybody's accounting, and each task's, at one moment.
+/// The total accounting and that of each task, at the same moment.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct AccountingByTask {
-    /// Of all tasks, and of what is nobody's.
+    /// The total, with unrolls without a known task.
     pub all: Accounting,
-    /// By the task's name.
+    /// The accounting of each task, by its name.
     pub tasks: BTreeMap<String, TaskAccounting>,
 }

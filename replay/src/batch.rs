@@ -1,4 +1,4 @@
-//! A batch in the hands of the trainer.
+//! A batch at the trainer.
 
 use std::fmt;
 use std::sync::Arc;
@@ -15,15 +15,15 @@ pub(crate) trait TakeBack: Send + Sync {
     fn take_back(&self, buffer: Buffer, dropped: Option<Reason>);
 }
 
-/// A full batch in the hands of the trainer.
+/// A full batch at the trainer.
 ///
-/// It is given back with [`Batcher::trained`](crate::Batcher::trained) or
-/// [`Batcher::discard`](crate::Batcher::discard). One that is merely dropped counts as lost at
-/// restart: a trainer that lets go of batches is a learner going down.
+/// The trainer returns it with [`Batcher::trained`](crate::Batcher::trained) or
+/// [`Batcher::discard`](crate::Batcher::discard). The unrolls of a batch that is dropped
+/// count as lost at restart, because a trainer drops batches only when the learner stops.
 pub struct Batch {
-    /// Where each field of an unroll lies.
+    /// The layout of its unrolls.
     pub layout: Arc<UnrollLayout>,
-    /// B.
+    /// B, the number of unrolls.
     pub unrolls: usize,
     buffer: Option<Box<Buffer>>,
     owner: Option<Box<dyn TakeBack>>,
@@ -34,10 +34,10 @@ impl Batch {
         Self { layout, unrolls: buffer.len(), buffer: Some(Box::new(buffer)), owner: Some(owner) }
     }
 
-    /// A batch of these unrolls that belongs to no batcher, for instance from a recording.
+    /// A batch of these unrolls that belongs to no batcher, for example from a recording.
     ///
     /// # Errors
-    /// [`Invalid::Length`] when a payload is no unroll of this layout.
+    /// [`Invalid::Length`] if the length of a payload is not that of the layout.
     pub fn assemble(
         layout: Arc<UnrollLayout>,
         unrolls: impl IntoIterator<Item = (UnrollHeader, impl Into<Pieces>), IntoIter: ExactSizeIterator>,
@@ -54,23 +54,23 @@ impl Batch {
         Ok(Self { layout, unrolls: buffer.len(), buffer: Some(Box::new(buffer)), owner: None })
     }
 
-    /// A field of `f32`, `[B, rows, width]`; empty for [`Field::Clip`] and [`Field::Image`], which are
+    /// A field of `f32`, `[B, rows, width]`. It is empty for [`Field::Clip`] and [`Field::Image`]; see
     /// [`clip`](Self::clip) and [`image`](Self::image).
     pub fn f32(&self, field: Field) -> &[f32] {
         self.buffer.as_ref().map_or(&[], |buffer| &buffer.floats[field])
     }
 
-    /// The clips' indices, `[B, T+1]`.
+    /// The indices of the clips, `[B, T+1]`.
     pub fn clip(&self) -> &[u32] {
         self.buffer.as_ref().map_or(&[], |buffer| &buffer.clips)
     }
 
-    /// The images, `[B, T+1, I]`; empty when the humanoid is blind.
+    /// The camera images, `[B, T+1, I]`; empty if the humanoid has no camera.
     pub fn image(&self) -> &[u8] {
         self.buffer.as_ref().map_or(&[], |buffer| &buffer.images)
     }
 
-    /// The headers, `[B]`, without the layout hash, which all of them share.
+    /// The headers, `[B]`, without the layout hash, which is equal in all of them.
     pub fn headers(&self) -> &[UnrollHeader] {
         self.buffer.as_ref().map_or(&[], |buffer| &buffer.headers)
     }
@@ -80,14 +80,14 @@ impl Batch {
         self.headers().iter().map(|header| header.task as usize).collect()
     }
 
-    /// Ends its life in the accounting: trained on, or dropped for a reason.
-    pub(crate) fn finish(mut self, end: Option<Reason>) {
-        self.give_back(end);
+    /// Accounts for the unrolls as dropped for this reason, or without a reason as trained on. Returns the memory.
+    pub(crate) fn finish(mut self, dropped: Option<Reason>) {
+        self.give_back(dropped);
     }
 
-    fn give_back(&mut self, end: Option<Reason>) {
+    fn give_back(&mut self, dropped: Option<Reason>) {
         if let (Some(buffer), Some(owner)) = (self.buffer.take(), self.owner.take()) {
-            owner.take_back(*buffer, end);
+            owner.take_back(*buffer, dropped);
         }
     }
 }

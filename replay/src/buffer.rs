@@ -7,17 +7,17 @@ use comic_proto::{Field, PerField, Pieces, UnrollLayout};
 
 use crate::streaming;
 
-/// The arrays of a batch: `[B, rows, width]` for each field. Made once and used again and again.
+/// The arrays of a batch: `[B, rows, width]` for each field. A buffer is allocated once and then reused.
 #[derive(Debug)]
 pub(crate) struct Buffer {
-    /// Empty for the clips and the images.
+    /// Empty for clips and images.
     pub(crate) floats: PerField<Vec<f32>>,
     pub(crate) clips: Vec<u32>,
     pub(crate) images: Vec<u8>,
-    /// By slot; in a free one stands what was there before.
+    /// One header per slot. A free slot has the header of an earlier unroll.
     pub(crate) headers: Vec<UnrollHeader>,
     filled: Vec<bool>,
-    /// Slots in use.
+    /// Number of slots in use.
     unrolls: usize,
 }
 
@@ -37,7 +37,7 @@ impl Buffer {
         }
     }
 
-    /// Slots in use.
+    /// Number of slots in use.
     pub(crate) fn len(&self) -> usize {
         self.unrolls
     }
@@ -47,17 +47,17 @@ impl Buffer {
         self.unrolls == self.filled.len()
     }
 
-    /// The first free slot; beyond the last one when there is none.
+    /// The first free slot; the number of slots if there is none.
     pub(crate) fn first_free(&self) -> usize {
         self.filled.iter().position(|filled| !filled).unwrap_or(self.filled.len())
     }
 
-    /// Whether there is such a slot, and nothing in it.
+    /// Whether this slot exists and is free.
     pub(crate) fn is_free(&self, slot: usize) -> bool {
         self.filled.get(slot) == Some(&false)
     }
 
-    /// The task of every unroll in it.
+    /// The task of each unroll.
     pub(crate) fn tasks(&self) -> impl Iterator<Item = u32> {
         self.filled.iter().zip(&self.headers).filter(|(filled, _)| **filled).map(|(_, header)| header.task)
     }
@@ -68,15 +68,15 @@ impl Buffer {
         self.unrolls = 0;
     }
 
-    /// Copies an unroll into a free slot: each field once, from where the network put it to where it is trained on.
-    /// The payload's size is the layout's.
+    /// Copies an unroll into a free slot: each field once, from the received pieces to its place in the batch. The
+    /// payload must have the size of the layout.
     pub(crate) fn put(&mut self, layout: &UnrollLayout, slot: usize, header: UnrollHeader, payload: &Pieces) {
         for field in Field::ALL {
-            let place = place(layout, field, slot);
+            let range = slot_range(layout, field, slot);
             let bytes: &mut [u8] = match field {
-                Field::Clip => bytemuck::cast_slice_mut(&mut self.clips[place]),
-                Field::Image => &mut self.images[place],
-                _ => bytemuck::cast_slice_mut(&mut self.floats[field][place]),
+                Field::Clip => bytemuck::cast_slice_mut(&mut self.clips[range]),
+                Field::Image => &mut self.images[range],
+                _ => bytemuck::cast_slice_mut(&mut self.floats[field][range]),
             };
             payload.copy_by(layout.range(field).start, bytes, streaming::copy);
         }
@@ -85,7 +85,7 @@ impl Buffer {
         self.unrolls += 1;
     }
 
-    /// Frees the slots of the unrolls that are not `kept`, and returns the tasks of those unrolls.
+    /// Frees the slots of the unrolls that are not `kept`. Returns the tasks of the removed unrolls.
     pub(crate) fn retain(&mut self, kept: impl Fn(&UnrollHeader) -> bool) -> Vec<u32> {
         let mut removed = Vec::new();
         for (filled, header) in self.filled.iter_mut().zip(&self.headers) {
@@ -98,7 +98,7 @@ impl Buffer {
         removed
     }
 
-    /// Moves unrolls of `other` here, as far as there are free slots.
+    /// Moves unrolls from `other` into the free slots of this buffer.
     pub(crate) fn fill_from(&mut self, layout: &UnrollLayout, other: &mut Buffer) {
         for slot in 0..other.filled.len() {
             if self.is_full() {
@@ -110,7 +110,7 @@ impl Buffer {
             other.unrolls -= 1;
             let free = self.first_free();
             for field in Field::ALL {
-                let (from, to) = (place(layout, field, slot), place(layout, field, free));
+                let (from, to) = (slot_range(layout, field, slot), slot_range(layout, field, free));
                 match field {
                     Field::Clip => self.clips[to].copy_from_slice(&other.clips[from]),
                     Field::Image => self.images[to].copy_from_slice(&other.images[from]),
@@ -124,8 +124,8 @@ impl Buffer {
     }
 }
 
-/// The elements of a slot in a field's array.
-fn place(layout: &UnrollLayout, field: Field, slot: usize) -> Range<usize> {
+/// The elements of one slot in the array of a field.
+fn slot_range(layout: &UnrollLayout, field: Field, slot: usize) -> Range<usize> {
     let elements = layout.elements(field);
     slot * elements..(slot + 1) * elements
 }

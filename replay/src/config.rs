@@ -1,25 +1,25 @@
 //! The fixed configuration of a batcher.
 
-/// What does not change while a batcher lives.
+/// The configuration of a batcher. It does not change while the batcher exists.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
-    /// B: unrolls a batch, at least 1.
+    /// B, the number of unrolls per batch, at least 1.
     pub unrolls: usize,
-    /// An unroll may be so many published versions old, when it comes and when its batch is handed out.
+    /// Greatest age of an unroll in published versions, when it arrives and when the trainer gets its batch.
     pub max_staleness: u64,
-    /// Batches that may be assembled while one is trained on. With 0 nothing is taken meanwhile, and what waits is as
-    /// fresh as can be; with 1 the next batch is ready when the trainer is.
+    /// Number of batches that may be assembled while one is trained on. With 0 no unroll is accepted in the meantime,
+    /// so unrolls are as new as possible. With 1 the next batch can be ready when the trainer needs it.
     pub ahead: usize,
-    /// In which order unrolls stand in a batch.
+    /// The order of the unrolls in a batch.
     pub order: BatchOrder,
 }
 
-/// Which slot of a batch an unroll takes.
+/// The order of the unrolls in a batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BatchOrder {
-    /// The next one: first come, first served.
+    /// In the order of arrival: an unroll gets the next free slot.
     Arrival,
-    /// That of its environment's number. A batch has one unroll of each of B environments, and no order of arrival can
-    /// be told from it.
+    /// In the order of the environments: an unroll gets the slot with the number of its environment. A batch has one
+    /// unroll of each of B environments, so it does not depend on the order of arrival.
     Environment,
 }

@@ -2,21 +2,21 @@
 
 use comic_proto::v1::Behaviour;
 
-/// What the trainer wants at this moment.
+/// The phase of the training: which unrolls the trainer uses at this moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Phase {
-    /// The learner's epoch.
+    /// The learner epoch.
     pub epoch: u64,
-    /// The newest published version; versions count publications.
+    /// The newest published version. Each publication increases it by one.
     pub version: u64,
-    /// Unrolls of versions before this one are superseded: they were made under other conditions.
+    /// Unrolls with an older version than this are superseded: they were made in an earlier phase.
     pub oldest: u64,
-    /// Unrolls of the other behaviour are superseded.
+    /// Unrolls with another behaviour are superseded.
     pub behaviour: Behaviour,
 }
 
 impl Phase {
-    /// The phase in which an epoch of the learner begins: nothing is published yet, and the policy acts.
+    /// The first phase of a learner epoch: no version is published yet, and the policy acts.
     pub fn begin(epoch: u64) -> Self {
         Self { epoch, version: 0, oldest: 0, behaviour: Behaviour::Policy }
     }

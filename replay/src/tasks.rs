@@ -1,17 +1,17 @@
-//! The same accounting for each task of joint training.
+//! The accounting of each task.
 
 use std::collections::BTreeMap;
 
 use crate::accounting::TaskAccounting;
 
-/// The tasks of a run with their accounting, in the order of the indices in the unrolls' headers.
+/// The tasks of a run with their accounting, in the order of the task indices in the headers of unrolls.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Tasks {
     tasks: Vec<(String, TaskAccounting)>,
 }
 
 impl Tasks {
-    /// These tasks. Each takes its accounting out of `known`, or begins a new one.
+    /// These tasks. Each one continues its accounting in `known`, which is removed there, or begins a new one.
     pub(crate) fn new(tasks: impl IntoIterator<Item = String>, known: &mut BTreeMap<String, TaskAccounting>) -> Self {
         let with_accounting = |name: String| {
             let accounting = known.remove(&name).unwrap_or_default();
@@ -20,12 +20,12 @@ impl Tasks {
         Self { tasks: tasks.into_iter().map(with_accounting).collect() }
     }
 
-    /// The accounting of the task with this index.
+    /// The accounting of the task with this index; `None` for an unknown index.
     pub(crate) fn of(&mut self, task: u32) -> Option<&mut TaskAccounting> {
         self.tasks.get_mut(task as usize).map(|(_, accounting)| accounting)
     }
 
-    /// Every task's accounting by its name.
+    /// The accounting of each task, by its name.
     pub(crate) fn by_name(self) -> BTreeMap<String, TaskAccounting> {
         self.tasks.into_iter().collect()
     }
