@@ -3,46 +3,46 @@
 use std::io;
 use std::path::PathBuf;
 
-/// What is wrong with a client's URL, certificates or token.
+/// An error of a client's URL, certificates or token.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum AccessError {
-    /// The learner's address is no URL.
-    #[error("`{url}` is no address of a learner: give one like http://host:7070")]
+    /// The address of the learner is not a valid URL.
+    #[error("`{url}` is not a valid address of a learner: give an address like http://host:7070")]
     Url {
-        /// What was given.
+        /// The given address.
         url: String,
     },
-    /// `https://`, and nobody to trust.
+    /// The address begins with `https://`, but no authority is given.
     #[error("{url} needs --ca FILE, the authority that signed the learner's certificate")]
     NoAuthority {
-        /// The learner's address.
+        /// The address of the learner.
         url: String,
     },
-    /// An authority, and nothing to check with it.
+    /// An authority is given, but the address does not use TLS.
     #[error("--ca is given, but {url} does not use TLS: write https://")]
     NotSecure {
-        /// The learner's address.
+        /// The address of the learner.
         url: String,
     },
     /// A file cannot be read.
     #[error("cannot read {}", path.display())]
     File {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// No token, or none that can stand in a header.
-    #[error("{origin} holds no usable token: a token is one line of visible ASCII characters without spaces")]
+    /// There is no token, or it is not valid in a header.
+    #[error("{origin} has no valid token: a token is one line of visible ASCII characters without spaces")]
     Token {
         /// File or variable.
         origin: String,
     },
-    /// Certificates or keys that are none, or that do not belong together.
+    /// Certificates or keys are invalid, or do not belong together.
     #[error("the certificates cannot be used: {reason}")]
     Tls {
-        /// What rustls says.
+        /// The message of rustls.
         reason: String,
     },
 }

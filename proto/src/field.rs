@@ -4,34 +4,34 @@ use std::fmt;
 
 use comic_experiment::{Experiment, TaskSpec};
 
-/// Bytes of an element of every field but the image, whose elements are bytes.
+/// Bytes per element of all fields except the image, whose elements are single bytes.
 pub(crate) const ELEMENT: usize = 4;
 
-/// The sizes an unroll is made of.
+/// The sizes that determine the shape of an unroll.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct UnrollShape {
-    /// T: transitions.
+    /// T, the number of transitions.
     pub length: usize,
-    /// P: proprioception.
+    /// P, the size of proprioception.
     pub proprioception: usize,
-    /// X: task observation.
+    /// X, the size of the task observation.
     pub task: usize,
-    /// A: action.
+    /// A, the size of an action.
     pub action: usize,
-    /// Z: latent.
+    /// Z, the size of the latent.
     pub latent: usize,
-    /// R: reward terms.
+    /// R, the number of reward terms.
     pub reward_terms: usize,
-    /// I: bytes of an image, a multiple of 4; 0 when the humanoid is blind.
+    /// I, the bytes of a camera image, a multiple of 4; 0 if the humanoid has no camera.
     pub image: usize,
-    /// K: Gaussians that the behaviour policy's distribution is a mixture of.
+    /// K, the number of components (Gaussians) of the behaviour policy's distribution.
     pub components: usize,
-    /// S: numbers that the policy remembers from step to step; 0 when it remembers nothing.
+    /// S, the size of the policy's recurrent state; 0 if it is not recurrent.
     pub state: usize,
 }
 
 impl UnrollShape {
-    /// The unrolls of this task under this experiment.
+    /// The shape of the unrolls of this experiment and its task spec.
     pub fn new(spec: &TaskSpec, experiment: &Experiment) -> Self {
         Self {
             length: experiment.unroll.length,
@@ -40,56 +40,56 @@ impl UnrollShape {
             action: spec.action,
             latent: experiment.network.latent.size,
             reward_terms: spec.reward_terms.len(),
-            // Whole words keep every row aligned.
+            // The image has whole words, so every row is aligned.
             image: spec.image.next_multiple_of(ELEMENT),
             components: experiment.network.components(),
             state: experiment.network.state_size(),
         }
     }
 
-    /// Elements in a row of this field.
+    /// Number of elements per row of this field.
     pub fn width(&self, field: Field) -> usize {
         field.width(self)
     }
 }
 
-/// One array of an unroll; the order here is the order in the payload.
+/// One array of an unroll. The order of the variants is the order in the payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Field {
-    /// `[T+1, P]` f32: what the body feels of itself, SI units.
+    /// `[T+1, P]` f32: proprioception, in SI units.
     Proprioception,
     /// `[T+1, X]` f32: the task observation.
     Task,
-    /// `[T, Z]` f32: z of the step before; zero at an episode's first step.
+    /// `[T, Z]` f32: z of the previous step; 0 at the first step of an episode.
     PreviousLatent,
-    /// `[T, Z]` f32: the standard-normal noise that made z.
+    /// `[T, Z]` f32: the standard-normal noise of z.
     LatentNoise,
-    /// `[T, A]` f32: the action as sampled, not clipped.
+    /// `[T, A]` f32: the sampled action, not clipped.
     Action,
     /// `[T, K·A]` f32: mean of each component of the behaviour policy.
     Mean,
     /// `[T, K·A]` f32, positive: standard deviation of each component of the behaviour policy.
     Std,
-    /// `[T, K]` f32: ln of the components' weights, which add up to 1; absent where there is one component.
+    /// `[T, K]` f32: ln of the weights of the components, which add up to 1; empty for one component.
     LogWeights,
-    /// `[T, R]` f32: one column for each reward term.
+    /// `[T, R]` f32: one column per reward term.
     Reward,
-    /// `[T]` f32 in [0, 1]: 0 where the step terminated the episode, 1 elsewhere.
+    /// `[T]` f32 in [0, 1]: 0 if the step terminated the episode, else 1.
     Discount,
-    /// `[T]` f32, 1 or 0: whether the row holds a transition.
+    /// `[T]` f32, 1 or 0: whether the row has a transition.
     Valid,
-    /// `[T+1]` f32, 1 or 0: whether the row is an episode's first observation.
+    /// `[T+1]` f32, 1 or 0: whether the row is the first observation of an episode.
     First,
-    /// `[1, S]` f32: what the policy remembers when it meets the first observation.
+    /// `[1, S]` f32: the recurrent state before the first observation.
     State,
-    /// `[T+1]` u32: the clip's index.
+    /// `[T+1]` u32: the index of the clip.
     Clip,
-    /// `[T+1, I]` u8: what the humanoid sees, rows from the top, red, green, blue.
+    /// `[T+1, I]` u8: the camera image, rows from the top, red, green, blue.
     Image,
 }
 
 impl Field {
-    /// Every field, in payload order.
+    /// All fields in payload order.
     pub const ALL: [Self; 15] = [
         Self::Proprioception,
         Self::Task,
@@ -108,7 +108,7 @@ impl Field {
         Self::Image,
     ];
 
-    /// Its name in layout descriptions and messages.
+    /// The name in descriptions of layouts and in messages.
     pub fn name(self) -> &'static str {
         match self {
             Self::Proprioception => "proprioception",
@@ -173,6 +173,7 @@ impl Field {
         }
     }
 
+    /// Type of an element.
     pub(crate) fn element(self) -> &'static str {
         match self {
             Self::Clip => "u32",
@@ -181,7 +182,7 @@ impl Field {
         }
     }
 
-    /// Bytes of an element.
+    /// Bytes per element.
     pub(crate) fn element_bytes(self) -> usize {
         if self == Self::Image { 1 } else { ELEMENT }
     }

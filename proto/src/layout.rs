@@ -1,4 +1,4 @@
-//! Where each field of an unroll lies in the payload.
+//! The position of each field of an unroll in the payload.
 
 use std::fmt::Write as _;
 use std::ops::Range;
@@ -8,12 +8,13 @@ use sha2::{Digest, Sha256};
 use crate::field::{ELEMENT, Field, UnrollShape};
 use crate::per_field::PerField;
 
-/// Room in a message for everything of fixed size around payload and episode statistics.
+/// Bytes in a message for everything except payload and episode statistics.
 const HEADER_SLACK: usize = 4096;
-/// Room for one episode's statistics without its returns: a few varints and tags.
+/// Bytes for the statistics of one episode without its returns: a few varints and tags.
 const EPISODE_SLACK: usize = 64;
 
-/// Where every field of an unroll lies in the payload, and the hash by which both sides know they agree.
+/// The position of every field of an unroll in the payload, and a hash by which actor and learner check that their
+/// layouts are equal.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UnrollLayout {
     shape: UnrollShape,
@@ -38,12 +39,12 @@ impl UnrollLayout {
         Self { shape, ranges, hash: Sha256::digest(description).into() }
     }
 
-    /// The shape it was made from.
+    /// The shape of the unrolls.
     pub fn shape(&self) -> &UnrollShape {
         &self.shape
     }
 
-    /// Bytes of a payload.
+    /// Size of a payload, bytes.
     pub fn size(&self) -> usize {
         self.range(Field::Image).end
     }
@@ -53,33 +54,33 @@ impl UnrollLayout {
         self.hash
     }
 
-    /// The bytes of a payload in which this field lies.
+    /// The range of this field in a payload, bytes.
     pub fn range(&self, field: Field) -> Range<usize> {
         let (start, end) = self.ranges[field];
         start..end
     }
 
-    /// Elements a row.
+    /// Number of elements per row.
     pub fn width(&self, field: Field) -> usize {
         field.width(&self.shape)
     }
 
-    /// Rows: T, T + 1 or 1.
+    /// Number of rows: T, T + 1 or 1.
     pub fn rows(&self, field: Field) -> usize {
         field.rows(self.shape.length)
     }
 
-    /// Elements of the whole field, rows × width.
+    /// Number of elements of the field, rows × width.
     pub fn elements(&self, field: Field) -> usize {
         self.range(field).len() / field.element_bytes()
     }
 
-    /// The most episodes that can end in one unroll: each has its last observation in a row of its own.
+    /// Greatest number of episodes that can end in one unroll. The last observation of each has its own row.
     pub fn max_episodes(&self) -> usize {
         self.shape.length.saturating_add(1)
     }
 
-    /// The largest `UnrollMessage` that can be valid, in bytes: what a server sets as its decoding limit.
+    /// Size of the largest valid `UnrollMessage`, bytes. A server uses it as its decoding limit.
     pub fn message_limit(&self) -> usize {
         let episode = self.shape.reward_terms.saturating_mul(ELEMENT).saturating_add(EPISODE_SLACK);
         self.size().saturating_add(self.max_episodes().saturating_mul(episode)).saturating_add(HEADER_SLACK)
