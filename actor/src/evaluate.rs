@@ -14,6 +14,7 @@ mod table;
 
 use std::sync::Arc;
 
+use comic_experiment::seed::derive;
 use comic_proto::UnrollShape;
 use comic_tasks::{ClipStarts, Simulated, Task};
 use rand::{Rng as _, SeedableRng as _};
@@ -22,7 +23,6 @@ use rand_pcg::Pcg64;
 use crate::Error;
 use crate::acting::ForwardPass;
 use crate::acting_loop::Controller;
-use crate::seeds::derive;
 
 pub use options::Options;
 pub use report::{ClipReport, Finished, Report};

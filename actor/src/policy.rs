@@ -1,7 +1,7 @@
 //! The forward pass through libtorch.
 
 use comic_experiment::{Experiment, InitialPose, TaskSpec};
-use comic_networks::{Memory, Policy, Routing};
+use comic_networks::{Policy, RecurrentState, Routing};
 use comic_proto::Field;
 use tch::nn::VarStore;
 use tch::{Device, Tensor};
@@ -97,7 +97,7 @@ impl ForwardPass for TorchPolicy {
                 &observation,
                 &matrix(&batch[Field::PreviousLatent])?,
                 &matrix(&batch[Field::LatentNoise])?,
-                Memory { state: &matrix(&batch[Field::State])?, first: None },
+                RecurrentState { state: &matrix(&batch[Field::State])?, first: None },
             );
             let (mean, std, log_weights) = acting.action.to_rows();
             let read = |tensor: &Tensor, values: &mut [f32]| match values {
