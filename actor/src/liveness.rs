@@ -1,4 +1,4 @@
-//! A sign of life: a file that is written while environments are stepped, and `comic-actor health`, which looks at it.
+//! Liveness: a file that is written while environments are stepped, and `comic-actor health`, which reads its age.
 
 use std::fs;
 use std::io::{ErrorKind, Write as _};
@@ -13,79 +13,79 @@ use clap::Args;
 use crate::Error;
 use crate::worker::Progress;
 
-/// How often it is looked whether environments were stepped.
+/// How often the steps are checked.
 const EVERY: Duration = Duration::from_secs(2);
 
-/// Asks whether an actor steps environments: exits with 0 if it did lately, and with 1 if not. An actor whose learner is away
-/// or slower than it is stands still, too.
+/// Checks whether an actor steps environments: exits with 0 if it did lately, and with 1 if not. An actor that waits for
+/// its learner takes no steps either.
 #[derive(Clone, Debug, Args)]
 pub struct Health {
-    /// What the actor was given as --pulse.
-    #[arg(long, value_name = "FILE", env = "COMIC_PULSE")]
-    pub pulse: PathBuf,
+    /// The file that the actor was given as --liveness.
+    #[arg(long, value_name = "FILE", env = "COMIC_LIVENESS")]
+    pub liveness: PathBuf,
     /// Seconds within which an environment must have been stepped.
     #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u64).range(5..=86_400))]
     pub within: u64,
 }
 
 impl Health {
-    /// Looks, and says so on stdout.
+    /// Checks the file's age and prints the result on stdout.
     ///
     /// # Errors
-    /// An actor that stands still, or has not begun.
+    /// No step was taken yet, or none lately.
     pub fn run(&self) -> Result<()> {
-        let file = self.pulse.display();
-        let written = match fs::metadata(&self.pulse) {
-            Ok(found) => found.modified().with_context(|| format!("{file} has no time"))?,
+        let file = self.liveness.display();
+        let written = match fs::metadata(&self.liveness) {
+            Ok(found) => found.modified().with_context(|| format!("{file} has no modification time"))?,
             Err(error) if error.kind() == ErrorKind::NotFound => bail!("no environment was stepped yet"),
-            Err(error) => return Err(error).with_context(|| format!("cannot look at {file}")),
+            Err(error) => return Err(error).with_context(|| format!("cannot read {file}")),
         };
-        // A clock that was set back makes it look new, which it then is for as long.
+        // If the clock was set back, the file counts as new.
         let age = written.elapsed().unwrap_or_default();
         if age > Duration::from_secs(self.within) {
             bail!("no environment was stepped for {} s", age.as_secs());
         }
-        // Nobody has to read it.
+        // Standard output may be closed.
         let _ = writeln!(std::io::stdout(), "acting");
         Ok(())
     }
 }
 
-/// The file of a process that acts.
+/// The liveness file of an actor process.
 #[derive(Debug)]
-pub(crate) struct Pulse {
+pub(crate) struct Liveness {
     file: PathBuf,
-    /// How many the process had taken when it was last looked.
+    /// Steps of the process at the last check.
     steps: u64,
 }
 
-impl Pulse {
-    /// There is no file until an environment was stepped, so that what a former process left says nothing about this one.
+impl Liveness {
+    /// Removes the file of an earlier process. The file comes back with the first step.
     ///
     /// # Errors
-    /// A place where no file can be written.
+    /// [`Error::Usage`] when the file cannot be written.
     pub(crate) fn new(file: &Path) -> Result<Self, Error> {
         let usable = fs::write(file, "").and_then(|()| fs::remove_file(file));
-        let unusable = |error| Error::Usage(format!("--pulse {}: it cannot be written: {error}", file.display()));
+        let unusable = |error| Error::Usage(format!("--liveness {}: it cannot be written: {error}", file.display()));
         usable.map_err(unusable).map(|()| Self { file: file.to_owned(), steps: 0 })
     }
 
-    /// Keeps it up.
-    pub(crate) async fn beat(mut self, progress: Arc<Progress>) {
+    /// Writes the file again and again.
+    pub(crate) async fn keep_up(mut self, progress: Arc<Progress>) {
         loop {
-            self.look(progress.steps.load(Ordering::Relaxed));
+            self.update(progress.steps.load(Ordering::Relaxed));
             tokio::time::sleep(EVERY).await;
         }
     }
 
     /// Writes the file if environments were stepped since the last time.
-    fn look(&mut self, steps: u64) {
+    fn update(&mut self, steps: u64) {
         if steps == self.steps {
             return;
         }
         self.steps = steps;
         if let Err(error) = fs::write(&self.file, format!("{steps}\n")) {
-            tracing::warn!(file = %self.file.display(), %error, "the sign of life could not be written");
+            tracing::warn!(file = %self.file.display(), %error, "the liveness file could not be written");
         }
     }
 }
@@ -94,23 +94,23 @@ impl Pulse {
 mod tests {
     use super::*;
 
-    fn health(pulse: &Path) -> Result<()> {
-        Health { pulse: pulse.into(), within: 60 }.run()
+    fn health(liveness: &Path) -> Result<()> {
+        Health { liveness: liveness.into(), within: 60 }.run()
     }
 
     #[test]
-    fn what_a_former_process_left_counts_for_nothing() {
+    fn the_file_of_an_earlier_process_is_removed() {
         let directory = tempfile::tempdir().unwrap();
-        let file = directory.path().join("pulse");
+        let file = directory.path().join("liveness");
         fs::write(&file, "1000\n").unwrap();
         assert!(health(&file).is_ok());
-        Pulse::new(&file).unwrap();
+        Liveness::new(&file).unwrap();
         assert!(health(&file).unwrap_err().to_string().contains("yet"));
-        assert!(matches!(Pulse::new(&directory.path().join("nowhere/pulse")), Err(Error::Usage(_))));
+        assert!(matches!(Liveness::new(&directory.path().join("nowhere/liveness")), Err(Error::Usage(_))));
     }
 
     #[test]
-    fn an_actor_that_stands_still_is_not_healthy() {
+    fn an_actor_without_steps_is_not_healthy() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let ago = std::time::SystemTime::now() - Duration::from_secs(90);
         file.as_file().set_modified(ago).unwrap();
@@ -118,16 +118,16 @@ mod tests {
     }
 
     #[test]
-    fn it_is_written_as_long_as_steps_are_taken() {
+    fn the_file_is_written_while_steps_are_taken() {
         let directory = tempfile::tempdir().unwrap();
-        let file = directory.path().join("pulse");
-        let mut pulse = Pulse::new(&file).unwrap();
-        pulse.look(0);
-        assert!(!file.exists(), "no step, no sign");
-        pulse.look(7);
+        let file = directory.path().join("liveness");
+        let mut liveness = Liveness::new(&file).unwrap();
+        liveness.update(0);
+        assert!(!file.exists(), "no step was taken");
+        liveness.update(7);
         assert_eq!(fs::read_to_string(&file).unwrap(), "7\n");
         fs::remove_file(&file).unwrap();
-        pulse.look(7);
-        assert!(!file.exists(), "it stands still");
+        liveness.update(7);
+        assert!(!file.exists(), "no step was taken since");
     }
 }

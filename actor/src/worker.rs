@@ -123,12 +123,9 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     ) -> Result<(), Error> {
         while let Some(directive) = mailbox.wait_from(self.oldest_wanted(pace)) {
             self.adopt(&directive)?;
-            let finished = tracing::debug_span!(
-                "rollout",
-                environments = self.acting.rollouts.len(),
-                version = directive.version
-            )
-            .in_scope(|| self.unroll(&|| mailbox.is_closed(), progress))?;
+            let finished =
+                tracing::debug_span!("rollout", environments = self.acting.rollouts.len(), version = directive.version)
+                    .in_scope(|| self.unroll(&|| mailbox.is_closed(), progress))?;
             let Some(finished) = finished else { return Ok(()) };
             let round = Round::default();
             for mut unroll in finished {
