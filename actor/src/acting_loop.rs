@@ -27,16 +27,16 @@ pub enum Controller<'a, F> {
 
 impl<F: ForwardPass> Controller<'_, F> {
     /// Writes the action distribution of every row.
-    fn decide<E: Environment>(&mut self, simulations: &[Simulation<E>], batch: &mut ActingBatch) -> Result<(), Error> {
+    fn decide<E: Environment>(&mut self, rollouts: &[Rollout<E>], batch: &mut ActingBatch) -> Result<(), Error> {
         let std = match self {
             Self::Policy(forward) => return forward.forward(batch),
             Self::Servo { std } => Some(*std),
             Self::Zero => None,
         };
-        for (index, simulation) in simulations.iter().enumerate() {
+        for (index, rollout) in rollouts.iter().enumerate() {
             let mut row = batch.row(index);
             match std {
-                Some(std) => row.set_gaussian(|mean| simulation.servo_action(mean), std),
+                Some(std) => row.set_gaussian(|mean| rollout.servo_action(mean), std),
                 None => row.set_gaussian(|mean| mean.fill(0.0), 0.0),
             }
             // No policy acts, so there is no latent and no recurrent state.
@@ -53,7 +53,7 @@ pub(crate) trait Recorder<E> {
     ///
     /// # Errors
     /// A camera image that cannot be drawn.
-    fn observe(&mut self, index: usize, simulation: &mut Simulation<E>, row: &mut ActingRow<'_>) -> Result<(), Error>;
+    fn observe(&mut self, index: usize, rollout: &mut Rollout<E>, row: &mut ActingRow<'_>) -> Result<(), Error>;
 
     /// Before the forward pass: draws the noise of the row's latent.
     fn draw_latent_noise(&mut self, index: usize, row: &mut ActingRow<'_>);
@@ -65,7 +65,7 @@ pub(crate) trait Recorder<E> {
     fn step(
         &mut self,
         index: usize,
-        simulation: &mut Simulation<E>,
+        rollout: &mut Rollout<E>,
         row: &mut ActingRow<'_>,
     ) -> Result<ControlFlow<()>, Error>;
 }
@@ -73,7 +73,7 @@ pub(crate) trait Recorder<E> {
 /// E environments that act together.
 #[derive(Debug)]
 pub(crate) struct ActingLoop<E> {
-    pub(crate) simulations: Vec<Simulation<E>>,
+    pub(crate) rollouts: Vec<Rollout<E>>,
     pub(crate) batch: ActingBatch,
 }
 
@@ -81,14 +81,14 @@ impl<E: Environment> ActingLoop<E> {
     /// Environments that are in no episode yet.
     pub(crate) fn new(environments: Vec<E>, shape: &UnrollShape) -> Self {
         let batch = ActingBatch::new(environments.len(), shape);
-        let simulations = environments.into_iter().map(|environment| Simulation::new(environment, shape.action));
-        Self { simulations: simulations.collect(), batch }
+        let rollouts = environments.into_iter().map(|environment| Rollout::new(environment, shape.action));
+        Self { rollouts: rollouts.collect(), batch }
     }
 
     /// Records every environment's current observation.
     pub(crate) fn observe(&mut self, recorder: &mut impl Recorder<E>) -> Result<(), Error> {
-        for (index, simulation) in self.simulations.iter_mut().enumerate() {
-            recorder.observe(index, simulation, &mut self.batch.row(index))?;
+        for (index, rollout) in self.rollouts.iter_mut().enumerate() {
+            recorder.observe(index, rollout, &mut self.batch.row(index))?;
         }
         Ok(())
     }
@@ -103,12 +103,12 @@ impl<E: Environment> ActingLoop<E> {
         recorder: &mut impl Recorder<E>,
     ) -> Result<ControlFlow<()>, Error> {
         self.observe(recorder)?;
-        for index in 0..self.simulations.len() {
+        for index in 0..self.rollouts.len() {
             recorder.draw_latent_noise(index, &mut self.batch.row(index));
         }
-        controller.decide(&self.simulations, &mut self.batch)?;
-        for (index, simulation) in self.simulations.iter_mut().enumerate() {
-            if recorder.step(index, simulation, &mut self.batch.row(index))?.is_break() {
+        controller.decide(&self.rollouts, &mut self.batch)?;
+        for (index, rollout) in self.rollouts.iter_mut().enumerate() {
+            if recorder.step(index, rollout, &mut self.batch.row(index))?.is_break() {
                 return Ok(ControlFlow::Break(()));
             }
         }
@@ -118,7 +118,7 @@ impl<E: Environment> ActingLoop<E> {
 
 /// An environment and its current episode.
 #[derive(Debug)]
-pub(crate) struct Simulation<E> {
+pub(crate) struct Rollout<E> {
     pub(crate) environment: E,
     pub(crate) episode: Episode,
     /// The episode is over, and no other one has begun.
@@ -133,7 +133,7 @@ pub(crate) struct Simulation<E> {
     clipped: Vec<f32>,
 }
 
-impl<E: Environment> Simulation<E> {
+impl<E: Environment> Rollout<E> {
     fn new(environment: E, actions: usize) -> Self {
         Self {
             environment,

@@ -100,10 +100,10 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     ) -> Self {
         let length = layout.shape().length;
         let mut acting = ActingLoop::new(environments, layout.shape());
-        let recorder = UnrollRecorder::new(layout, (first..).take(acting.simulations.len()), seed);
-        for (index, simulation) in acting.simulations.iter_mut().enumerate() {
-            simulation.environment.reset();
-            simulation.begin_episode(&mut acting.batch.row(index));
+        let recorder = UnrollRecorder::new(layout, (first..).take(acting.rollouts.len()), seed);
+        for (index, rollout) in acting.rollouts.iter_mut().enumerate() {
+            rollout.environment.reset();
+            rollout.begin_episode(&mut acting.batch.row(index));
         }
         Self { acting, recorder, forward, length, first, demonstration_noise, directive: None }
     }
@@ -123,12 +123,9 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     ) -> Result<(), Error> {
         while let Some(directive) = mailbox.wait_from(self.oldest_wanted(pace)) {
             self.adopt(&directive)?;
-            let finished = tracing::debug_span!(
-                "rollout",
-                environments = self.acting.simulations.len(),
-                version = directive.version
-            )
-            .in_scope(|| self.unroll(&|| mailbox.is_closed(), progress))?;
+            let finished =
+                tracing::debug_span!("rollout", environments = self.acting.rollouts.len(), version = directive.version)
+                    .in_scope(|| self.unroll(&|| mailbox.is_closed(), progress))?;
             let Some(finished) = finished else { return Ok(()) };
             let round = Round::default();
             for mut unroll in finished {
@@ -200,13 +197,13 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
             .directive
             .as_ref()
             .map_or((0, 0, Behaviour::Policy), |newest| (newest.learner_epoch, newest.version, newest.behaviour));
-        let ActingLoop { simulations, batch } = &mut self.acting;
-        let mut unrolls = Vec::with_capacity(simulations.len());
-        for ((index, simulation), environment) in simulations.iter_mut().enumerate().zip(self.first..) {
+        let ActingLoop { rollouts, batch } = &mut self.acting;
+        let mut unrolls = Vec::with_capacity(rollouts.len());
+        for ((index, rollout), environment) in rollouts.iter_mut().enumerate().zip(self.first..) {
             let RecordedUnroll { payload, episodes, task } = self.recorder.take(index);
-            if simulation.ended {
-                simulation.environment.reset();
-                simulation.begin_episode(&mut batch.row(index));
+            if rollout.ended {
+                rollout.environment.reset();
+                rollout.begin_episode(&mut batch.row(index));
             }
             let ticket = None;
             unrolls.push(FinishedUnroll {

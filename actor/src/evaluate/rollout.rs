@@ -13,7 +13,7 @@ use super::options::Options;
 use super::report::Finished;
 use crate::Error;
 use crate::acting::{ActingRow, ForwardPass};
-use crate::acting_loop::{ActingLoop, Controller, Recorder, Simulation};
+use crate::acting_loop::{ActingLoop, Controller, Recorder, Rollout};
 
 /// Watches a rollout, to show its progress or to film it.
 pub trait Audience<E> {
@@ -58,7 +58,7 @@ pub(super) fn run<E: Environment, F: ForwardPass>(
 ) -> Result<Vec<Finished>, Error> {
     let mut acting = ActingLoop::new(environments, shape);
     let mut recorder = EpisodeRecorder {
-        running: vec![Running::default(); acting.simulations.len()],
+        running: vec![Running::default(); acting.rollouts.len()],
         queue: starts.iter().enumerate(),
         all: starts.len(),
         finished: Vec::with_capacity(starts.len()),
@@ -67,12 +67,12 @@ pub(super) fn run<E: Environment, F: ForwardPass>(
         action: vec![0.0; shape.action],
         audience,
     };
-    for (index, simulation) in acting.simulations.iter_mut().enumerate() {
-        if recorder.begin_next(index, simulation, &mut acting.batch.row(index))?.is_break() {
+    for (index, rollout) in acting.rollouts.iter_mut().enumerate() {
+        if recorder.begin_next(index, rollout, &mut acting.batch.row(index))?.is_break() {
             return Ok(recorder.finished);
         }
     }
-    while acting.simulations.iter().any(|simulation| !simulation.ended) {
+    while acting.rollouts.iter().any(|rollout| !rollout.ended) {
         if acting.iterate(controller, &mut recorder)?.is_break() {
             break;
         }
@@ -109,25 +109,25 @@ impl<E: Environment> EpisodeRecorder<'_, E> {
     fn begin_next(
         &mut self,
         index: usize,
-        simulation: &mut Simulation<E>,
+        rollout: &mut Rollout<E>,
         row: &mut ActingRow<'_>,
     ) -> Result<ControlFlow<()>, Error> {
         let Some((number, start)) = self.queue.next() else { return Ok(ControlFlow::Continue(())) };
         self.running[index] = Running { number, start: *start, rewards: Vec::new() };
-        simulation.environment.reset_to(start.clip, start.start)?;
-        simulation.begin_episode(row);
-        self.audience.watch(number, &mut simulation.environment)
+        rollout.environment.reset_to(start.clip, start.start)?;
+        rollout.begin_episode(row);
+        self.audience.watch(number, &mut rollout.environment)
     }
 
-    fn finish(&mut self, index: usize, simulation: &Simulation<E>, outcome: Outcome) {
+    fn finish(&mut self, index: usize, rollout: &Rollout<E>, outcome: Outcome) {
         let Running { start, rewards, .. } = std::mem::take(&mut self.running[index]);
         self.finished.push(Finished {
             clip: start.clip,
             start: start.start,
-            steps_left: simulation.episode.steps_left,
+            steps_left: rollout.episode.steps_left,
             rewards,
-            returns: simulation.returns,
-            head_heights: simulation.head_heights,
+            returns: rollout.returns,
+            head_heights: rollout.head_heights,
             diverged: outcome == Outcome::Diverged,
         });
         self.audience.count(self.finished.len(), self.all);
@@ -135,9 +135,9 @@ impl<E: Environment> EpisodeRecorder<'_, E> {
 }
 
 impl<E: Environment> Recorder<E> for EpisodeRecorder<'_, E> {
-    fn observe(&mut self, _index: usize, simulation: &mut Simulation<E>, row: &mut ActingRow<'_>) -> Result<(), Error> {
-        if !simulation.ended {
-            simulation.environment.draw(row.image)?;
+    fn observe(&mut self, _index: usize, rollout: &mut Rollout<E>, row: &mut ActingRow<'_>) -> Result<(), Error> {
+        if !rollout.ended {
+            rollout.environment.draw(row.image)?;
         }
         Ok(())
     }
@@ -152,27 +152,27 @@ impl<E: Environment> Recorder<E> for EpisodeRecorder<'_, E> {
     fn step(
         &mut self,
         index: usize,
-        simulation: &mut Simulation<E>,
+        rollout: &mut Rollout<E>,
         row: &mut ActingRow<'_>,
     ) -> Result<ControlFlow<()>, Error> {
-        if simulation.ended {
+        if rollout.ended {
             return Ok(ControlFlow::Continue(()));
         }
         match self.deterministic {
             true => self.action.copy_from_slice(row.mode()),
             false => row.sample(&mut self.action, &mut self.rng),
         }
-        let step = simulation.step(&self.action, row);
+        let step = rollout.step(&self.action, row);
         let Running { number, rewards, .. } = &mut self.running[index];
         rewards.push(step.reward_terms.iter().sum());
         let mut flow = ControlFlow::Continue(());
         if step.outcome != Outcome::Diverged {
-            flow = self.audience.watch(*number, &mut simulation.environment)?;
+            flow = self.audience.watch(*number, &mut rollout.environment)?;
         }
-        if simulation.ended {
-            self.finish(index, simulation, step.outcome);
+        if rollout.ended {
+            self.finish(index, rollout, step.outcome);
             if flow.is_continue() {
-                flow = self.begin_next(index, simulation, row)?;
+                flow = self.begin_next(index, rollout, row)?;
             }
         }
         Ok(flow)

@@ -12,7 +12,7 @@ use rand_pcg::Pcg64;
 
 use crate::Error;
 use crate::acting::ActingRow;
-use crate::acting_loop::{Recorder, Simulation};
+use crate::acting_loop::{Recorder, Rollout};
 use crate::seeds::EnvironmentSeeds;
 
 /// The unrolls of all environments of a worker, filled row by row.
@@ -70,23 +70,23 @@ impl UnrollRecorder {
 
 impl<E: Environment> Recorder<E> for UnrollRecorder {
     /// Writes the current observation as row `t`. The camera image is drawn here, once for the row and for acting.
-    fn observe(&mut self, index: usize, simulation: &mut Simulation<E>, row: &mut ActingRow<'_>) -> Result<(), Error> {
+    fn observe(&mut self, index: usize, rollout: &mut Rollout<E>, row: &mut ActingRow<'_>) -> Result<(), Error> {
         let (OpenUnroll { buffer, task, .. }, t) = (&mut self.unrolls[index], self.t);
         if t == 0 {
-            *task = simulation.episode.task;
+            *task = rollout.episode.task;
             buffer.row_mut(Field::State, 0).copy_from_slice(&row[Field::State]);
         }
-        if simulation.episode.task != *task {
+        if rollout.episode.task != *task {
             buffer.repeat_observation(t);
             return Ok(());
         }
-        simulation.environment.draw(row.image)?;
+        rollout.environment.draw(row.image)?;
         buffer.image_mut(t).copy_from_slice(row.image);
         for field in [Field::Proprioception, Field::Task] {
             buffer.row_mut(field, t).copy_from_slice(&row[field]);
         }
-        buffer.row_mut(Field::First, t)[0] = f32::from(u8::from(simulation.steps == 0));
-        buffer.set_clip(t, simulation.episode.clip as u32);
+        buffer.row_mut(Field::First, t)[0] = f32::from(u8::from(rollout.steps == 0));
+        buffer.set_clip(t, rollout.episode.clip as u32);
         Ok(())
     }
 
@@ -97,21 +97,21 @@ impl<E: Environment> Recorder<E> for UnrollRecorder {
     fn step(
         &mut self,
         index: usize,
-        simulation: &mut Simulation<E>,
+        rollout: &mut Rollout<E>,
         row: &mut ActingRow<'_>,
     ) -> Result<ControlFlow<()>, Error> {
         let (unroll, t) = (&mut self.unrolls[index], self.t);
-        if simulation.episode.task != unroll.task {
+        if rollout.episode.task != unroll.task {
             // An episode of another task waits: the row stays padding.
             row.reset_recurrent_state();
-        } else if simulation.ended {
+        } else if rollout.ended {
             unroll.write_last_observation(t, row);
-            simulation.environment.reset();
-            simulation.begin_episode(row);
+            rollout.environment.reset();
+            rollout.begin_episode(row);
         } else {
-            unroll.write_transition(t, simulation, row);
+            unroll.write_transition(t, rollout, row);
             self.steps += 1;
-            self.episodes += u64::from(simulation.ended);
+            self.episodes += u64::from(rollout.ended);
         }
         Ok(ControlFlow::Continue(()))
     }
@@ -119,18 +119,18 @@ impl<E: Environment> Recorder<E> for UnrollRecorder {
 
 impl OpenUnroll {
     /// Samples an action, takes a step, and writes both as row `t`.
-    fn write_transition<E: Environment>(&mut self, t: usize, simulation: &mut Simulation<E>, row: &mut ActingRow<'_>) {
+    fn write_transition<E: Environment>(&mut self, t: usize, rollout: &mut Rollout<E>, row: &mut ActingRow<'_>) {
         self.write_distribution(t, row);
         let action = self.buffer.row_mut(Field::Action, t);
         row.sample(action, &mut self.rng);
-        let step = simulation.step(action, row);
+        let step = rollout.step(action, row);
         let reward = self.buffer.row_mut(Field::Reward, t);
         for (reward, term) in reward.iter_mut().zip(&step.reward_terms) {
             *reward = *term as f32;
         }
         self.buffer.row_mut(Field::Discount, t)[0] = step.discount as f32;
         self.buffer.row_mut(Field::Valid, t)[0] = 1.0;
-        self.end_episode(simulation, step.outcome);
+        self.end_episode(rollout, step.outcome);
     }
 
     /// Row `t` is an episode's last observation: it has no action and no reward, and its discount is 0 for a reader that
@@ -150,7 +150,7 @@ impl OpenUnroll {
     }
 
     /// Keeps the statistics of an episode that is over.
-    fn end_episode<E>(&mut self, simulation: &Simulation<E>, outcome: Outcome) {
+    fn end_episode<E>(&mut self, rollout: &Rollout<E>, outcome: Outcome) {
         let end = match outcome {
             Outcome::Running => return,
             Outcome::Terminated => EpisodeEnd::Terminated,
@@ -159,12 +159,12 @@ impl OpenUnroll {
         };
         let terms = self.buffer.layout().shape().reward_terms;
         self.episodes.push(EpisodeStatistics {
-            clip: simulation.episode.clip as u32,
-            steps: simulation.steps,
-            steps_left_at_start: simulation.episode.steps_left as u32,
-            returns: simulation.returns.iter().take(terms).map(|sum| *sum as f32).collect(),
+            clip: rollout.episode.clip as u32,
+            steps: rollout.steps,
+            steps_left_at_start: rollout.episode.steps_left as u32,
+            returns: rollout.returns.iter().take(terms).map(|sum| *sum as f32).collect(),
             end: end.into(),
-            head_height: Some((simulation.head_heights / f64::from(simulation.steps.max(1))) as f32),
+            head_height: Some((rollout.head_heights / f64::from(rollout.steps.max(1))) as f32),
         });
     }
 }
