@@ -138,7 +138,7 @@ impl Field {
         }
     }
 
-    /// Elements of a row.
+    /// Number of elements per row.
     pub fn width(self, shape: &UnrollShape) -> usize {
         match self {
             Self::Proprioception => shape.proprioception,
