@@ -20,6 +20,7 @@ mod lines;
 mod network;
 pub mod presets;
 mod resolve;
+pub mod seed;
 mod spec;
 mod tasks;
 

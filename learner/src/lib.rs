@@ -24,6 +24,7 @@ pub mod bench;
 pub mod checkpoint;
 pub mod commands;
 pub mod device;
+pub mod document;
 pub mod error;
 pub mod load;
 mod log_limiter;

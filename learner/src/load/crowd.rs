@@ -78,7 +78,7 @@ enum Kind {
 impl Options {
     pub(super) fn run(&self) -> Result<()> {
         let crowd = Arc::new(Crowd::new(self)?);
-        crate::run::allow_descriptors(self.actors as u64 + 256);
+        crate::service::process::allow_descriptors(self.actors as u64 + 256);
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
         for index in 0..self.actors {
             runtime.spawn(crowd.clone().actor(index));

@@ -23,10 +23,11 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::process::obey;
 use crate::publish::Publisher;
-use crate::run::service_runtime;
 use crate::security::{ConnectionLimits, Security, Tls};
-use crate::service::quarantine::QuarantineOptions;
-use crate::service::{Setup, Shared, serve, server, window};
+use crate::service::http2::{server, window};
+use crate::service::process::{allow_descriptors, runtime};
+use crate::service::quarantine::QuarantineArguments;
+use crate::service::{Service, Setup, serve};
 
 const EPOCH: u64 = 1;
 
@@ -63,13 +64,13 @@ enum Kind {
 
 impl Options {
     pub(super) fn run(&self) -> Result<()> {
-        let runtime = service_runtime()?;
+        let runtime = runtime()?;
         let listener = runtime.block_on(TcpListener::bind((Ipv4Addr::LOCALHOST, 0)))?;
         println!("{}", json!({ "listening": listener.local_addr()?.to_string() }));
         match self.kind {
             Kind::Learner => {
                 let learner = Stand::new(self)?;
-                runtime.spawn(serve(listener, learner.shared.clone(), std::future::pending()));
+                runtime.spawn(serve(listener, learner.service.clone(), std::future::pending()));
                 learner.start(self)?;
                 obey(|order| learner.answer(order))
             }
@@ -100,7 +101,7 @@ impl Options {
 /// The learner, with something that takes batches in the trainer's place.
 #[derive(Clone, Debug)]
 struct Stand {
-    shared: Arc<Shared>,
+    service: Service,
     batcher: Batcher,
     publisher: Publisher,
     payload: Bytes,
@@ -123,8 +124,8 @@ impl Stand {
             max_requests: 262_144,
             ..ConnectionLimits::default()
         };
-        crate::run::allow_descriptors(16_384);
-        let shared = Shared::new(Setup {
+        allow_descriptors(16_384);
+        let service = Service::new(Setup {
             run: "runs/load".into(),
             id: 0,
             security: security(options.tls.as_deref())?,
@@ -134,9 +135,9 @@ impl Stand {
             assets: Vec::new(),
             batcher: batcher.clone(),
             publisher: publisher.clone(),
-            quarantine: QuarantineOptions::default(),
+            quarantine: QuarantineArguments::default(),
         })?;
-        Ok(Self { shared, batcher, publisher, payload: Bytes::from(vec![1; options.parameters]) })
+        Ok(Self { service, batcher, publisher, payload: Bytes::from(vec![1; options.parameters]) })
     }
 
     fn start(&self, options: &Options) -> Result<()> {
@@ -171,7 +172,7 @@ impl Stand {
                         self.publish();
                     }
                     self.batcher.trained(batch);
-                    self.shared.telemetry.count_update(began.elapsed(), ages);
+                    self.service.trainer().telemetry.count_update(began.elapsed(), ages);
                 }
                 Next::Elapsed => {}
                 Next::Closed => return,

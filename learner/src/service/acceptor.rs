@@ -1,50 +1,51 @@
-//! Connections as they come in: counted, limited, and through TLS where it is on.
+//! Accepts connections: counts and limits them, and makes the TLS handshake where TLS is on.
 
 use std::collections::HashMap;
 use std::future::Future as _;
 use std::io;
 use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
 use futures::stream::{self, Stream};
+use parking_lot::Mutex;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
 use tokio::time::Sleep;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
-use super::lock;
 use crate::log_limiter::LogLimiter;
 use crate::observe::telemetry::Telemetry;
 use crate::security::{ConnectionLimits, Tls};
 
-/// A handshake takes a few round trips, TLS's and HTTP/2's each; whoever takes longer is turned away.
+/// The time limit of the TLS handshake, and of the HTTP/2 preface. Each takes a few round trips.
 const HANDSHAKE: Duration = Duration::from_secs(10);
-/// Bytes with which HTTP/2 begins (RFC 9113, 3.4). From then on pings find out who is not there any more.
+/// Bytes with which HTTP/2 begins (RFC 9113, 3.4). After them pings find peers that are gone.
 const PREFACE: usize = 24;
-/// How long a peer whose handshake failed may take to read why.
-const LINGER: Duration = Duration::from_secs(1);
-/// Before listening again when the system has no file descriptor to give.
-const BREATH: Duration = Duration::from_millis(100);
+/// How long a peer may take to read why its handshake failed.
+const ALERT_TIMEOUT: Duration = Duration::from_secs(1);
+/// The pause before the next attempt when the system has no file descriptor left.
+const RETRY_DELAY: Duration = Duration::from_millis(100);
 
-/// What decides about a connection.
+/// Decides which connections are accepted; a handle that can be cloned.
 #[derive(Clone, Debug)]
 pub(super) struct Acceptor {
     tls: Option<Arc<Tls>>,
     per_address: usize,
-    in_all: usize,
-    places: Arc<Mutex<Places>>,
+    total: usize,
+    open: Arc<Mutex<OpenConnections>>,
     log_limiter: Arc<LogLimiter<IpAddr>>,
     telemetry: Arc<Telemetry>,
 }
 
+/// Numbers of open connections.
 #[derive(Debug, Default)]
-struct Places {
-    taken: HashMap<IpAddr, usize>,
-    in_all: usize,
+struct OpenConnections {
+    by_address: HashMap<IpAddr, usize>,
+    total: usize,
 }
 
 impl Acceptor {
@@ -52,33 +53,33 @@ impl Acceptor {
         Self {
             tls,
             per_address: limits.max_connections_per_address,
-            in_all: limits.max_connections(),
-            places: Arc::default(),
+            total: limits.max_connections(),
+            open: Arc::default(),
             log_limiter: Arc::default(),
             telemetry,
         }
     }
 
-    /// The connections that get in. Handshakes run beside one another, so that a slow peer keeps nobody waiting, and
-    /// each takes one of the limited places.
-    pub(super) fn open(self, listener: TcpListener) -> impl Stream<Item = io::Result<Connection>> {
-        stream::unfold((self, listener, JoinSet::new()), |(door, listener, mut handshakes)| async move {
+    /// The accepted connections. Handshakes run concurrently, so that a slow peer does not delay others, and each handshake
+    /// counts as a connection.
+    pub(super) fn connections(self, listener: TcpListener) -> impl Stream<Item = io::Result<Connection>> {
+        stream::unfold((self, listener, JoinSet::new()), |(acceptor, listener, mut handshakes)| async move {
             loop {
                 tokio::select! {
                     Some(done) = handshakes.join_next() => {
                         if let Ok(Some(connection)) = done {
-                            return Some((Ok(connection), (door, listener, handshakes)));
+                            return Some((Ok(connection), (acceptor, listener, handshakes)));
                         }
                     }
                     accepted = listener.accept() => match accepted {
                         Ok((stream, peer)) => {
-                            if let Some(place) = door.place(peer) {
-                                handshakes.spawn(door.clone().receive(stream, place));
+                            if let Some(place) = acceptor.reserve(peer) {
+                                handshakes.spawn(acceptor.clone().handshake(stream, place));
                             }
                         }
                         Err(error) => {
                             tracing::warn!(%error, "a connection could not be accepted");
-                            tokio::time::sleep(BREATH).await;
+                            tokio::time::sleep(RETRY_DELAY).await;
                         }
                     }
                 }
@@ -86,30 +87,32 @@ impl Acceptor {
         })
     }
 
-    fn place(&self, peer: SocketAddr) -> Option<Place> {
+    /// A place for a connection of this peer, if the limits allow one.
+    fn reserve(&self, peer: SocketAddr) -> Option<Place> {
         let address = peer.ip().to_canonical();
-        let mut places = lock(&self.places);
-        let taken = places.taken.get(&address).copied().unwrap_or_default();
-        let reason = if places.in_all >= self.in_all {
+        let mut open = self.open.lock();
+        let taken = open.by_address.get(&address).copied().unwrap_or_default();
+        let reason = if open.total >= self.total {
             "in_all"
         } else if taken >= self.per_address {
             "per_address"
         } else {
-            places.in_all += 1;
-            places.taken.insert(address, taken + 1);
+            open.total += 1;
+            open.by_address.insert(address, taken + 1);
             self.telemetry.connections.inc();
-            return Some(Place { address, door: self.clone() });
+            return Some(Place { address, acceptor: self.clone() });
         };
-        drop(places);
+        drop(open);
         self.telemetry.connections_refused.of(reason).inc();
         if let Some(unreported) = self.log_limiter.due(address) {
-            let (per_address, in_all) = (self.per_address, self.in_all);
-            tracing::warn!(%address, unreported, per_address, in_all, "connection refused: too many");
+            let (per_address, total) = (self.per_address, self.total);
+            tracing::warn!(%address, unreported, per_address, total, "connection refused: too many");
         }
         None
     }
 
-    async fn receive(self, stream: TcpStream, place: Place) -> Option<Connection> {
+    /// Makes the TLS handshake where TLS is on. `None` if it fails.
+    async fn handshake(self, stream: TcpStream, place: Place) -> Option<Connection> {
         let info = stream.connect_info();
         // A failure costs latency and nothing else.
         let _ = stream.set_nodelay(true);
@@ -124,10 +127,10 @@ impl Acceptor {
                 };
                 self.telemetry.connections_refused.of("tls").inc();
                 if let Some(unreported) = self.log_limiter.due(place.address) {
-                    tracing::warn!(address = %place.address, unreported, "no agreement on TLS: {error}");
+                    tracing::warn!(address = %place.address, unreported, "the TLS handshake failed: {error}");
                 }
                 if let Some(stream) = stream {
-                    let _ = tokio::time::timeout(LINGER, linger(stream)).await;
+                    let _ = tokio::time::timeout(ALERT_TIMEOUT, close_gently(stream)).await;
                 }
                 return None;
             }
@@ -136,30 +139,31 @@ impl Acceptor {
     }
 }
 
-/// Closed at once, with bytes of the peer unread, a socket is reset, and the peer never reads the alert that says why.
-async fn linger(mut stream: TcpStream) -> io::Result<()> {
+/// Reads what the peer still sends, and then closes. A socket that is closed with unread bytes is reset, and the peer then
+/// never reads the alert that says why.
+async fn close_gently(mut stream: TcpStream) -> io::Result<()> {
     stream.shutdown().await?;
     let mut rest = [0; 1024];
     while stream.read(&mut rest).await? > 0 {}
     Ok(())
 }
 
-/// A connection's place among the limited ones.
+/// A connection among those that the limits allow. Its drop frees the place.
 #[derive(Debug)]
 struct Place {
     address: IpAddr,
-    door: Acceptor,
+    acceptor: Acceptor,
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
-        self.door.telemetry.connections.dec();
-        let mut places = lock(&self.door.places);
-        places.in_all -= 1;
-        if let Some(taken) = places.taken.get_mut(&self.address) {
-            *taken -= 1;
-            if *taken == 0 {
-                places.taken.remove(&self.address);
+        self.acceptor.telemetry.connections.dec();
+        let mut open = self.acceptor.open.lock();
+        open.total -= 1;
+        if let Some(connections) = open.by_address.get_mut(&self.address) {
+            *connections -= 1;
+            if *connections == 0 {
+                open.by_address.remove(&self.address);
             }
         }
     }
@@ -169,19 +173,19 @@ trait Socket: AsyncRead + AsyncWrite + Send {}
 
 impl<T: AsyncRead + AsyncWrite + Send> Socket for T {}
 
-/// A connection that got in, with TLS or without.
+/// An accepted connection, with TLS or without.
 pub(super) struct Connection {
     stream: Pin<Box<dyn Socket>>,
-    /// Of a peer that has not begun to speak HTTP/2: how many bytes are missing, and until when.
-    silence: Option<(usize, Pin<Box<Sleep>>)>,
+    /// Until the peer has sent the HTTP/2 preface: the bytes that are missing, and the time limit.
+    preface: Option<(usize, Pin<Box<Sleep>>)>,
     info: TcpConnectInfo,
     _place: Place,
 }
 
 impl Connection {
     fn new(stream: Pin<Box<dyn Socket>>, info: TcpConnectInfo, place: Place) -> Self {
-        let silence = Some((PREFACE, Box::pin(tokio::time::sleep(HANDSHAKE))));
-        Self { stream, silence, info, _place: place }
+        let preface = Some((PREFACE, Box::pin(tokio::time::sleep(HANDSHAKE))));
+        Self { stream, preface, info, _place: place }
     }
 }
 
@@ -197,10 +201,10 @@ impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, context: &mut Context<'_>, into: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let before = into.filled().len();
         let read = self.stream.as_mut().poll_read(context, into);
-        if let Some((missing, deadline)) = &mut self.silence {
+        if let Some((missing, deadline)) = &mut self.preface {
             *missing = missing.saturating_sub(into.filled().len() - before);
             if *missing == 0 {
-                self.silence = None;
+                self.preface = None;
             } else if deadline.as_mut().poll(context).is_ready() {
                 return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
             }

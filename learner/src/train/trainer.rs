@@ -19,7 +19,7 @@ use crate::checkpoint::{Name, Snapshot, Store, incompatible};
 use crate::device::Backend;
 use crate::observe::metrics::{Metrics, Position};
 use crate::publish::Publisher;
-use crate::service::Shared;
+use crate::service::TrainerHandle;
 use crate::train::minibatches::tasks_of_unrolls;
 use crate::train::skipped_steps::SkippedSteps;
 use crate::train::statistics::ObservationStatistics;
@@ -50,8 +50,8 @@ pub struct Setup {
     pub batcher: Batcher,
     /// Where parameters go.
     pub publisher: Publisher,
-    /// Where the newest metrics are shown.
-    pub shared: Arc<Shared>,
+    /// What the trainer needs of the service.
+    pub shared: TrainerHandle,
 }
 
 /// Why training ended.
@@ -101,7 +101,7 @@ pub struct Trainer {
     pub(crate) losses: Map<String, Value>,
     pub(crate) batcher: Batcher,
     publisher: Publisher,
-    pub(crate) shared: Arc<Shared>,
+    pub(crate) shared: TrainerHandle,
     /// Unrolls of versions before this one are superseded.
     pub(crate) oldest: u64,
     pub(crate) metrics: Metrics,
