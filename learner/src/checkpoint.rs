@@ -373,7 +373,8 @@ mod tests {
         let failed = |error: anyhow::Error| incompatible(Path::new("runs/a"), error.context("cannot be restored"));
         assert_eq!(failed(tch::TchError::Torch("out of memory".into()).into()).exit_code(), 1);
         assert_eq!(
-            failed(crate::vmpo::Error::from(tch::TchError::Torch("out of memory".into())).into()).exit_code(),
+            failed(crate::algorithm::error::Error::from(tch::TchError::Torch("out of memory".into())).into())
+                .exit_code(),
             1
         );
         assert_eq!(failed(anyhow::anyhow!("the checkpoint does not fit")).exit_code(), 2);

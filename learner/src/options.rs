@@ -3,14 +3,12 @@
 use std::path::PathBuf;
 
 use clap::{Parser, Subcommand, ValueEnum};
-use comic_experiment::LowLevelName;
 use comic_networks::export::Part;
 
 use crate::commands::certs::Certs;
 use crate::commands::health::Health;
 use crate::commands::status::Status;
 use crate::document::DocumentArguments;
-use crate::load::Load;
 use crate::security::{ConnectionLimits, SecurityArguments};
 use crate::service::quarantine::QuarantineArguments;
 
@@ -80,25 +78,8 @@ pub enum Command {
     Health(Health),
     /// Make a certificate authority for development, and certificates for a learner and its actors.
     Certs(Certs),
-    /// Measure the service under many simulated actors.
-    Load(Load),
     /// Print what each metric means, as in docs/metrics.md.
     Metrics,
-    /// Time the update and compare it with its bare matrix products; one JSON line per figure.
-    Bench {
-        /// Threads of libtorch.
-        #[arg(long, default_value_t = 2)]
-        threads: usize,
-        /// Interleaved repeats; the median counts.
-        #[arg(long, default_value_t = 15)]
-        repeats: usize,
-        /// The low level: mlp, lstm, mixture or product.
-        #[arg(long, default_value_t = LowLevelName::Mlp)]
-        low_level: LowLevelName,
-        /// Joint training of two tasks.
-        #[arg(long, conflicts_with = "low_level")]
-        joint: bool,
-    },
 }
 
 /// The actor has the same exit codes; `docs/operations.md` says more.

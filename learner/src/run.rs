@@ -7,9 +7,7 @@ use std::net::SocketAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Duration;
 
-use bytes::Bytes;
 use comic_experiment::Experiment;
-use comic_proto::v1::Behaviour;
 use comic_replay::Batcher;
 use tokio::net::TcpListener;
 use tokio::signal::unix::{Signal, SignalKind, signal};
@@ -88,9 +86,10 @@ async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<()
 
 /// Tells the actors that the run is over, and gives them this time to hear it.
 async fn end_run(publisher: &Publisher, delay: Duration) {
-    let Some(newest) = publisher.newest() else { return };
-    publisher.publish(newest.version, Behaviour::Leave, &Bytes::new());
-    tokio::time::sleep(delay).await;
+    if publisher.newest().is_some() {
+        publisher.end_run();
+        tokio::time::sleep(delay).await;
+    }
 }
 
 /// The signals that stop a learner.

@@ -41,10 +41,10 @@ pub(super) fn prepare(
         Some(snapshot) => accounting(snapshot).map_err(|error| incompatible(&options.run, error))?,
         None => Ledger::new(),
     };
-    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));
+    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| task.name.clone()));
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
     let config = batches(&experiment.unroll);
-    let batcher = Batcher::new(layout, config, Phase { epoch, ..Phase::default() }, ledger);
+    let batcher = Batcher::new(layout, config, Phase::begin(epoch), ledger);
     let publisher = Publisher::new(epoch);
     let service = Service::new(service::Setup {
         run: options.run.clone(),

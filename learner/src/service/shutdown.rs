@@ -1,6 +1,5 @@
 //! How the service ends: first it drains, then it closes.
 
-use comic_proto::v1::Behaviour;
 use tokio::sync::watch;
 use tonic::Status;
 
@@ -46,7 +45,7 @@ impl Shutdown {
     /// The status with which a stream ends when the service closes: `None` when the run is over, because then the parameters
     /// have told the actor so.
     pub(super) fn status(&self) -> Option<Status> {
-        let over = self.publisher.newest().is_some_and(|newest| newest.behaviour == Behaviour::Leave);
+        let over = self.publisher.newest().is_some_and(|newest| newest.run_over);
         (!over).then(|| Status::unavailable("the learner is draining: reconnect"))
     }
 }
