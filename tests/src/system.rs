@@ -20,7 +20,7 @@ use crate::repository::root;
 
 /// Variables that would say where the learner is and what to show it.
 const SETTINGS: [&str; 7] =
-    ["COMIC_PULSE", "COMIC_LEARNER", "COMIC_CA", "COMIC_CERT", "COMIC_KEY", "COMIC_TOKEN_FILE", "COMIC_TOKEN"];
+    ["COMIC_LIVENESS", "COMIC_LEARNER", "COMIC_CA", "COMIC_CERT", "COMIC_KEY", "COMIC_TOKEN_FILE", "COMIC_TOKEN"];
 /// How long a status call may take.
 const CALL_LIMIT: Duration = Duration::from_secs(5);
 
