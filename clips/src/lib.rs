@@ -7,6 +7,7 @@
 //!   the action whose servos aim at it.
 //! - [`import`] makes clips of CMU's ASF and AMC files, [`check`] finds defects, [`ClipWriter`] writes files that
 //!   dm_control reads, [`merge()`] makes one of several. They know the body as rigid bodies, by forward kinematics.
+//! - [`spatial`] has vectors, rotation matrices and quaternions.
 //! - [`subset`] knows dm_control's named subsets, [`builtin_names`] what can follow `builtin:`.
 //!
 //! A source is `builtin:NAME` (compiled in, or made by the program) or the path of an HDF5 file in the layout of
@@ -27,7 +28,7 @@ mod humanoid;
 pub mod import;
 mod merge;
 mod nearest;
-mod spatial;
+pub mod spatial;
 mod subsets;
 mod write;
 
