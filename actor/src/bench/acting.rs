@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use comic_proto::{UnrollLayout, UnrollShape};
-use comic_tasks::floor::RawFloor;
+use comic_tasks::raw_physics::RawPhysics;
 use comic_tasks::{Environment, Simulated};
 
 use super::figure::{Figure, interleave};
@@ -24,7 +24,7 @@ use crate::worker::{Progress, Worker};
 pub(super) fn policy(subject: &Subject) -> Result<Figure, Error> {
     let (environments, tapes): (Vec<_>, Vec<_>) = environments(subject, 1)?.into_iter().map(Recorded::new).unzip();
     let mut worker = worker(subject, environments, 1)?;
-    let mut floors: Vec<_> = tapes.iter().map(|_| RawFloor::default()).collect();
+    let mut floors: Vec<_> = tapes.iter().map(|_| RawPhysics::default()).collect();
     let medians = interleave(subject.budget, || {
         let value = unroll_rate(&mut worker)?;
         let begin = Instant::now();
