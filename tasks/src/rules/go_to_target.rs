@@ -1,20 +1,23 @@
-//! Go-to-target (`locomotion/tasks/go_to_target.py`): a sparse reward within a metre of a target that then moves away.
+//! Go-to-target (`locomotion/tasks/go_to_target.py`): a sparse reward near a target, which moves after some rewarded steps.
 
 use std::f64::consts::PI;
 use std::sync::Arc;
 
+use comic_clips::spatial::{into_frame, subtract};
 use comic_experiment::GoToTarget;
 use rand::Rng as _;
 use rand_pcg::Pcg64;
 
+use super::environment::RuledTask;
+use super::interface::{Recorded, Rules, Verdict};
+use super::poses::{Poses, UP};
+use super::stage::{Arena, Stage};
 use crate::arenas::floor;
+use crate::environment::Task;
 use crate::error::Error;
 use crate::humanoid;
-use crate::observation::{Number, fill};
-use crate::quaternion::{difference, into_frame};
-use crate::rules::{Recorded, Rules, Verdict};
-use crate::stage::{Arena, Stage};
-use crate::start::{Poses, UP};
+use crate::humanoid::observation::{Number, fill};
+use crate::registry::{BuildTask, Context};
 
 /// The rules of go-to-target.
 #[derive(Debug)]
@@ -24,14 +27,21 @@ pub(crate) struct GoToTargetRules {
     arena: Arc<Arena>,
 }
 
-/// Where the target is, and for how many steps it was reached.
+/// The target, and the number of rewarded steps there.
 #[derive(Debug, Default)]
-pub(crate) struct Memory {
-    /// x and y, m; it lies on the floor.
+pub(crate) struct State {
+    /// x and y on the floor, m.
     pub(crate) target: [f64; 2],
     pub(crate) rewarded_steps: u32,
-    /// Targets to come before any is drawn, the next one last: for comparisons with recorded episodes.
+    /// Targets that come before random ones, the next one last; for comparisons with recorded episodes.
     pub(crate) script: Vec<[f64; 2]>,
+}
+
+impl BuildTask for GoToTarget {
+    fn build(&self, context: &Context<'_>) -> Result<Arc<dyn Task>, Error> {
+        let poses = Poses::new(self.start_pose, context.catalogue)?;
+        Ok(Arc::new(RuledTask::new(GoToTargetRules::new(self, poses)?, context.spec()?)))
+    }
 }
 
 impl GoToTargetRules {
@@ -40,8 +50,8 @@ impl GoToTargetRules {
         Ok(Self { config: config.clone(), poses, arena })
     }
 
-    fn next_target(&self, memory: &mut Memory, random: &mut Pcg64) -> [f64; 2] {
-        memory.script.pop().unwrap_or_else(|| self.place(random))
+    fn next_target(&self, state: &mut State, random: &mut Pcg64) -> [f64; 2] {
+        state.script.pop().unwrap_or_else(|| self.place(random))
     }
 
     fn place(&self, random: &mut Pcg64) -> [f64; 2] {
@@ -51,16 +61,16 @@ impl GoToTargetRules {
 }
 
 impl Rules for GoToTargetRules {
-    type Memory = Memory;
+    type State = State;
 
     fn stage(&self, _: &mut Pcg64) -> Result<Stage, Error> {
         Ok(Stage::new(Arc::clone(&self.arena)))
     }
 
-    fn begin(&self, stage: &mut Stage, memory: &mut Memory, random: &mut Pcg64) {
-        memory.target = self.next_target(memory, random);
+    fn begin(&self, stage: &mut Stage, state: &mut State, random: &mut Pcg64) {
+        state.target = self.next_target(state, random);
         if !self.config.carry_count {
-            memory.rewarded_steps = 0;
+            state.rewarded_steps = 0;
         }
         let mut pose = self.poses.draw(random);
         if self.config.random_heading {
@@ -71,51 +81,51 @@ impl Rules for GoToTargetRules {
         stage.place(&pose.qpos, &pose.qvel);
     }
 
-    fn judge(&self, stage: &mut Stage, memory: &mut Memory, random: &mut Pcg64) -> Verdict {
+    fn judge(&self, stage: &mut Stage, state: &mut State, random: &mut Pcg64) -> Verdict {
         let failed = stage.has_fallen();
-        // The target moves a step after the last rewarded one, and this step's reward sees it there already.
-        if self.config.moving_target && memory.rewarded_steps >= self.config.steps_at_target {
-            memory.target = self.next_target(memory, random);
-            memory.rewarded_steps = 0;
+        // The target moves one step after the last rewarded step. The reward of this step already uses the new target.
+        if self.config.moving_target && state.rewarded_steps >= self.config.steps_at_target {
+            state.target = self.next_target(state, random);
+            state.rewarded_steps = 0;
         }
         let (root, _) = stage.root();
-        let [x, y] = memory.target;
+        let [x, y] = state.target;
         let near = (x - root[0]).hypot(y - root[1]) < self.config.tolerance;
         if near && self.config.moving_target {
-            memory.rewarded_steps += 1;
+            state.rewarded_steps += 1;
         }
         Verdict::of(f64::from(u8::from(near)), failed)
     }
 
-    /// The target relative to the root, m, in the root's frame.
-    fn observe<T: Number>(&self, stage: &Stage, memory: &Memory, out: &mut [T]) {
+    /// The target relative to the root, in the root's frame, m.
+    fn observe<T: Number>(&self, stage: &Stage, state: &State, out: &mut [T]) {
         let (root, rotation) = stage.root();
-        let [x, y] = memory.target;
-        fill(out, into_frame(rotation, difference(&[x, y, 0.0], root)));
+        let [x, y] = state.target;
+        fill(out, into_frame(rotation, subtract([x, y, 0.0], *root)));
     }
 
     fn time_limit(&self) -> f64 {
         self.config.time_limit
     }
 
-    fn target(&self, memory: &Memory) -> Option<[f64; 2]> {
-        Some(memory.target)
+    fn target(&self, state: &State) -> Option<[f64; 2]> {
+        Some(state.target)
     }
 }
 
 impl Recorded for GoToTargetRules {
-    fn observation(&self, stage: &Stage, memory: &Memory) -> Vec<(&'static str, Vec<f64>)> {
+    fn observation(&self, stage: &Stage, state: &State) -> Vec<(&'static str, Vec<f64>)> {
         let mut target = vec![0.0; 3];
-        self.observe(stage, memory, &mut target);
+        self.observe(stage, state, &mut target);
         vec![("walker/target", target)]
     }
 
-    fn quantities(&self, stage: &Stage, memory: &Memory) -> Vec<(&'static str, Vec<f64>)> {
+    fn quantities(&self, stage: &Stage, state: &State) -> Vec<(&'static str, Vec<f64>)> {
         let (root, _) = stage.root();
-        let [x, y] = memory.target;
+        let [x, y] = state.target;
         vec![
             ("target", vec![x, y, 0.0]),
-            ("counter", vec![f64::from(memory.rewarded_steps)]),
+            ("counter", vec![f64::from(state.rewarded_steps)]),
             ("distance", vec![(x - root[0]).hypot(y - root[1])]),
             ("disallowed", vec![stage.falls().count() as f64]),
         ]
@@ -135,46 +145,46 @@ mod tests {
     }
 
     #[test]
-    fn the_target_moves_a_step_after_the_tenth_rewarded_one_and_pays_where_it_is_then() {
+    fn the_target_moves_one_step_after_the_tenth_rewarded_step() {
         let (rules, mut random) = (rules(&GoToTarget::default()), Pcg64::seed_from_u64(1));
         let mut stage = rules.stage(&mut random).unwrap();
-        let mut memory = Memory::default();
-        rules.begin(&mut stage, &mut memory, &mut random);
+        let mut state = State::default();
+        rules.begin(&mut stage, &mut state, &mut random);
         let (root, _) = stage.root();
-        memory.target = [root[0] + 0.9, root[1]];
-        memory.script = vec![[root[0] + 1.1, root[1]]];
+        state.target = [root[0] + 0.9, root[1]];
+        state.script = vec![[root[0] + 1.1, root[1]]];
         for _ in 0..10 {
-            assert_eq!(rules.judge(&mut stage, &mut memory, &mut random).reward_terms[0], 1.0);
+            assert_eq!(rules.judge(&mut stage, &mut state, &mut random).reward_terms[0], 1.0);
         }
-        let near = memory.target;
-        assert_eq!(rules.judge(&mut stage, &mut memory, &mut random).reward_terms[0], 0.0);
-        assert_ne!(memory.target, near);
-        assert_eq!(memory.rewarded_steps, 0);
+        let near = state.target;
+        assert_eq!(rules.judge(&mut stage, &mut state, &mut random).reward_terms[0], 0.0);
+        assert_ne!(state.target, near);
+        assert_eq!(state.rewarded_steps, 0);
     }
 
     #[test]
-    fn counts_begin_anew_with_an_episode_unless_told_otherwise() {
+    fn the_count_starts_at_0_in_each_episode_unless_it_is_kept() {
         for (carry_count, expected) in [(false, 0), (true, 7)] {
             let (rules, mut random) =
                 (rules(&GoToTarget { carry_count, ..GoToTarget::default() }), Pcg64::seed_from_u64(1));
             let mut stage = rules.stage(&mut random).unwrap();
-            let mut memory = Memory { rewarded_steps: 7, ..Memory::default() };
-            rules.begin(&mut stage, &mut memory, &mut random);
-            assert_eq!(memory.rewarded_steps, expected);
+            let mut state = State { rewarded_steps: 7, ..State::default() };
+            rules.begin(&mut stage, &mut state, &mut random);
+            assert_eq!(state.rewarded_steps, expected);
         }
     }
 
     #[test]
-    fn starts_and_targets_fill_the_square_and_headings_the_circle() {
+    fn starts_targets_and_headings_are_uniform() {
         let (rules, mut random) = (rules(&GoToTarget::default()), Pcg64::seed_from_u64(2));
         let mut stage = rules.stage(&mut random).unwrap();
-        let mut memory = Memory::default();
+        let mut state = State::default();
         let mut draws: [Vec<f64>; 5] = Default::default();
         for _ in 0..2000 {
-            rules.begin(&mut stage, &mut memory, &mut random);
+            rules.begin(&mut stage, &mut state, &mut random);
             let (root, rotation) = stage.root();
             let heading = rotation[5].atan2(rotation[2]) * 4.0 / PI;
-            let values = [root[0], root[1], memory.target[0], memory.target[1], heading];
+            let values = [root[0], root[1], state.target[0], state.target[1], heading];
             draws.iter_mut().zip(values).for_each(|(all, value)| all.push(value));
         }
         for values in draws {

@@ -1,7 +1,7 @@
-//! A window on an environment: MuJoCo's viewer, as mujoco-rs has it. Feature `viewer`.
+//! A window that shows an environment: mujoco-rs's viewer. Feature `viewer`.
 //!
-//! The window belongs to the process's first thread, and its OpenGL does not let that of the humanoid's sight into the
-//! same thread: environments are played in another one, and shown through a [`Screen`].
+//! The window belongs to the process's first thread. Its OpenGL context does not allow a context for camera images in the
+//! same thread. So environments step in another thread, and a [`Screen`] shows them.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -9,62 +9,63 @@ use std::time::Duration;
 use mujoco_rs::prelude::*;
 use mujoco_rs::viewer::{MjViewer, MjViewerError, ViewerSharedState};
 
+use super::ghost::{Ghost, GhostBody};
 use crate::arenas::floor::TARGET;
+use crate::environment::Simulated;
 use crate::error::Error;
-use crate::ghost::{Ghost, Phantom};
 use crate::humanoid::PREFIX;
-use crate::{Simulated, Simulation};
+use crate::physics::Simulation;
 
-/// What the window shows at first: an extent of so many metres, seen from one and a half times as far, and how far the
-/// camera looks down (degrees).
+/// The first view: its extent (m), and the camera's angle to the horizontal (degrees). MuJoCo places the camera at one and a
+/// half times the extent.
 const EXTENT: f64 = 2.5;
 const ELEVATION: f32 = -14.0;
-/// Where the window's camera looks at first (rad, from +x): MuJoCo's default.
+/// The camera's first direction (rad, from +x): MuJoCo's default.
 const AZIMUTH: f64 = std::f64::consts::FRAC_PI_2;
-/// The least between two pictures: 60 a second.
+/// The shortest time between two pictures: 60 per second.
 const PICTURE_TIME: Duration = Duration::from_micros(16_667);
 
-/// The window, which belongs to the process's first thread.
+/// The window. It belongs to the process's first thread.
 #[derive(Debug)]
 pub struct Viewer {
     window: MjViewer,
 }
 
-/// Where an environment is shown, from any thread.
+/// Shows environments in the window, from any thread.
 #[derive(Debug)]
 pub struct Screen {
     state: Arc<Mutex<ViewerSharedState>>,
     ghost: Option<Ghost>,
-    phantom: Option<Phantom>,
+    ghost_body: Option<GhostBody>,
     model: Arc<MjModel>,
 }
 
 impl Viewer {
-    /// Opens a window on environments like this one.
+    /// Opens a window for environments like this one.
     ///
     /// # Errors
-    /// [`Error::Display`] when there is no display, or no OpenGL on it.
+    /// [`Error::Display`]: there is no display, or it has no OpenGL.
     pub fn open(environment: &dyn Simulated, ghost: Option<Ghost>) -> Result<(Self, Screen), Error> {
-        // Asked first, for an answer that names the variables.
+        // This check comes first because its message names the variables.
         if ["DISPLAY", "WAYLAND_DISPLAY"].iter().all(|name| std::env::var_os(name).is_none_or(|name| name.is_empty())) {
             return Err(Error::Display { reason: "neither DISPLAY nor WAYLAND_DISPLAY is set".into() });
         }
         let model = environment.model();
-        let phantom = ghost.map(|_| Phantom::new(&model));
-        let parts = phantom.as_ref().map_or(0, Phantom::parts) as usize;
+        let ghost_body = ghost.map(|_| GhostBody::new(&model));
+        let parts = ghost_body.as_ref().map_or(0, GhostBody::parts) as usize;
         let settings = near_the_humanoid(&model, environment.simulation());
         let window =
             MjViewer::builder().window_name("CoMic").max_user_geoms(parts).build_passive(&settings).map_err(display)?;
-        let screen = Screen { state: Arc::clone(window.state()), ghost, phantom, model };
+        let screen = Screen { state: Arc::clone(window.state()), ghost, ghost_body, model };
         Ok((Self { window }, screen))
     }
 
-    /// Draws what is shown until the window is closed, or `goes_on` says no.
+    /// Draws until the window is closed or `keep_running` returns false.
     ///
     /// # Errors
-    /// [`Error::Display`] when OpenGL fails.
-    pub fn run(&mut self, goes_on: impl Fn() -> bool) -> Result<(), Error> {
-        while self.window.running() && goes_on() {
+    /// [`Error::Display`]: OpenGL fails.
+    pub fn run(&mut self, keep_running: impl Fn() -> bool) -> Result<(), Error> {
+        while self.window.running() && keep_running() {
             self.window.render().map_err(display)?;
             std::thread::sleep(PICTURE_TIME);
         }
@@ -73,34 +74,34 @@ impl Viewer {
 }
 
 impl Screen {
-    /// Shows the environment as it stands. A push with the mouse pushes the humanoid.
+    /// Shows the environment's current state. A push with the mouse pushes the humanoid.
     pub fn show(&mut self, environment: &mut dyn Simulated) {
         let (model, scenery) = (environment.model(), environment.scenery());
         if !self.model.is_compatible_with_model(&model) {
-            self.phantom = self.ghost.map(|_| Phantom::new(&model));
+            self.ghost_body = self.ghost.map(|_| GhostBody::new(&model));
         }
         let target = model.name_to_id(MjtObjBase::mjOBJ_SITE, TARGET);
         scenery.mark_target(target, environment.simulation_mut());
         self.model = model;
-        // A window that panicked shows nothing any more.
+        // The lock is poisoned when the window's thread panicked. Then there is nothing to show.
         let Ok(mut state) = self.state.lock() else { return };
         state.sync_data(environment.simulation_mut());
-        if let (Some(phantom), Some(ghost), Some(reference)) = (&mut self.phantom, self.ghost, &scenery.reference) {
-            phantom.stand(reference, ghost, AZIMUTH);
-            phantom.appear(state.user_scene_mut(), &MjvOption::default());
+        if let (Some(body), Some(ghost), Some(reference)) = (&mut self.ghost_body, self.ghost, &scenery.reference) {
+            body.set_pose(reference, ghost, AZIMUTH);
+            body.draw(state.user_scene_mut(), &MjvOption::default());
         }
     }
 }
 
-/// The model with the settings that decide where the window's camera begins: by the humanoid, from the side. Left to
-/// themselves they would show all of a corridor of 100 m.
+/// The model with settings for the window's first view: near the humanoid, from the side. The model's own settings would show
+/// a whole corridor of 100 m.
 fn near_the_humanoid(model: &MjModel, simulation: &Simulation) -> MjModel {
     let mut settings = model.clone();
     let root = model.name_to_id(MjtObjBase::mjOBJ_BODY, &format!("{PREFIX}root"));
     if let Some(position) = root.and_then(|root| simulation.xpos().get(root)) {
         settings.stat_mut().center = *position;
     }
-    // Clipping planes are relative to the extent, and stay where they are.
+    // Clipping planes are relative to the extent. Their distances must not change.
     let shrunk = (settings.stat().extent / EXTENT) as f32;
     settings.stat_mut().extent = EXTENT;
     let visual = settings.vis_mut();

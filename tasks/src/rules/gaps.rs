@@ -1,14 +1,27 @@
-//! The corridor with gaps: platforms of random length with random gaps between them.
+//! The corridor with gaps: platforms of random length, and random gaps between them.
+
+use std::sync::Arc;
 
 use comic_experiment::Gaps;
 use mujoco_rs::prelude::*;
 use rand::Rng as _;
 use rand_pcg::Pcg64;
 
+use super::corridor::{CorridorRules, Obstacles};
+use super::environment::RuledTask;
+use super::poses::Poses;
 use crate::arenas::corridor::{self, Block, Extent};
-use crate::corridor::Obstacles;
+use crate::environment::Task;
 use crate::error::Error;
 use crate::humanoid;
+use crate::registry::{BuildTask, Context};
+
+impl BuildTask for Gaps {
+    fn build(&self, context: &Context<'_>) -> Result<Arc<dyn Task>, Error> {
+        let poses = Poses::new(self.corridor.start_pose, context.catalogue)?;
+        Ok(Arc::new(RuledTask::new(CorridorRules::new(&self.corridor, poses, self.clone()), context.spec()?)))
+    }
+}
 
 impl Obstacles for Gaps {
     fn draw(&self, extent: Extent, random: &mut Pcg64) -> Result<MjModel, Error> {
@@ -20,8 +33,8 @@ impl Obstacles for Gaps {
     }
 }
 
-/// `GapsCorridor.regenerate`: a platform, a gap, and so on to the corridor's end. There is no gap between the first
-/// platform, where the humanoid starts, and the second.
+/// `GapsCorridor.regenerate`: platforms and gaps to the corridor's end. There is no gap between the first platform, where the
+/// humanoid starts, and the second.
 fn platforms(config: &Gaps, extent: Extent, random: &mut Pcg64) -> Vec<Block> {
     let mut draw = |[low, high]: [f64; 2]| random.random_range(low..=high);
     let mut platforms = vec![corridor::first_platform(extent)];
@@ -34,8 +47,8 @@ fn platforms(config: &Gaps, extent: Extent, random: &mut Pcg64) -> Vec<Block> {
     platforms
 }
 
-/// Boxes that nearly every arena gets by with: six standard deviations more than the mean. A rare one needs more, and
-/// is laid out differently, which costs time and nothing else.
+/// A number of boxes that is enough for nearly every arena: the mean and six standard deviations. A rare arena needs more
+/// and has another memory layout, which only costs time.
 fn most_platforms(config: &Gaps, extent: Extent) -> usize {
     let ([a, b], [c, d]) = (config.platform, config.gap);
     let step = (a + b + c + d) / 2.0;
@@ -72,7 +85,7 @@ mod tests {
         for _ in 0..200 {
             let platforms = platforms(&config, EXTENT, &mut random);
             assert_eq!((start(&platforms[0]), end(&platforms[0])), (0.0, 6.0));
-            assert!((start(&platforms[1]) - 6.0).abs() < 1e-9, "no gap behind the first platform");
+            assert!((start(&platforms[1]) - 6.0).abs() < 1e-9, "no gap after the first platform");
             let last = platforms.last().map(start).unwrap_or_default();
             assert!((100.0 - 3.75..100.0).contains(&last), "{last}");
             gaps.extend(platforms[1..].windows(2).map(|pair| start(&pair[1]) - end(&pair[0])));
@@ -90,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn a_corridor_of_the_smallest_platforms_and_gaps_still_ends() {
+    fn a_corridor_of_the_smallest_platforms_and_gaps_has_an_end() {
         let config = Gaps { platform: [0.3, 0.3], gap: [0.75, 0.75], ..Gaps::default() };
         assert_eq!(platforms(&config, EXTENT, &mut Pcg64::seed_from_u64(1)).len(), 91);
     }

@@ -1,12 +1,12 @@
-//! Where in MuJoCo's arrays the humanoid's parts are.
+//! The places of the humanoid's parts in MuJoCo's arrays.
 
 use std::ops::Range;
 
 use comic_clips::{ACTUATOR_JOINTS, ACTUATORS, WalkerModel};
 use mujoco_rs::prelude::*;
 
+use super::names::{END_EFFECTORS, PREFIX};
 use crate::error::Error;
-use crate::humanoid::{END_EFFECTORS, PREFIX};
 use crate::physics::Simulation;
 
 /// Number of coordinates of the root before the joints: position and quaternion.
@@ -19,7 +19,7 @@ pub(crate) const ROOT_VELOCITIES: usize = 6;
 pub(crate) struct Walker {
     /// Which body this is.
     pub(crate) model: WalkerModel,
-    /// Body `walker/`, whose subtree is the whole humanoid.
+    /// Body `walker/`. Its subtree is the whole humanoid.
     pub(crate) frame: usize,
     /// Body `root`.
     pub(crate) root: usize,
@@ -71,10 +71,10 @@ impl Walker {
         data.xpos()[head][2]
     }
 
-    /// The order of joints and servos is a constant of this workspace; here the compiled model confirms it.
+    /// Checks that the compiled model has the joints and servos in the constant order of this workspace.
     fn check(&self, model: &MjModel) -> Result<(), Error> {
         if model.body_pos().len() < self.tracked.end {
-            return Err(lost("the expected number of bodies"));
+            return Err(lost("some of the humanoid's bodies"));
         }
         for (servo, joint) in ACTUATORS.iter().zip(ACTUATOR_JOINTS) {
             let name = format!("{PREFIX}{servo}");
@@ -88,7 +88,7 @@ impl Walker {
         Ok(())
     }
 
-    /// Joint of each servo, as an index behind the root's coordinates (or velocities).
+    /// The joint of each servo, counted from the first joint after the root's coordinates or velocities.
     pub(crate) fn servo_joints() -> [usize; 56] {
         ACTUATOR_JOINTS
     }
@@ -110,5 +110,5 @@ fn sensor_range(model: &MjModel, first: &str, last: &str) -> Result<Range<usize>
 }
 
 fn lost(what: &str) -> Error {
-    Error::Model { doing: "finding the humanoid's parts", reason: format!("the model has not {what}") }
+    Error::Model { doing: "finding the humanoid's parts", reason: format!("the model lacks {what}") }
 }

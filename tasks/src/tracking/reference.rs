@@ -1,17 +1,18 @@
-//! A reference clip, ready for the task.
+//! A reference clip in the form that the task reads.
 
 use comic_clips::{Clip, Entry, Features, Motion};
 
 use crate::error::Error;
-use crate::features;
+use crate::humanoid::features;
+use crate::humanoid::walker::Walker;
 use crate::physics::Data;
-use crate::walker::Walker;
 
-/// The most a clip's first frame may differ from the body put into it (`tracking.py`, `initialize_episode`).
+/// Largest allowed difference between a clip's first frame and the body in the same pose (`tracking.py`,
+/// `initialize_episode`).
 const MISMATCH: f64 = 1e-2;
 
-/// The frames of a clip that the task sees, counted from the sub-range's first. Reading beyond the last frame gives
-/// the last: nothing that an episode can do reaches there, and nothing may panic.
+/// The frames of a clip that the task uses, counted from the sub-range's first frame. Reading after the last frame gives the
+/// last frame. No episode reads there; the rule only prevents a panic.
 #[derive(Debug)]
 pub(crate) struct Reference {
     /// Seconds between frames.
@@ -25,11 +26,12 @@ pub(crate) struct Reference {
 }
 
 impl Reference {
-    /// Takes the sub-range of `entry`; features that the clip lacks come from the body's kinematics.
+    /// Takes the sub-range of `entry`. The body's kinematics give the features when the clip has none.
     pub(crate) fn new(clip: Clip, entry: &Entry, walker: &Walker, data: &mut Data) -> Result<Self, Error> {
         let range = entry.frames();
         if range.is_empty() || range.end > clip.steps() {
-            let reason = format!("frames {range:?} wanted, {} are there; has its file been replaced?", clip.steps());
+            let reason =
+                format!("it has {} frames, and frames {range:?} are needed; has its file been replaced?", clip.steps());
             return Err(Error::Clip { clip: clip.name, reason });
         }
         let features = match clip.features {
@@ -48,7 +50,7 @@ impl Reference {
         Ok(reference)
     }
 
-    /// A clip made for another body shows in the positions of its bodies.
+    /// Refuses a clip that was made for another body: the positions of its bodies differ from this body's.
     fn check(&self, name: &str, walker: &Walker, data: &mut Data) -> Result<(), Error> {
         features::pose(data, &self.motion, self.first);
         let bodies = data.xpos()[walker.tracked.clone()].as_flattened();
@@ -58,7 +60,7 @@ impl Reference {
             return Err(Error::Clip {
                 clip: name.into(),
                 reason: format!(
-                    "its first frame is {error:.3} away from this body in the same pose, allowed is {MISMATCH}; \
+                    "its first frame is {error:.3} away from this body in the same pose, the limit is {MISMATCH}; \
                      it was made for another body, convert it or leave it out"
                 ),
             });
@@ -66,12 +68,12 @@ impl Reference {
         Ok(())
     }
 
-    /// The last frame at which an episode can stand when references reach `look_ahead` frames ahead.
+    /// The last frame of an episode whose references reach `look_ahead` frames ahead.
     pub(crate) fn last_step(&self, look_ahead: usize) -> usize {
         self.frames.saturating_sub(look_ahead + 1)
     }
 
-    /// Seconds from first to last frame.
+    /// Time from the first to the last frame, s.
     pub(crate) fn duration(&self) -> f64 {
         self.frames.saturating_sub(1) as f64 * self.dt
     }

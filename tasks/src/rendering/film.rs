@@ -1,8 +1,7 @@
-//! Drawing an environment for people: the humanoid from outside or through its own eyes, and a ghost of the reference.
+//! Draws an environment for people: the humanoid from outside or with its own camera, and the reference as a ghost.
 //!
-//! Drawing needs OpenGL through EGL, and no display. A film's context belongs to the thread that made the film. The
-//! humanoid's own sight ([`vision`](crate::vision)) may draw in the same thread: each makes its context current before
-//! it draws.
+//! Drawing needs OpenGL through EGL, and no display. A film's OpenGL context belongs to the thread that made the film. The
+//! policy's camera images (`vision`) may be drawn in the same thread: both make their context current before they draw.
 
 use std::str::FromStr;
 use std::sync::Arc;
@@ -10,33 +9,35 @@ use std::sync::Arc;
 use mujoco_rs::prelude::*;
 use mujoco_rs::renderer::MjRenderer;
 
+use super::ghost::{Ghost, GhostBody};
+use super::vision::{egocentric, graphics};
 use crate::arenas::floor::TARGET;
-use crate::error::Error;
-use crate::ghost::{Ghost, Phantom};
-use crate::humanoid::{PREFIX, missing};
-use crate::vision::{egocentric, graphics};
-use crate::{Scenery, Simulated, Simulation};
+use crate::environment::{Scenery, Simulated};
+use crate::error::{Error, missing};
+use crate::humanoid::PREFIX;
+use crate::physics::Simulation;
 
-/// Side of the shadow map in pixels, half of dm_control's (in software a quarter of the time), and samples a pixel.
+/// Width of the shadow map in pixels, and samples per pixel. The shadow map has half the width of dm_control's, which takes a
+/// quarter of the time in software.
 const SHADOW_SIZE: i32 = 2048;
 const SAMPLES: i32 = 4;
-/// Distance of the cameras outside from the humanoid's centre of mass (m), and how far they look down (degrees).
+/// Distance of the outside cameras from the humanoid's centre of mass (m), and their angle to the horizontal (degrees).
 const DISTANCE: f64 = 3.8;
 const ELEVATION: f64 = -14.0;
-/// Angles from the humanoid's heading at an episode's begin to where the cameras look (degrees): over its right
-/// shoulder to what lies ahead, and from its right.
+/// Angles from the humanoid's heading at the start of the episode to the direction of the cameras (degrees): over its right
+/// shoulder, and from its right.
 const TRACKING_TURN: f64 = 35.0;
 const SIDE_TURN: f64 = 90.0;
 
-/// Whence an environment is drawn.
+/// The camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Camera {
-    /// From behind its right shoulder, following its centre of mass.
+    /// Behind the humanoid's right shoulder. It follows the centre of mass.
     #[default]
     Tracking,
-    /// Through its own eyes.
+    /// The humanoid's egocentric camera.
     Egocentric,
-    /// From its right, following its centre of mass.
+    /// At the humanoid's right. It follows the centre of mass.
     Side,
 }
 
@@ -48,20 +49,20 @@ pub struct Size {
 }
 
 impl Size {
-    /// The least and the most of either.
+    /// The smallest and largest value of both.
     const RANGE: std::ops::RangeInclusive<u16> = 16..=2048;
 
-    /// A picture of `width` × `height` pixels; `None` when either is not within 16 … 2048.
+    /// A picture of `width` × `height` pixels; `None` unless both are within 16 … 2048.
     pub fn new(width: u16, height: u16) -> Option<Self> {
         (Self::RANGE.contains(&width) && Self::RANGE.contains(&height)).then_some(Self { width, height })
     }
 
-    /// Pixels from left to right.
+    /// Width in pixels.
     pub fn width(self) -> u16 {
         self.width
     }
 
-    /// Pixels from top to bottom.
+    /// Height in pixels.
     pub fn height(self) -> u16 {
         self.height
     }
@@ -78,66 +79,68 @@ impl FromStr for Size {
     fn from_str(text: &str) -> Result<Self, String> {
         let size =
             text.split_once('x').and_then(|(width, height)| Self::new(width.parse().ok()?, height.parse().ok()?));
-        size.ok_or_else(|| format!("`{text}` is no size: give WIDTHxHEIGHT with both within 16 and 2048, like 640x480"))
+        size.ok_or_else(|| {
+            format!("`{text}` is not a size; give WIDTHxHEIGHT, both from 16 to 2048, for instance 640x480")
+        })
     }
 }
 
 /// How a film is drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shot {
-    /// Of every picture.
+    /// Size of every picture.
     pub size: Size,
-    /// Whence.
+    /// The camera.
     pub camera: Camera,
-    /// Where the reference is drawn, in a task that has one.
+    /// The place of the ghost, in a task with a reference; `None` draws no ghost.
     pub ghost: Option<Ghost>,
 }
 
-/// Draws environments of one task, one picture after the other.
+/// Draws pictures of environments of one task.
 #[derive(Debug)]
 pub struct Film {
     shot: Shot,
-    studio: Option<Studio>,
+    renderer: Option<OffscreenRenderer>,
     /// The humanoid's heading when the episode began, rad.
     heading: f64,
 }
 
 impl Film {
-    /// Nothing is drawn yet; the first [`draw`](Self::draw) says whether there is OpenGL.
+    /// A film without pictures. The first [`draw`](Self::draw) fails when there is no OpenGL.
     pub fn new(shot: Shot) -> Self {
-        Self { shot, studio: None, heading: 0.0 }
+        Self { shot, renderer: None, heading: 0.0 }
     }
 
     /// A picture of the environment after its last reset or step: [`Size::bytes`] bytes.
     ///
     /// # Errors
-    /// [`Error::Graphics`] when there is nothing to draw with.
+    /// [`Error::Graphics`]: there is no OpenGL.
     pub fn draw(&mut self, environment: &mut dyn Simulated) -> Result<&[u8], Error> {
         let (model, scenery) = (environment.model(), environment.scenery());
-        let fits = |studio: &Studio| studio.renderer.scene().is_compatible_with_model(&model);
-        let (studio, opened) = match self.studio.take().filter(fits) {
-            Some(studio) => (self.studio.insert(studio), false),
-            None => (self.studio.insert(Studio::new(&model, self.shot)?), true),
+        let fits = |renderer: &OffscreenRenderer| renderer.context.scene().is_compatible_with_model(&model);
+        let (renderer, opened) = match self.renderer.take().filter(fits) {
+            Some(renderer) => (self.renderer.insert(renderer), false),
+            None => (self.renderer.insert(OffscreenRenderer::new(&model, self.shot)?), true),
         };
         let simulation = environment.simulation_mut();
         if opened || simulation.time() == 0.0 {
-            self.heading = studio.heading(simulation);
+            self.heading = renderer.heading(simulation);
         }
-        studio.draw(simulation, &scenery, self.shot, self.heading)
+        renderer.draw(simulation, &scenery, self.shot, self.heading)
     }
 }
 
-/// An off-screen context for models of one layout, and what of them is drawn.
+/// An OpenGL context without a window, for models with one memory layout.
 #[derive(Debug)]
-struct Studio {
-    renderer: MjRenderer,
-    phantom: Option<Phantom>,
+struct OffscreenRenderer {
+    context: MjRenderer,
+    ghost: Option<GhostBody>,
     root: usize,
-    /// The site that marks a target, where there is one.
+    /// The site of the target's mark, if there is one.
     target: Option<usize>,
 }
 
-impl Studio {
+impl OffscreenRenderer {
     fn new(model: &Arc<MjModel>, shot: Shot) -> Result<Self, Error> {
         let root = model
             .name_to_id(MjtObjBase::mjOBJ_BODY, &format!("{PREFIX}root"))
@@ -149,24 +152,24 @@ impl Studio {
                 (camera, MjvOption::default())
             }
         };
-        // How a context draws is decided by the model it is made for; drawn is whatever model comes.
+        // The model of a context decides its settings. It can draw any model with the same layout.
         let mut settings = MjModel::clone(model);
         let visual = settings.vis_mut();
         (visual.quality.shadowsize, visual.quality.offsamples) = (SHADOW_SIZE, SAMPLES);
         (visual.global.offwidth, visual.global.offheight) = (shot.size.width.into(), shot.size.height.into());
-        let phantom = shot.ghost.map(|_| Phantom::new(model));
-        let renderer = MjRenderer::builder()
+        let ghost = shot.ghost.map(|_| GhostBody::new(model));
+        let context = MjRenderer::builder()
             .width(shot.size.width.into())
             .height(shot.size.height.into())
             .camera(camera)
             .opts(options)
-            .num_visual_user_geom(phantom.as_ref().map_or(0, Phantom::parts))
+            .num_visual_user_geom(ghost.as_ref().map_or(0, GhostBody::parts))
             .build(&settings)
             .map_err(graphics)?;
-        Ok(Self { renderer, phantom, root, target: model.name_to_id(MjtObjBase::mjOBJ_SITE, TARGET) })
+        Ok(Self { context, ghost, root, target: model.name_to_id(MjtObjBase::mjOBJ_SITE, TARGET) })
     }
 
-    /// Angle about the vertical by which the root's forward axis, its own z, is turned from +x, rad.
+    /// Angle about the vertical between +x and the root's forward axis, its own z, rad.
     fn heading(&self, simulation: &Simulation) -> f64 {
         let rotation = &simulation.xmat()[self.root];
         rotation[5].atan2(rotation[2])
@@ -185,16 +188,16 @@ impl Studio {
         };
         let azimuth = heading.to_degrees() + turn;
         if shot.camera != Camera::Egocentric {
-            self.renderer.camera_mut().azimuth = azimuth;
+            self.context.camera_mut().azimuth = azimuth;
         }
         scenery.mark_target(self.target, simulation);
-        if let (Some(phantom), Some(ghost), Some(reference)) = (&mut self.phantom, shot.ghost, &scenery.reference) {
-            phantom.stand(reference, ghost, azimuth.to_radians());
-            let options = self.renderer.opts().clone();
-            phantom.appear(self.renderer.user_scene_mut(), &options);
+        if let (Some(body), Some(ghost), Some(reference)) = (&mut self.ghost, shot.ghost, &scenery.reference) {
+            body.set_pose(reference, ghost, azimuth.to_radians());
+            let options = self.context.opts().clone();
+            body.draw(self.context.user_scene_mut(), &options);
         }
-        self.renderer.sync_data(simulation).map_err(graphics)?;
-        self.renderer.render().map_err(graphics)?;
-        self.renderer.rgb_flat().ok_or_else(|| Error::Graphics { reason: "nothing was drawn".into() })
+        self.context.sync_data(simulation).map_err(graphics)?;
+        self.context.render().map_err(graphics)?;
+        self.context.rgb_flat().ok_or_else(|| Error::Graphics { reason: "MuJoCo returned no picture".into() })
     }
 }

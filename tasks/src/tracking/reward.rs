@@ -1,15 +1,16 @@
 //! Termination error and reward (`reference_pose/tracking.py`, `reference_pose/rewards.py`: `comic_reward_fn`).
 
+use comic_clips::spatial::half_angle_between;
 use comic_experiment::TerminationError;
 
-use crate::MAX_REWARD_TERMS;
-use crate::features::appendages;
+use super::reference::Reference;
+use crate::environment::MAX_REWARD_TERMS;
+use crate::humanoid::features::appendages;
+use crate::humanoid::walker::{ROOT_COORDINATES, ROOT_VELOCITIES, Walker};
 use crate::physics::Data;
-use crate::quaternion::distance;
-use crate::reference::Reference;
-use crate::walker::{ROOT_COORDINATES, ROOT_VELOCITIES, Walker};
 
-/// ε: how far the body is from frame `frame`: positions of the tracking bodies (m, world) and joint angles (rad).
+/// ε: the difference between the body and frame `frame`, in the positions of the tracking bodies (m, world) and the joint
+/// angles (rad).
 pub(crate) fn termination_error(
     kind: TerminationError,
     walker: &Walker,
@@ -27,8 +28,8 @@ pub(crate) fn termination_error(
     }
 }
 
-/// The reward's terms with their weights, in the order of `TRACKING_REWARD_TERMS`. Half of the reward is pose, half
-/// the distance from termination, which goes below 0 on a step that terminates.
+/// The reward's terms with their weights, in the order of `TRACKING_REWARD_TERMS`. The weights of the pose terms add up to
+/// 0.45; joint velocities and termination have 0.5 each. The termination term is negative in a step that terminates.
 pub(crate) fn terms(
     walker: &Walker,
     data: &Data,
@@ -41,7 +42,7 @@ pub(crate) fn terms(
     let orientations: f64 = data.xquat()[walker.tracked.clone()]
         .iter()
         .zip(reference.body_quaternions(frame))
-        .map(|(body, target)| distance(body, target).powi(2))
+        .map(|(body, target)| half_angle_between(*body, *target).powi(2))
         .sum();
     let center_of_mass = squared(&data.subtree_com()[walker.frame], reference.center_of_mass(frame));
     let velocities = squared(&data.qvel()[ROOT_VELOCITIES..], reference.joints_velocity(frame));

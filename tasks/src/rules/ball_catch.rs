@@ -14,29 +14,32 @@
 //! | throw | from 2 to 3 m ahead, ±0.3 m aside, 0.8 to 1.3 m high; at a point 0.35 m before the chest; 0.6 to 0.9 s of flight | ours |
 //! | task observation | ball: position, velocity, angular velocity in the root's frame, radius; target in the root's frame | ours |
 //!
-//! All of them are fields of [`BallCatch`], but for the fronts of the hands.
+//! All of them are fields of [`BallCatch`], except the fronts of the hands.
 
 use std::sync::Arc;
 
+use comic_clips::spatial::{into_frame, subtract};
 use comic_experiment::BallCatch;
-use rand::Rng as _;
+use rand::{Rng as _, SeedableRng as _};
 use rand_distr::{Distribution as _, StandardNormal};
 use rand_pcg::Pcg64;
 
+use super::environment::RuledTask;
+use super::get_up::standing_reward;
+use super::interface::{Rules, Verdict};
+use super::poses::Poses;
+use super::stage::{Arena, Part, Stage};
 use crate::arenas::floor;
+use crate::environment::{MAX_REWARD_TERMS, Task};
 use crate::error::Error;
-use crate::get_up::standing_reward;
 use crate::humanoid;
-use crate::observation::{Number, fill};
-use crate::quaternion::{difference, into_frame};
-use crate::rules::{Rules, Verdict};
-use crate::stage::{Arena, Part, Stage};
-use crate::start::Poses;
+use crate::humanoid::observation::{Number, fill};
+use crate::registry::{BuildTask, Context};
 
 /// Gravity, m/s² (MuJoCo's default).
 const GRAVITY: f64 = 9.81;
-/// Where the ball's position and quaternion, linear (world) and angular (its own frame) velocity lie: behind the
-/// humanoid's.
+/// First index of the ball's position and quaternion in the coordinates, and of its linear (world) and angular (its own
+/// frame) velocity in the velocities. The humanoid's come first.
 const BALL_COORDINATES: usize = 63;
 const BALL_VELOCITIES: usize = 62;
 
@@ -55,19 +58,28 @@ struct Ball {
     radius: f64,
 }
 
-/// What one environment remembers of its episode.
+/// The state of an episode.
 #[derive(Debug, Default)]
-pub(crate) struct Memory {
+pub(crate) struct State {
     radius: f64,
     /// Consecutive steps in which the ball was held.
     held_steps: u32,
     caught: bool,
-    /// Where to walk once the ball is caught: x and y, m.
+    /// The target of walking after the ball is caught: x and y, m.
     target: [f64; 2],
 }
 
+impl BuildTask for BallCatch {
+    fn build(&self, context: &Context<'_>) -> Result<Arc<dyn Task>, Error> {
+        let poses = Poses::new(self.start_pose, context.catalogue)?;
+        let mut random = Pcg64::seed_from_u64(context.experiment.seed);
+        let rules = BallCatchRules::new(self, poses, &mut random)?;
+        Ok(Arc::new(RuledTask::new(rules, context.spec()?)))
+    }
+}
+
 impl BallCatchRules {
-    /// Compiles the balls of which every episode draws one.
+    /// Compiles the balls. Every episode draws one of them.
     pub(crate) fn new(config: &BallCatch, poses: Poses, random: &mut Pcg64) -> Result<Self, Error> {
         let mut ball = || {
             let radius = uniform(config.radius, random);
@@ -85,18 +97,18 @@ impl BallCatchRules {
         let from = [uniform(config.distance, random), uniform(config.lateral, random), uniform(config.height, random)];
         let aim = [config.aim_distance, uniform(config.aim_lateral, random), uniform(config.aim_height, random)];
         let time = uniform(config.flight_time, random);
-        let mut velocity = difference(&aim, &from).map(|way| way / time);
+        let mut velocity = subtract(aim, from).map(|distance| distance / time);
         velocity[2] += 0.5 * GRAVITY * time;
         (from, velocity)
     }
 
-    /// Counts a step in which the ball was held, or not.
-    fn count(&self, holds: bool, memory: &mut Memory) {
-        memory.held_steps = if holds { memory.held_steps.saturating_add(1) } else { 0 };
-        memory.caught |= memory.held_steps >= self.config.hold_steps;
+    /// Counts the consecutive steps in which the ball was held.
+    fn count(&self, holds: bool, state: &mut State) {
+        state.held_steps = if holds { state.held_steps.saturating_add(1) } else { 0 };
+        state.caught |= state.held_steps >= self.config.hold_steps;
     }
 
-    /// Which hand's front, which hand's back and whether the torso touch the ball.
+    /// What touches the ball.
     fn touches(stage: &Stage) -> Touches {
         let mut touches = Touches::default();
         for (one, other, place) in stage.contacts() {
@@ -110,18 +122,18 @@ impl BallCatchRules {
                 Part::LeftHand | Part::RightHand => {
                     let hand = usize::from(part == Part::RightHand);
                     let body = stage.arena.hands[hand];
-                    let offset = difference(&place, &stage.data.xpos()[body]);
+                    let offset = subtract(place, stage.data.xpos()[body]);
                     let [_, _, z] = into_frame(&stage.data.xmat()[body], offset);
                     touches.sides[hand][usize::from(z >= 0.0)] = true;
                 }
-                _ => {}
+                Part::Foot | Part::Body | Part::Ball | Part::Other => {}
             }
         }
         touches
     }
 }
 
-/// Who touches the ball.
+/// What touches the ball.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Touches {
     /// The ground or the head.
@@ -132,7 +144,7 @@ struct Touches {
 }
 
 impl Touches {
-    /// Fronts less backs, in hands.
+    /// Number of hands that touch with the front, minus those that touch with the back.
     fn score(self) -> f64 {
         self.sides.iter().map(|[front, back]| f64::from(u8::from(*front)) - f64::from(u8::from(*back))).sum()
     }
@@ -148,16 +160,16 @@ fn uniform([low, high]: [f64; 2], random: &mut Pcg64) -> f64 {
 }
 
 impl Rules for BallCatchRules {
-    type Memory = Memory;
+    type State = State;
 
     fn stage(&self, random: &mut Pcg64) -> Result<Stage, Error> {
         Ok(Stage::new(Arc::clone(&self.balls[random.random_range(0..self.balls.len())].arena)))
     }
 
-    fn begin(&self, stage: &mut Stage, memory: &mut Memory, random: &mut Pcg64) {
+    fn begin(&self, stage: &mut Stage, state: &mut State, random: &mut Pcg64) {
         let Ball { arena, radius } = &self.balls[random.random_range(0..self.balls.len())];
         stage.enter(Arc::clone(arena));
-        *memory = Memory { radius: *radius, target: [self.config.target_distance, 0.0], ..Memory::default() };
+        *state = State { radius: *radius, target: [self.config.target_distance, 0.0], ..State::default() };
         let pose = self.poses.draw(random);
         let (position, velocity) = self.throw(random);
         let spin: [f64; 3] = std::array::from_fn(|_| {
@@ -169,20 +181,20 @@ impl Rules for BallCatchRules {
         stage.place(&qpos, &qvel);
     }
 
-    fn judge(&self, stage: &mut Stage, memory: &mut Memory, _: &mut Pcg64) -> Verdict {
+    fn judge(&self, stage: &mut Stage, state: &mut State, _: &mut Pcg64) -> Verdict {
         let config = &self.config;
         let touches = Self::touches(stage);
-        let mut reward_terms = [0.0; crate::MAX_REWARD_TERMS];
+        let mut reward_terms = [0.0; MAX_REWARD_TERMS];
         if touches.failure {
             reward_terms[0] = config.failure_reward;
             return Verdict { reward_terms, failed: true };
         }
-        self.count(touches.holds(), memory);
+        self.count(touches.holds(), state);
         reward_terms[1] = config.touch_reward * touches.score();
         reward_terms[2] = config.standing_reward * standing_reward(stage.head_height(), config.target_height);
-        if memory.caught {
+        if state.caught {
             let (root, _) = stage.root();
-            let way = [memory.target[0] - root[0], memory.target[1] - root[1]];
+            let way = [state.target[0] - root[0], state.target[1] - root[1]];
             let velocity = stage.data.qvel();
             let speed = (velocity[0] * way[0] + velocity[1] * way[1]) / way[0].hypot(way[1]).max(1e-6);
             reward_terms[3] = config.walking_reward * (speed / config.walking_speed).clamp(0.0, 1.0);
@@ -190,49 +202,47 @@ impl Rules for BallCatchRules {
         Verdict { reward_terms, failed: false }
     }
 
-    fn observe<T: Number>(&self, stage: &Stage, memory: &Memory, out: &mut [T]) {
+    fn observe<T: Number>(&self, stage: &Stage, state: &State, out: &mut [T]) {
         let (root, rotation) = stage.root();
         let (qpos, qvel) = (&stage.data.qpos()[BALL_COORDINATES..], &stage.data.qvel()[BALL_VELOCITIES..]);
-        let position = into_frame(rotation, difference(&[qpos[0], qpos[1], qpos[2]], root));
+        let position = into_frame(rotation, subtract([qpos[0], qpos[1], qpos[2]], *root));
         let velocity = into_frame(rotation, [qvel[0], qvel[1], qvel[2]]);
-        // MuJoCo keeps a free body's angular velocity in the body's own frame.
+        // MuJoCo gives a free body's angular velocity in the body's own frame.
         let ball = stage.arena.ball.unwrap_or_default();
         let own = &stage.data.xmat()[ball];
         let in_world = std::array::from_fn(|row| (0..3).map(|column| own[3 * row + column] * qvel[3 + column]).sum());
         let spin = into_frame(rotation, in_world);
-        let [x, y] = memory.target;
-        let target = into_frame(rotation, difference(&[x, y, 0.0], root));
-        fill(out, position.into_iter().chain(velocity).chain(spin).chain([memory.radius]).chain(target));
+        let [x, y] = state.target;
+        let target = into_frame(rotation, subtract([x, y, 0.0], *root));
+        fill(out, position.into_iter().chain(velocity).chain(spin).chain([state.radius]).chain(target));
     }
 
     fn time_limit(&self) -> f64 {
         self.config.time_limit
     }
 
-    fn target(&self, memory: &Memory) -> Option<[f64; 2]> {
-        Some(memory.target)
+    fn target(&self, state: &State) -> Option<[f64; 2]> {
+        Some(state.target)
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use rand::SeedableRng as _;
-
     use super::*;
 
     fn rules(config: &BallCatch) -> BallCatchRules {
         BallCatchRules::new(config, Poses::upright(), &mut Pcg64::seed_from_u64(1)).unwrap()
     }
 
-    /// A stage on which an episode has begun, its memory and the generator.
-    fn begun(rules: &BallCatchRules) -> (Stage, Memory, Pcg64) {
-        let (mut random, mut memory) = (Pcg64::seed_from_u64(2), Memory::default());
+    /// A stage with the first state of an episode, the rules' state and the random number generator.
+    fn first_state(rules: &BallCatchRules) -> (Stage, State, Pcg64) {
+        let (mut random, mut state) = (Pcg64::seed_from_u64(2), State::default());
         let mut stage = rules.stage(&mut random).unwrap();
-        rules.begin(&mut stage, &mut memory, &mut random);
-        (stage, memory, random)
+        rules.begin(&mut stage, &mut state, &mut random);
+        (stage, state, random)
     }
 
-    /// Puts the ball at rest at a place of the world, m.
+    /// Puts the ball at rest at a position in the world, m.
     fn put(stage: &mut Stage, place: [f64; 3]) {
         let (mut qpos, mut qvel) = (stage.data.qpos().to_vec(), stage.data.qvel().to_vec());
         qpos[BALL_COORDINATES..BALL_COORDINATES + 3].copy_from_slice(&place);
@@ -240,7 +250,7 @@ mod tests {
         stage.place(&qpos, &qvel);
     }
 
-    /// The place at which the ball overlaps a hand by a centimetre, on its front (`side` −1) or on its back (+1).
+    /// The position at which the ball overlaps a hand by a centimetre, on the front (`side` −1) or on the back (+1).
     fn at_hand(stage: &Stage, hand: usize, side: f64, radius: f64) -> [f64; 3] {
         let body = stage.arena.hands[hand];
         let (place, rotation) = (stage.data.xpos()[body], stage.data.xmat()[body]);
@@ -254,32 +264,32 @@ mod tests {
     }
 
     #[test]
-    fn the_ground_and_the_head_fail_with_minus_one_and_nothing_else() {
+    fn a_ball_on_the_ground_or_the_head_fails_with_a_reward_of_minus_one() {
         let rules = rules(&one_size());
-        let (mut stage, mut memory, mut random) = begun(&rules);
+        let (mut stage, mut state, mut random) = first_state(&rules);
         let head = {
             let [.., head] = stage.arena.walker.appendages;
             stage.data.xpos()[head]
         };
         for place in [[2.0, 0.0, 0.095], [head[0] + 0.12, head[1], head[2] + 0.12]] {
             put(&mut stage, place);
-            let verdict = rules.judge(&mut stage, &mut memory, &mut random);
+            let verdict = rules.judge(&mut stage, &mut state, &mut random);
             assert!(verdict.failed, "{place:?}");
             assert_eq!(verdict.reward_terms, [-1.0, 0.0, 0.0, 0.0, 0.0]);
         }
         put(&mut stage, [2.0, 0.0, 0.5]);
-        assert!(!rules.judge(&mut stage, &mut memory, &mut random).failed, "a ball in the air");
+        assert!(!rules.judge(&mut stage, &mut state, &mut random).failed, "a ball in the air");
     }
 
     #[test]
-    fn the_front_of_a_hand_pays_a_hundredth_and_its_back_costs_one() {
+    fn the_front_of_a_hand_gives_a_hundredth_and_the_back_takes_one() {
         let rules = rules(&one_size());
-        let (mut stage, mut memory, mut random) = begun(&rules);
+        let (mut stage, mut state, mut random) = first_state(&rules);
         for hand in [0, 1] {
             for (side, expected) in [(-1.0, 0.01), (1.0, -0.01)] {
                 let place = at_hand(&stage, hand, side, 0.1);
                 put(&mut stage, place);
-                let verdict = rules.judge(&mut stage, &mut memory, &mut random);
+                let verdict = rules.judge(&mut stage, &mut state, &mut random);
                 assert_eq!(verdict.reward_terms[1], expected, "hand {hand}, side {side}");
             }
         }
@@ -303,54 +313,54 @@ mod tests {
     }
 
     #[test]
-    fn standing_pays_at_most_a_hundredth() {
+    fn standing_gives_at_most_a_hundredth() {
         let rules = rules(&one_size());
-        let (mut stage, mut memory, mut random) = begun(&rules);
-        let verdict = rules.judge(&mut stage, &mut memory, &mut random);
+        let (mut stage, mut state, mut random) = first_state(&rules);
+        let verdict = rules.judge(&mut stage, &mut state, &mut random);
         assert!((verdict.reward_terms[2] - 0.01).abs() < 1e-6, "{verdict:?}");
         for _ in 0..60 {
             stage.step(&[0.0; 56]);
         }
         put(&mut stage, [2.0, 0.0, 2.0]);
-        let verdict = rules.judge(&mut stage, &mut memory, &mut random);
+        let verdict = rules.judge(&mut stage, &mut state, &mut random);
         assert!((0.0..0.005).contains(&verdict.reward_terms[2]), "a fallen body: {verdict:?}");
     }
 
     #[test]
-    fn walking_pays_only_once_the_ball_was_held_for_ten_steps() {
+    fn walking_gives_a_reward_only_after_the_ball_was_caught() {
         let rules = rules(&one_size());
-        let (mut stage, _, mut random) = begun(&rules);
+        let (mut stage, _, mut random) = first_state(&rules);
         let (mut qpos, mut qvel) = (stage.data.qpos().to_vec(), stage.data.qvel().to_vec());
         qpos[BALL_COORDINATES..BALL_COORDINATES + 3].copy_from_slice(&[2.0, 0.0, 2.0]);
         for (speed, expected) in [(0.5, 0.005), (2.0, 0.01), (-1.0, 0.0)] {
             qvel[0] = speed;
             stage.place(&qpos, &qvel);
             for (caught, expected) in [(false, 0.0), (true, expected)] {
-                let mut memory = Memory { caught, target: [3.0, 0.0], radius: 0.1, held_steps: 0 };
-                let verdict = rules.judge(&mut stage, &mut memory, &mut random);
+                let mut state = State { caught, target: [3.0, 0.0], radius: 0.1, held_steps: 0 };
+                let verdict = rules.judge(&mut stage, &mut state, &mut random);
                 assert!((verdict.reward_terms[3] - expected).abs() < 1e-12, "{speed} {caught}: {verdict:?}");
             }
         }
     }
 
     #[test]
-    fn a_ball_is_caught_at_the_tenth_step_in_a_row() {
+    fn a_ball_is_caught_after_ten_consecutive_steps() {
         let rules = rules(&one_size());
-        let mut memory = Memory::default();
+        let mut state = State::default();
         for (holds, caught) in (0..9).map(|_| (true, false)).chain([(false, false)]) {
-            rules.count(holds, &mut memory);
-            assert_eq!(memory.caught, caught);
+            rules.count(holds, &mut state);
+            assert_eq!(state.caught, caught);
         }
         for step in 1..=12 {
-            rules.count(true, &mut memory);
-            assert_eq!(memory.caught, step >= 10, "step {step}");
+            rules.count(true, &mut state);
+            assert_eq!(state.caught, step >= 10, "step {step}");
         }
-        rules.count(false, &mut memory);
-        assert!(memory.caught, "once caught it stays so, whatever becomes of it");
+        rules.count(false, &mut state);
+        assert!(state.caught, "a caught ball stays caught");
     }
 
     #[test]
-    fn throws_fly_up_and_reach_their_aim_in_time() {
+    fn throws_go_up_and_reach_their_aim_in_time() {
         let (config, mut random) = (BallCatch::default(), Pcg64::seed_from_u64(3));
         let rules = rules(&BallCatch { balls: 1, ..config.clone() });
         for _ in 0..200 {
@@ -367,18 +377,18 @@ mod tests {
     }
 
     #[test]
-    fn balls_differ_in_size_and_mass_from_episode_to_episode() {
+    fn balls_of_different_episodes_differ_in_size_and_mass() {
         let rules = rules(&BallCatch { balls: 8, ..BallCatch::default() });
-        let (mut stage, mut memory, mut random) = begun(&rules);
+        let (mut stage, mut state, mut random) = first_state(&rules);
         let mut seen = std::collections::BTreeSet::new();
         for _ in 0..100 {
-            rules.begin(&mut stage, &mut memory, &mut random);
+            rules.begin(&mut stage, &mut state, &mut random);
             let body = stage.arena.ball.unwrap();
             let model = stage.arena.models.shared();
             let (mass, geom) = (model.body_mass()[body], model.body_geomadr()[body] as usize);
-            assert_eq!(model.geom_size()[geom][0], memory.radius);
-            assert!((0.08..=0.15).contains(&memory.radius) && (0.3..=1.5).contains(&mass));
-            seen.insert((memory.radius.to_bits(), mass.to_bits()));
+            assert_eq!(model.geom_size()[geom][0], state.radius);
+            assert!((0.08..=0.15).contains(&state.radius) && (0.3..=1.5).contains(&mass));
+            seen.insert((state.radius.to_bits(), mass.to_bits()));
         }
         assert_eq!(seen.len(), 8);
     }

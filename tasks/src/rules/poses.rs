@@ -1,18 +1,18 @@
-//! The poses in which episodes begin that do not follow a clip.
+//! The poses in which episodes of tasks without a reference begin.
 
+use comic_clips::spatial::{about_vector, multiply, normalize, rotated};
 use comic_clips::{Catalogue, WalkerModel};
 use comic_experiment::StartPose;
 use rand::Rng;
 
 use crate::error::Error;
-use crate::quaternion::{normalised, product, rotated, turn};
-use crate::walker::ROOT_COORDINATES;
+use crate::humanoid::walker::ROOT_COORDINATES;
 
 /// Height (m) and orientation of the upright root (`cmu_humanoid.py`, `_UPRIGHT_POS_V2020`, `_UPRIGHT_QUAT`).
 const UPRIGHT_HEIGHT: f64 = 1.143;
 const UPRIGHT_QUATERNION: [f64; 4] = [0.859, 1.0, 1.0, 0.859];
 
-/// Positions and velocities of the humanoid, root and joints.
+/// Coordinates and velocities of the humanoid's root and joints.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Pose {
     pub(crate) qpos: [f64; 63],
@@ -20,11 +20,11 @@ pub(crate) struct Pose {
 }
 
 impl Pose {
-    /// Upright, facing +x, every joint at 0 (`initializers.UprightInitializer`).
+    /// The upright pose: facing +x, every joint at 0 (`initializers.UprightInitializer`).
     pub(crate) fn upright() -> Self {
         let mut qpos = [0.0; 63];
         qpos[2] = UPRIGHT_HEIGHT;
-        qpos[3..7].copy_from_slice(&normalised(&UPRIGHT_QUATERNION));
+        qpos[3..7].copy_from_slice(&normalize(UPRIGHT_QUATERNION));
         Self { qpos, qvel: [0.0; 62] }
     }
 
@@ -38,27 +38,27 @@ impl Pose {
         &mut self.qpos[ROOT_COORDINATES..]
     }
 
-    /// Moved by `x` and `y` (m), as `Entity.shift_pose` does.
+    /// The pose moved by `x` and `y` (m), as by `Entity.shift_pose`.
     pub(crate) fn moved(mut self, x: f64, y: f64) -> Self {
         self.qpos[0] += x;
         self.qpos[1] += y;
         self
     }
 
-    /// Turned about the world's axis `axis` by `angle` (rad), and its linear velocity with it; the angular one is in
-    /// the root's own frame (`Entity.shift_pose` with `rotate_velocity`).
+    /// The pose and its linear velocity, turned about the world's axis `axis` by `angle` (rad). The angular velocity does not
+    /// change: it is in the root's own frame (`Entity.shift_pose` with `rotate_velocity`).
     pub(crate) fn turned(mut self, axis: [f64; 3], angle: f64) -> Self {
-        let by = turn(axis, angle);
-        let turned = normalised(&product(&by, &self.quaternion()));
+        let by = about_vector(axis, angle);
+        let turned = normalize(multiply(by, self.quaternion()));
         self.qpos[3..7].copy_from_slice(&turned);
-        let velocity = rotated(&by, [self.qvel[0], self.qvel[1], self.qvel[2]]);
+        let velocity = rotated(by, [self.qvel[0], self.qvel[1], self.qvel[2]]);
         self.qvel[..3].copy_from_slice(&velocity);
         self
     }
 
-    /// Angle about the vertical by which the root's forward axis, its own z, is turned from +x, rad.
+    /// Angle about the vertical between +x and the root's forward axis, its own z, rad.
     pub(crate) fn heading(&self) -> f64 {
-        let [x, y, _] = rotated(&self.quaternion(), [0.0, 0.0, 1.0]);
+        let [x, y, _] = rotated(self.quaternion(), [0.0, 0.0, 1.0]);
         y.atan2(x)
     }
 
@@ -67,7 +67,7 @@ impl Pose {
     }
 }
 
-/// Poses to begin in, all at the origin and facing +x.
+/// The poses in which a task's episodes can begin. All are at the origin and face +x.
 #[derive(Debug)]
 pub(crate) struct Poses(Vec<Pose>);
 
@@ -77,8 +77,10 @@ impl Poses {
         Self(vec![Pose::upright()])
     }
 
+    /// The upright pose, or the frames of the clips.
+    ///
     /// # Errors
-    /// When clips are asked for and cannot be read, or are of another body.
+    /// The clips cannot be read, or they are for another body.
     pub(crate) fn new(kind: StartPose, catalogue: &Catalogue) -> Result<Self, Error> {
         match kind {
             StartPose::Upright => Ok(Self::upright()),
@@ -109,7 +111,7 @@ impl Poses {
     }
 
     pub(crate) fn draw(&self, random: &mut impl Rng) -> Pose {
-        // There is at least one.
+        // There is at least one pose.
         self.0[random.random_range(0..self.0.len())]
     }
 }

@@ -1,7 +1,7 @@
-//! What the humanoid sees: its egocentric camera, drawn by MuJoCo off-screen (`cmu_humanoid.py`, `egocentric_camera`).
+//! The camera images of the policy: MuJoCo draws the humanoid's egocentric camera (`cmu_humanoid.py`, `egocentric_camera`).
 //!
-//! Drawing needs OpenGL through EGL, and no display. A context belongs to the thread that made it and is costly, so each
-//! thread keeps one of its own, at first use, for all its environments; the caller sees none of that.
+//! Drawing needs OpenGL through EGL, and no display. An OpenGL context belongs to the thread that made it and takes long to
+//! make. Each thread makes one when it first draws, and uses it for all its environments.
 
 use std::cell::RefCell;
 
@@ -9,7 +9,7 @@ use comic_experiment::{IMAGE_SIZE, Vision};
 use mujoco_rs::prelude::*;
 use mujoco_rs::renderer::{MjRenderer, RendererError};
 
-use crate::error::Error;
+use crate::error::{Error, missing};
 use crate::humanoid::PREFIX;
 use crate::physics::Simulation;
 
@@ -17,18 +17,18 @@ use crate::physics::Simulation;
 pub const IMAGE_BYTES: usize = IMAGE_SIZE * IMAGE_SIZE * 3;
 /// The camera's name.
 const CAMERA: &str = "egocentric";
-/// The group of what the humanoid does not see of itself: its nose (`_WALKER_INVIS_GROUP`).
+/// The group of geoms that the egocentric camera does not show: the nose (`_WALKER_INVIS_GROUP`).
 const INVISIBLE_GROUP: usize = 1;
 
 thread_local! {
-    /// The camera of this thread, and how it draws.
+    /// The camera of this thread and its quality.
     static CAMERA_OF_THREAD: RefCell<Option<(Vision, Camera)>> = const { RefCell::new(None) };
 }
 
-/// Draws what the humanoid of `simulation` sees into `image`, [`IMAGE_BYTES`] long. [`Vision::Off`] draws nothing.
+/// Draws the camera image of `simulation` into `image`, which has [`IMAGE_BYTES`] bytes. [`Vision::Off`] does nothing.
 ///
 /// # Errors
-/// [`Error::Graphics`] when there is no OpenGL.
+/// [`Error::Graphics`]: there is no OpenGL.
 pub(crate) fn draw(vision: Vision, simulation: &mut Simulation, image: &mut [u8]) -> Result<(), Error> {
     if vision == Vision::Off {
         return Ok(());
@@ -37,7 +37,7 @@ pub(crate) fn draw(vision: Vision, simulation: &mut Simulation, image: &mut [u8]
         let camera = match kept {
             Some((kind, camera)) if *kind == vision => camera,
             _ => {
-                // The old context goes before the new one comes: both would be current in this thread.
+                // The old context must end before the new one begins: both would be current in this thread.
                 *kept = None;
                 &mut kept.insert((vision, Camera::new(simulation.model(), vision)?)).1
             }
@@ -46,7 +46,7 @@ pub(crate) fn draw(vision: Vision, simulation: &mut Simulation, image: &mut [u8]
     })
 }
 
-/// An off-screen context, and the egocentric camera in it.
+/// An OpenGL context without a window, and the egocentric camera in it.
 #[derive(Debug)]
 struct Camera {
     renderer: MjRenderer,
@@ -55,7 +55,7 @@ struct Camera {
 impl Camera {
     fn new(model: &MjModel, vision: Vision) -> Result<Self, Error> {
         let (camera, options) = egocentric(model)?;
-        // How a context draws is decided by the model it is made for; drawn is whatever model comes.
+        // The model of a context decides its settings. It can draw any model with the same layout.
         let mut settings = model.clone();
         if vision == Vision::Fast {
             let visual = settings.vis_mut();
@@ -83,18 +83,18 @@ impl Camera {
     }
 }
 
-/// The egocentric camera, and what it sees.
+/// The egocentric camera and its drawing options.
 pub(crate) fn egocentric(model: &MjModel) -> Result<(MjvCamera, MjvOption), Error> {
     let camera = model
         .name_to_id(MjtObjBase::mjOBJ_CAMERA, &format!("{PREFIX}{CAMERA}"))
-        .ok_or_else(|| crate::humanoid::missing("camera", CAMERA))?;
+        .ok_or_else(|| missing("camera", CAMERA))?;
     let mut options = MjvOption::default();
     options.geomgroup[INVISIBLE_GROUP] = 0;
     options.flags[MjtVisFlag::mjVIS_RANGEFINDER as usize] = 0;
     Ok((MjvCamera::new_fixed(camera), options))
 }
 
-/// What went wrong with OpenGL, and what helps.
+/// An error of OpenGL.
 pub(crate) fn graphics(error: RendererError) -> Error {
     let cause = std::error::Error::source(&error).map(|cause| format!(": {cause}")).unwrap_or_default();
     Error::Graphics { reason: format!("{error}{cause}") }

@@ -1,14 +1,27 @@
-//! The corridor with walls across part of it.
+//! The corridor with walls, each across a part of its width.
+
+use std::sync::Arc;
 
 use comic_experiment::{WallSide, Walls};
 use mujoco_rs::prelude::*;
 use rand::Rng as _;
 use rand_pcg::Pcg64;
 
+use super::corridor::{CorridorRules, Obstacles};
+use super::environment::RuledTask;
+use super::poses::Poses;
 use crate::arenas::corridor::{self, Block, Extent, X_PADDING};
-use crate::corridor::Obstacles;
+use crate::environment::Task;
 use crate::error::Error;
 use crate::humanoid;
+use crate::registry::{BuildTask, Context};
+
+impl BuildTask for Walls {
+    fn build(&self, context: &Context<'_>) -> Result<Arc<dyn Task>, Error> {
+        let poses = Poses::new(self.corridor.start_pose, context.catalogue)?;
+        Ok(Arc::new(RuledTask::new(CorridorRules::new(&self.corridor, poses, self.clone()), context.spec()?)))
+    }
+}
 
 impl Obstacles for Walls {
     fn draw(&self, extent: Extent, random: &mut Pcg64) -> Result<MjModel, Error> {
@@ -17,8 +30,8 @@ impl Obstacles for Walls {
     }
 }
 
-/// `WallsCorridor.regenerate`: a wall at every `spacing`, the first of them `spacing` behind the corridor's beginning,
-/// which is 2 m behind the origin.
+/// `WallsCorridor.regenerate`: a wall every `spacing` metres. The first one is `spacing` after the corridor's start, which is
+/// 2 m before the origin.
 fn walls(config: &Walls, extent: Extent, random: &mut Pcg64) -> Vec<Block> {
     let mut x = config.spacing - X_PADDING;
     if config.initial_padding {
@@ -51,7 +64,7 @@ mod tests {
     const EXTENT: Extent = Extent { length: 100.0, width: 10.0 };
 
     #[test]
-    fn twenty_walls_stand_five_metres_apart_from_the_third_metre_on() {
+    fn there_are_twenty_walls_five_metres_apart_from_the_third_metre_on() {
         let mut random = Pcg64::seed_from_u64(1);
         let places = |config: &Walls, random: &mut Pcg64| {
             walls(config, EXTENT, random).iter().map(|wall| wall.position[0]).collect::<Vec<_>>()
@@ -63,7 +76,7 @@ mod tests {
     }
 
     #[test]
-    fn widths_and_heights_fill_their_ranges_and_sides_are_a_fair_coin() {
+    fn widths_and_heights_are_uniform_and_both_sides_equally_likely() {
         let (config, mut random) = (Walls::default(), Pcg64::seed_from_u64(2));
         let all: Vec<Block> = (0..200).flat_map(|_| walls(&config, EXTENT, &mut random)).collect();
         let count = all.len() as f64;
@@ -86,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn dm_controls_default_puts_white_walls_on_the_left_first_and_then_in_turn() {
+    fn dm_controls_default_has_white_walls_on_alternating_sides_from_the_left() {
         let config = Walls { side: WallSide::Alternate, random_colours: false, ..Walls::default() };
         let all = walls(&config, EXTENT, &mut Pcg64::seed_from_u64(3));
         assert!(all.iter().enumerate().all(|(index, wall)| (wall.position[1] > 0.0) == (index % 2 == 0)));

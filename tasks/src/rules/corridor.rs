@@ -1,4 +1,4 @@
-//! What running through a corridor means (`locomotion/tasks/corridors.py`), whatever stands in the way.
+//! The rules of both corridors (`locomotion/tasks/corridors.py`).
 
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -7,20 +7,22 @@ use comic_experiment::{Corridor, Vision};
 use mujoco_rs::prelude::*;
 use rand_pcg::Pcg64;
 
+use super::interface::{Recorded, Rules, Verdict};
+use super::poses::Poses;
+use super::stage::{Arena, Stage};
 use crate::arenas::corridor::Extent;
 use crate::error::Error;
-use crate::observation::{Number, fill};
-use crate::rules::{Recorded, Rules, Verdict};
-use crate::stage::{Arena, Stage};
-use crate::start::Poses;
+use crate::humanoid::observation::{Number, fill};
 
-/// Distance along the corridor at which the humanoid begins (m, `walker_spawn_position` of dm_control's examples).
+/// Distance along the corridor at which an episode begins (m, `walker_spawn_position` of dm_control's examples).
 pub(crate) const START: f64 = 0.5;
 
-/// What stands in the way, drawn anew for every arena.
+/// The obstacles of a corridor. Each arena has its own random ones.
 pub(crate) trait Obstacles: Debug + Send + Sync + 'static {
+    /// A new arena with random obstacles.
+    ///
     /// # Errors
-    /// When MuJoCo refuses the arena.
+    /// MuJoCo refuses the arena.
     fn draw(&self, extent: Extent, random: &mut Pcg64) -> Result<MjModel, Error>;
 }
 
@@ -32,10 +34,10 @@ pub(crate) struct CorridorRules<O> {
     obstacles: O,
 }
 
-/// How long the current arena has been used.
+/// The use of the current arena.
 #[derive(Debug, Default)]
-pub(crate) struct Memory {
-    /// Control steps in the current arena; none when the next episode needs another one.
+pub(crate) struct State {
+    /// Control steps in the current arena; `None` when the next episode needs another arena.
     steps: Option<u32>,
 }
 
@@ -50,7 +52,8 @@ impl<O: Obstacles> CorridorRules<O> {
     }
 }
 
-/// 1 at `target` (m/s), falling linearly to 0 at 0 and at twice the target (`rewards.tolerance` with margin `target`).
+/// 1 at `target` (m/s). It falls linearly to 0 at velocity 0 and at twice the target (`rewards.tolerance` with margin
+/// `target`).
 pub(crate) fn velocity_reward(velocity: f64, target: f64) -> f64 {
     let distance = if velocity < target { target - velocity } else { velocity - target } / target;
     if velocity == target {
@@ -63,25 +66,25 @@ pub(crate) fn velocity_reward(velocity: f64, target: f64) -> f64 {
 }
 
 impl<O: Obstacles> Rules for CorridorRules<O> {
-    type Memory = Memory;
+    type State = State;
 
     fn stage(&self, random: &mut Pcg64) -> Result<Stage, Error> {
         Ok(Stage::new(self.draw_arena(random)?))
     }
 
-    fn begin(&self, stage: &mut Stage, memory: &mut Memory, random: &mut Pcg64) {
-        let worn = memory.steps.is_none_or(|steps| steps >= self.config.arena_steps);
-        // One arena could be compiled, so the next can: should that ever fail, the old one serves on.
+    fn begin(&self, stage: &mut Stage, state: &mut State, random: &mut Pcg64) {
+        let worn = state.steps.is_none_or(|steps| steps >= self.config.arena_steps);
+        // A first arena was compiled, so this one can be. If it fails, the old arena stays in use.
         if worn && let Ok(arena) = self.draw_arena(random) {
             stage.enter(arena);
-            memory.steps = Some(0);
+            state.steps = Some(0);
         }
         let pose = self.poses.draw(random).moved(START, 0.0);
         stage.place(&pose.qpos, &pose.qvel);
     }
 
-    fn judge(&self, stage: &mut Stage, memory: &mut Memory, _: &mut Pcg64) -> Verdict {
-        memory.steps = memory.steps.map(|steps| steps.saturating_add(1));
+    fn judge(&self, stage: &mut Stage, state: &mut State, _: &mut Pcg64) -> Verdict {
+        state.steps = state.steps.map(|steps| steps.saturating_add(1));
         stage.data.subtree_vel();
         let walker = &stage.arena.walker;
         let velocity = stage.data.subtree_linvel()[walker.root][0];
@@ -91,7 +94,7 @@ impl<O: Obstacles> Rules for CorridorRules<O> {
     }
 
     /// The root's height, m.
-    fn observe<T: Number>(&self, stage: &Stage, _: &Memory, out: &mut [T]) {
+    fn observe<T: Number>(&self, stage: &Stage, _: &State, out: &mut [T]) {
         fill(out, [stage.root().0[2]]);
     }
 
@@ -105,11 +108,11 @@ impl<O: Obstacles> Rules for CorridorRules<O> {
 }
 
 impl<O: Obstacles> Recorded for CorridorRules<O> {
-    fn observation(&self, _: &Stage, _: &Memory) -> Vec<(&'static str, Vec<f64>)> {
+    fn observation(&self, _: &Stage, _: &State) -> Vec<(&'static str, Vec<f64>)> {
         Vec::new()
     }
 
-    fn quantities(&self, stage: &Stage, _: &Memory) -> Vec<(&'static str, Vec<f64>)> {
+    fn quantities(&self, stage: &Stage, _: &State) -> Vec<(&'static str, Vec<f64>)> {
         let walker = &stage.arena.walker;
         let [hands_and_feet @ .., _head] = walker.appendages;
         vec![
@@ -141,31 +144,31 @@ mod tests {
         CorridorRules::new(&config, Poses::upright(), obstacles)
     }
 
-    /// After each of `count` episodes of `steps` steps: whether the next one has another arena.
+    /// Plays `count` episodes of `steps` steps. After each: whether the next episode has another arena.
     fn changes<O: Obstacles>(rules: &CorridorRules<O>, count: usize, steps: usize) -> Vec<bool> {
-        let (mut random, mut memory) = (Pcg64::seed_from_u64(1), Memory::default());
+        let (mut random, mut state) = (Pcg64::seed_from_u64(1), State::default());
         let mut stage = rules.stage(&mut random).unwrap();
-        rules.begin(&mut stage, &mut memory, &mut random);
+        rules.begin(&mut stage, &mut state, &mut random);
         let mut change = |_| {
             let before = Arc::clone(&stage.arena);
             for _ in 0..steps {
                 stage.step(&[0.0; 56]);
-                rules.judge(&mut stage, &mut memory, &mut random);
+                rules.judge(&mut stage, &mut state, &mut random);
             }
-            rules.begin(&mut stage, &mut memory, &mut random);
+            rules.begin(&mut stage, &mut state, &mut random);
             !Arc::ptr_eq(&before, &stage.arena)
         };
         (0..count).map(&mut change).collect()
     }
 
     #[test]
-    fn an_arena_serves_until_its_steps_are_used_up() {
+    fn an_arena_is_used_for_its_number_of_steps() {
         assert_eq!(changes(&rules(Walls::default(), 0), 3, 2), [true; 3]);
         assert_eq!(changes(&rules(Walls::default(), 5), 6, 2), [false, false, true, false, false, true]);
     }
 
     #[test]
-    fn arenas_of_gaps_are_laid_out_alike_so_that_a_simulation_moves_from_one_to_the_next() {
+    fn all_arenas_of_gaps_have_one_memory_layout() {
         let (rules, mut random) = (rules(Gaps::default(), 0), Pcg64::seed_from_u64(1));
         let mut stage = rules.stage(&mut random).unwrap();
         for _ in 0..10 {
@@ -175,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn hidden_boxes_change_nothing() {
+    fn spare_boxes_do_not_change_the_physics() {
         let config = Gaps::default();
         let extent = Extent { length: 30.0, width: 10.0 };
         let one = crate::arenas::corridor::platform(0, 6.0, 2.0, extent);

@@ -1,12 +1,12 @@
-//! What of a pose the task compares, by forward kinematics.
+//! Features of a pose, by forward kinematics: what the tracking task compares.
 
+use comic_clips::spatial::{into_frame, subtract};
 use comic_clips::{Features, Motion};
 
+use super::walker::Walker;
 use crate::physics::Data;
-use crate::quaternion::{difference, into_frame};
-use crate::walker::Walker;
 
-/// Puts the humanoid into frame `index` of `motion`, kinematics only.
+/// Puts the humanoid into frame `index` of `motion`. Only the kinematics are computed.
 pub(crate) fn pose(data: &mut Data, motion: &Motion, index: usize) {
     let qpos = data.qpos_mut();
     qpos[..3].copy_from_slice(&motion.position[index]);
@@ -33,13 +33,13 @@ pub(crate) fn features(walker: &Walker, data: &mut Data, motion: &Motion) -> Fea
     features
 }
 
-/// rradius, lradius, rfoot, lfoot, head relative to the root, m, in the root's frame.
+/// Positions of rradius, lradius, rfoot, lfoot, head relative to the root, m, in the root's frame.
 pub(crate) fn appendages(walker: &Walker, data: &Data) -> [f64; 15] {
     let (positions, root) = (data.xpos(), walker.root);
     let rotation = &data.xmat()[root];
     let mut all = [0.0; 15];
     for (place, body) in all.as_chunks_mut::<3>().0.iter_mut().zip(walker.appendages) {
-        *place = into_frame(rotation, difference(&positions[body], &positions[root]));
+        *place = into_frame(rotation, subtract(positions[body], positions[root]));
     }
     all
 }
@@ -60,7 +60,7 @@ mod tests {
         a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
     }
 
-    /// Clip for clip, the features that a file has against the ones its motion gives.
+    /// Compares the features in a file with those of its motion, clip by clip.
     fn assert_kinematics_give_the_files_features(path: &Path) {
         let model = humanoid::build(WalkerModel::Cmu2020).unwrap();
         let walker = Walker::new(WalkerModel::Cmu2020, &model).unwrap();

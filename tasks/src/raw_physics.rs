@@ -1,26 +1,27 @@
-//! The physics without a task: what the environments' speed is measured against.
+//! The physics without a task. Benchmarks compare an environment's speed with it.
 
 use std::sync::Arc;
 
 use mujoco_rs::prelude::*;
 
-use crate::{Simulated, Simulation};
+use crate::environment::Simulated;
+use crate::physics::Simulation;
 
-/// `6 × mj_step` + `mj_forward` per control step on an environment's own model, and nothing else.
+/// A simulation of an environment's model that only steps: `6 × mj_step` and one `mj_forward` in a control step.
 #[derive(Debug, Default)]
-pub struct RawFloor {
+pub struct RawPhysics {
     data: Option<Simulation>,
 }
 
-/// A state from which the physics alone goes on.
+/// An environment's model and state, from which [`RawPhysics`] continues.
 #[derive(Clone, Debug)]
-pub struct FloorState {
+pub struct PhysicsState {
     model: Arc<MjModel>,
     qpos: Vec<f64>,
     qvel: Vec<f64>,
 }
 
-impl FloorState {
+impl PhysicsState {
     /// The state of an environment.
     pub fn of(environment: &dyn Simulated) -> Self {
         let simulation = environment.simulation();
@@ -28,11 +29,11 @@ impl FloorState {
     }
 }
 
-impl RawFloor {
-    /// `mj_resetData` and the state.
-    pub fn reset_to(&mut self, state: &FloorState) {
-        let entered = self.data.as_mut().is_some_and(|data| data.try_swap_model(Arc::clone(&state.model)).is_ok());
-        if !entered {
+impl RawPhysics {
+    /// Calls `mj_resetData` and sets the state.
+    pub fn reset_to(&mut self, state: &PhysicsState) {
+        let moved = self.data.as_mut().is_some_and(|data| data.try_swap_model(Arc::clone(&state.model)).is_ok());
+        if !moved {
             self.data = None;
         }
         let data = self.data.get_or_insert_with(|| Simulation::new(Arc::clone(&state.model)));
@@ -41,7 +42,7 @@ impl RawFloor {
         data.qvel_mut().copy_from_slice(&state.qvel);
     }
 
-    /// One control step of `substeps` physics steps; `action` as in [`Environment::step`](crate::Environment::step).
+    /// One control step of `substeps` physics steps; `action` is that of [`Environment::step`](crate::Environment::step).
     pub fn step(&mut self, action: &[f32], substeps: usize) {
         let Some(data) = &mut self.data else { return };
         for (place, value) in data.ctrl_mut().iter_mut().zip(action) {
@@ -53,7 +54,7 @@ impl RawFloor {
         data.forward();
     }
 
-    /// `mj_forward`: after [`RawFloor::reset_to`], the least that a reset costs.
+    /// Calls `mj_forward`. With [`RawPhysics::reset_to`] this is the smallest possible work of a reset.
     pub fn forward(&mut self) {
         if let Some(data) = &mut self.data {
             data.forward();

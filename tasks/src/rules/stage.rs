@@ -1,4 +1,4 @@
-//! What every task but tracking is played on: the V2020 humanoid in an arena, and who touches whom there.
+//! A simulation of the V2020 humanoid in an arena, for all tasks but tracking, and the contacts in it.
 
 use std::sync::Arc;
 
@@ -7,23 +7,23 @@ use mujoco_rs::prelude::*;
 
 use crate::arenas::corridor::GROUND;
 use crate::arenas::floor::BALL;
-use crate::error::Error;
-use crate::humanoid::{PREFIX, missing};
-use crate::observation::Body;
+use crate::error::{Error, missing};
+use crate::humanoid::PREFIX;
+use crate::humanoid::observation::Body;
+use crate::humanoid::walker::Walker;
 use crate::physics::{Data, Models};
-use crate::walker::Walker;
 
-/// Physics steps in a control step of 0.03 s (S).
+/// Physics steps in a control step (S: 0.03 s).
 pub(crate) const SUBSTEPS: usize = 6;
-/// Seconds of a control step.
+/// Length of a control step, s.
 pub(crate) const CONTROL_TIMESTEP: f64 = 0.03;
 
-/// What a geom is to the rules of the tasks.
+/// The kind of a geom, for the rules.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Part {
     /// The floor, or a platform.
     Ground,
-    /// A foot or its toes, which may touch the ground (`walkers/cmu_humanoid.py`, `ground_contact_geoms`).
+    /// A foot or its toes. They may touch the ground (`walkers/cmu_humanoid.py`, `ground_contact_geoms`).
     Foot,
     Head,
     Torso,
@@ -37,22 +37,25 @@ pub(crate) enum Part {
 }
 
 impl Part {
-    /// Whether it belongs to the humanoid and is no foot.
+    /// Whether it is a part of the humanoid other than a foot.
     pub(crate) fn is_body(self) -> bool {
-        matches!(self, Self::Head | Self::Torso | Self::LeftHand | Self::RightHand | Self::Body)
+        match self {
+            Self::Head | Self::Torso | Self::LeftHand | Self::RightHand | Self::Body => true,
+            Self::Ground | Self::Foot | Self::Ball | Self::Other => false,
+        }
     }
 }
 
-/// A compiled arena with the humanoid in it, shared by all simulations in it.
+/// A compiled arena with the humanoid. All simulations in this arena share it.
 #[derive(Debug)]
 pub(crate) struct Arena {
     pub(crate) models: Models,
     pub(crate) walker: Walker,
-    /// By geom.
+    /// The part of each geom.
     parts: Vec<Part>,
     /// Bodies of the left and the right hand.
     pub(crate) hands: [usize; 2],
-    /// Body of the ball, where there is one.
+    /// Body of the ball, if there is a ball.
     pub(crate) ball: Option<usize>,
 }
 
@@ -78,7 +81,7 @@ fn parts(model: &MjModel) -> Vec<Part> {
             Some("lhand" | "lfingers" | "lthumb") => Part::LeftHand,
             Some("rhand" | "rfingers" | "rthumb") => Part::RightHand,
             Some(_) => Part::Body,
-            // Every arena's first geom is the plane it stands on.
+            // The first geom of every arena is the ground plane.
             None if body == GROUND || geom == 0 => Part::Ground,
             None if body == BALL => Part::Ball,
             None => Part::Other,
@@ -100,7 +103,7 @@ impl Stage {
         Self { arena, data }
     }
 
-    /// Goes to another arena, keeping the simulation's memory where the two are laid out alike.
+    /// Moves the simulation to another arena. Arenas with the same memory layout share one allocation.
     pub(crate) fn enter(&mut self, arena: Arc<Arena>) {
         if !arena.models.take_over(&mut self.data) {
             self.data = arena.models.data();
@@ -108,7 +111,7 @@ impl Stage {
         self.arena = arena;
     }
 
-    /// Puts everything into this state and computes what follows from it, without servo forces.
+    /// Sets the state and computes everything that follows from it without servo forces.
     pub(crate) fn place(&mut self, qpos: &[f64], qvel: &[f64]) {
         self.arena.models.place(&mut self.data, qpos, qvel, None);
     }
@@ -117,7 +120,7 @@ impl Stage {
         self.arena.models.step(&mut self.data, control);
     }
 
-    /// What touches what at the end of the control step: both parts and the place, m.
+    /// The contacts at the end of the control step: both parts and the position, m.
     pub(crate) fn contacts(&self) -> impl Iterator<Item = (Part, Part, [f64; 3])> {
         let part = |geom: i32| usize::try_from(geom).ok().and_then(|geom| self.arena.parts.get(geom)).copied();
         self.data.contact().iter().filter_map(move |contact| {
@@ -126,7 +129,7 @@ impl Stage {
         })
     }
 
-    /// Contacts between the ground and a part of the humanoid that is no foot.
+    /// Positions of the contacts between the ground and a part of the humanoid other than a foot.
     pub(crate) fn falls(&self) -> impl Iterator<Item = [f64; 3]> {
         self.contacts().filter_map(|(one, other, place)| {
             let falls = (one == Part::Ground && other.is_body()) || (other == Part::Ground && one.is_body());
@@ -134,12 +137,12 @@ impl Stage {
         })
     }
 
-    /// Whether there is one.
+    /// Whether there is such a contact.
     pub(crate) fn has_fallen(&self) -> bool {
         self.falls().next().is_some()
     }
 
-    /// The humanoid, to observe.
+    /// The humanoid, for observations.
     pub(crate) fn body(&self) -> Body<'_> {
         Body { walker: &self.arena.walker, data: &self.data }
     }

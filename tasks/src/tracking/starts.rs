@@ -1,32 +1,21 @@
-//! Where episodes start (`tracking.py`: `_get_possible_starts`, `_get_clip_to_track`).
-
-use std::ops::Range;
+//! The start frames of the clips (`tracking.py`: `_get_possible_starts`, `_get_clip_to_track`).
 
 use comic_clips::Entry;
 use rand::Rng;
 
-/// The starts of one clip.
-#[derive(Clone, Debug, PartialEq)]
-pub struct ClipStarts {
-    /// Index of the clip.
-    pub clip: usize,
-    /// Frames that may be drawn, each as likely as any other, counted from the clip's own first frame.
-    pub frames: Range<usize>,
-    /// Probability that a draw is one of them.
-    pub probability: f64,
-}
+use crate::environment::ClipStarts;
 
-/// All starts: every frame of every clip has its clip's weight.
+/// All start frames. Each has the weight of its clip.
 #[derive(Debug)]
-pub(crate) struct Starts {
+pub(super) struct Starts {
     clips: Vec<ClipStarts>,
     /// Sums of probabilities up to and including each clip.
     cumulative: Vec<f64>,
 }
 
 impl Starts {
-    /// `None` when nothing can be drawn.
-    pub(crate) fn new(
+    /// `None` when no frame has a weight above 0.
+    pub(super) fn new(
         entries: &[Entry],
         look_ahead: usize,
         min_steps: usize,
@@ -60,16 +49,16 @@ impl Starts {
         Some(Self { clips, cumulative })
     }
 
-    pub(crate) fn clips(&self) -> &[ClipStarts] {
+    pub(super) fn clips(&self) -> &[ClipStarts] {
         &self.clips
     }
 
-    /// Draws a clip and a frame of it.
-    pub(crate) fn draw(&self, random: &mut impl Rng) -> (usize, usize) {
+    /// Draws a clip and one of its start frames.
+    pub(super) fn draw(&self, random: &mut impl Rng) -> (usize, usize) {
         let total = self.cumulative.last().copied().unwrap_or(1.0);
         let point = random.random::<f64>() * total;
         let index = self.cumulative.partition_point(|sum| *sum <= point);
-        // Rounding may carry the point to the end; a clip without weight is never the last resort.
+        // By rounding the point can be at the end. Then the last clip with a weight is drawn.
         let clip = self.clips.get(index).or_else(|| self.clips.iter().rev().find(|clip| clip.probability > 0.0));
         match clip {
             Some(clip) if !clip.frames.is_empty() => (clip.clip, random.random_range(clip.frames.clone())),
@@ -97,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn every_frame_that_can_last_has_its_clips_weight() {
+    fn every_start_frame_has_its_clips_weight() {
         // The same sub-ranges and weights as in dm_control's draws in the parity data.
         let starts = Starts::new(&four_clips(), 5, 10, false).unwrap();
         let frames: Vec<_> = starts.clips().iter().map(|clip| clip.frames.clone()).collect();
@@ -133,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn draws_follow_the_law() {
+    fn draws_have_the_probabilities_of_their_clips() {
         let starts = Starts::new(&four_clips(), 5, 10, false).unwrap();
         let mut random = Pcg64::seed_from_u64(7);
         let draws = 200_000;
@@ -155,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn at_the_clips_start_only_the_weight_counts() {
+    fn with_starts_at_first_frames_only_the_weight_counts() {
         let starts = Starts::new(&four_clips(), 5, 10, true).unwrap();
         let frames: Vec<_> = starts.clips().iter().map(|clip| clip.frames.clone()).collect();
         assert_eq!(frames, [0..1, 10..11, 0..1, 5..6]);
@@ -163,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn without_weight_there_is_nothing_to_draw() {
+    fn without_weight_there_are_no_starts() {
         assert!(Starts::new(&[entry(0, 120, 0.0)], 5, 10, false).is_none());
         assert!(Starts::new(&[], 5, 10, false).is_none());
     }

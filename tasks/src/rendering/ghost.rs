@@ -1,21 +1,21 @@
-//! The reference as a translucent humanoid.
+//! Draws the reference as a translucent humanoid.
 
 use std::str::FromStr;
 use std::sync::Arc;
 
 use mujoco_rs::prelude::*;
 
-use crate::Simulation;
+use crate::physics::Simulation;
 
 /// Red, green, blue and opacity of the ghost.
 const COLOUR: [f32; 4] = [0.35, 0.75, 1.0, 0.3];
-/// How far beside the humanoid it stands, m.
+/// Distance of the ghost from the humanoid in [`Ghost::Beside`], m.
 const ASIDE: f64 = 1.0;
 
-/// Where the reference is drawn.
+/// The place of the ghost, which shows the reference.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ghost {
-    /// Where it is: on the humanoid, as far as that follows it.
+    /// At the reference's own position: on the humanoid, if the humanoid follows the reference.
     On,
     /// A metre to the right in the picture.
     Beside,
@@ -28,32 +28,32 @@ impl FromStr for Ghost {
         match name {
             "on" => Ok(Self::On),
             "beside" => Ok(Self::Beside),
-            _ => Err(format!("no ghost `{name}`; it stands `on` the humanoid or `beside` it")),
+            _ => Err(format!("no ghost `{name}`; ghosts are `on` (on the humanoid) and `beside` (beside it)")),
         }
     }
 }
 
-/// A second simulation of the same model, tinted, that is put into poses and never steps.
+/// A second simulation of the same model in the ghost's colour. It is put into poses and never steps.
 #[derive(Debug)]
-pub(crate) struct Phantom {
+pub(crate) struct GhostBody {
     data: Simulation,
 }
 
-impl Phantom {
+impl GhostBody {
     pub(crate) fn new(model: &MjModel) -> Self {
         let mut tinted = model.clone();
         tinted.geom_rgba_mut().fill(COLOUR);
         Self { data: Simulation::new(Arc::new(tinted)) }
     }
 
-    /// The most parts that it is drawn with.
+    /// The largest number of drawn parts.
     pub(crate) fn parts(&self) -> u32 {
         self.data.model().geom_rgba().len() as u32
     }
 
-    /// Takes the pose of `reference` (generalised coordinates); `azimuth` (rad) is the direction in which it is looked
-    /// at. Coordinates that are none of this model's leave it where it is.
-    pub(crate) fn stand(&mut self, reference: &[f64], ghost: Ghost, azimuth: f64) {
+    /// Takes the pose `reference` (generalised coordinates). `azimuth` (rad) is the direction of the camera. Coordinates of
+    /// another model have no effect.
+    pub(crate) fn set_pose(&mut self, reference: &[f64], ghost: Ghost, azimuth: f64) {
         if reference.len() != self.data.qpos().len() {
             return;
         }
@@ -66,8 +66,8 @@ impl Phantom {
         self.data.forward();
     }
 
-    /// Fills `scene`, which adds to another one, with the parts that move: the floor is there once.
-    pub(crate) fn appear(&mut self, scene: &mut MjvScene, options: &MjvOption) {
+    /// Draws its moving parts into `scene`, which MuJoCo adds to another scene. The floor is already in the other scene.
+    pub(crate) fn draw(&mut self, scene: &mut MjvScene, options: &MjvOption) {
         let mut camera = MjvCamera::default();
         let parts = MjtCatBit::mjCAT_DYNAMIC as i32;
         scene.update_with_catmask(&mut self.data, options, &MjvPerturb::default(), &mut camera, parts);

@@ -1,23 +1,28 @@
-//! Recorded episodes of dm_control's go-to-target and corridors, replayed: the rules and the physics of training, with
-//! the draws taken from a record instead of a random number generator.
+//! Replays recorded episodes of dm_control's go-to-target and corridors. Rules and physics are those of training. Targets and
+//! obstacles come from the recording instead of a random number generator.
 
 use comic_experiment::{Corridor, GoToTarget, StartPose, Vision};
 use mujoco_rs::prelude::*;
 use rand_pcg::Pcg64;
 
+use super::corridor::{CorridorRules, Obstacles, START, State as CorridorState};
+use super::environment::RuledEnvironment;
+use super::go_to_target::{GoToTargetRules, State as GoToTargetState};
+use super::interface::Recorded;
+use super::poses::{Pose, Poses, UP};
 pub use crate::arenas::corridor::Block;
 use crate::arenas::corridor::{self, Extent};
-use crate::corridor::{CorridorRules, Memory as CorridorMemory, Obstacles, START};
+use crate::arenas::floor;
+use crate::environment::{Simulated, Step};
 use crate::error::Error;
-use crate::go_to_target::{GoToTargetRules, Memory as GoToTargetMemory};
-use crate::rules::{Recorded, RuledEnvironment};
-use crate::start::{Pose, Poses, UP};
-use crate::{Simulated, Simulation, Step, humanoid, vision};
+use crate::humanoid;
+use crate::physics::Simulation;
+use crate::rendering::vision;
 
-/// Named numbers.
+/// Names and values.
 type Named = Vec<(&'static str, Vec<f64>)>;
 
-/// An episode that goes as it was recorded.
+/// A replay of a recorded episode.
 #[derive(Debug)]
 pub struct Replay(Box<dyn Replayed>);
 
@@ -30,12 +35,12 @@ trait Replayed: Simulated {
 impl<R: Recorded> Replayed for RuledEnvironment<R> {
     fn dictionary(&self) -> Named {
         let mut dictionary = self.stage().body().dictionary();
-        dictionary.extend(self.rules().observation(self.stage(), self.memory()));
+        dictionary.extend(self.rules().observation(self.stage(), self.state()));
         dictionary
     }
 
     fn quantities(&self) -> Named {
-        self.rules().quantities(self.stage(), self.memory())
+        self.rules().quantities(self.stage(), self.state())
     }
 
     fn as_environment(&self) -> &dyn Simulated {
@@ -49,10 +54,10 @@ impl Replay {
         self.0.step_control(control)
     }
 
-    /// What the humanoid sees, as dm_control draws it (`full`) or as training does; [`vision::IMAGE_BYTES`] bytes.
+    /// Draws the camera image as dm_control does (`full`) or as training does; [`vision::IMAGE_BYTES`] bytes.
     ///
     /// # Errors
-    /// [`Error::Graphics`] when there is nothing to draw with.
+    /// [`Error::Graphics`]: there is no OpenGL.
     pub fn draw(&mut self, full: bool, image: &mut [u8]) -> Result<(), Error> {
         let vision = if full { Vision::Full } else { Vision::Fast };
         vision::draw(vision, self.0.simulation_mut(), image)
@@ -63,7 +68,7 @@ impl Replay {
         self.0.dictionary()
     }
 
-    /// What the task knows beside its observations: targets, counters, velocities.
+    /// The task's quantities besides its observations: targets, counters, velocities.
     pub fn quantities(&self) -> Vec<(&'static str, Vec<f64>)> {
         self.0.quantities()
     }
@@ -83,52 +88,52 @@ impl Replay {
 /// other (m).
 ///
 /// # Errors
-/// When the arena cannot be built.
+/// The arena cannot be built.
 pub fn replay_go_to_target(spawn: [f64; 2], rotation: f64, targets: &[[f64; 2]]) -> Result<Replay, Error> {
     let config = GoToTarget { start_pose: StartPose::Upright, ..GoToTarget::default() };
     let rules = GoToTargetRules::new(&config, Poses::upright())?;
     let mut script: Vec<[f64; 2]> = targets.iter().rev().copied().collect();
-    let memory = GoToTargetMemory { target: script.pop().unwrap_or_default(), script, ..Default::default() };
+    let state = GoToTargetState { target: script.pop().unwrap_or_default(), script, ..Default::default() };
     let pose = Pose::upright().turned(UP, rotation).moved(spawn[0], spawn[1]);
-    Ok(Replay(Box::new(RuledEnvironment::at(rules, &pose, memory)?)))
+    Ok(Replay(Box::new(RuledEnvironment::at(rules, &pose, state)?)))
 }
 
-/// A corridor of this length and width (m) with these platforms, or, where there are none, these walls.
+/// Replays a corridor with this length and width (m). It has these platforms, or these walls if there are no platforms.
 ///
 /// # Errors
-/// When the arena cannot be built.
+/// The arena cannot be built.
 pub fn replay_corridor(length: f64, width: f64, platforms: &[Block], walls: &[Block]) -> Result<Replay, Error> {
-    let obstacles = Known { platforms: platforms.to_vec(), walls: walls.to_vec() };
+    let obstacles = RecordedObstacles { platforms: platforms.to_vec(), walls: walls.to_vec() };
     let config = Corridor { length, width, ..Corridor::default() };
     let rules = CorridorRules::new(&config, Poses::upright(), obstacles);
     let pose = Pose::upright().moved(START, 0.0);
-    Ok(Replay(Box::new(RuledEnvironment::at(rules, &pose, CorridorMemory::default())?)))
+    Ok(Replay(Box::new(RuledEnvironment::at(rules, &pose, CorridorState::default())?)))
 }
 
 /// The model of such a corridor.
 ///
 /// # Errors
-/// When the arena cannot be built.
+/// The arena cannot be built.
 pub fn corridor_model(length: f64, width: f64, platforms: &[Block], walls: &[Block]) -> Result<MjModel, Error> {
-    Known { platforms: platforms.to_vec(), walls: walls.to_vec() }.build(Extent { length, width })
+    RecordedObstacles { platforms: platforms.to_vec(), walls: walls.to_vec() }.build(Extent { length, width })
 }
 
 /// The model of go-to-target.
 ///
 /// # Errors
-/// When the arena cannot be built.
+/// The arena cannot be built.
 pub fn go_to_target_model() -> Result<MjModel, Error> {
-    humanoid::build_in(crate::arenas::floor::with_target)
+    humanoid::build_in(floor::with_target)
 }
 
-/// Obstacles that are not drawn.
+/// Recorded obstacles.
 #[derive(Debug)]
-struct Known {
+struct RecordedObstacles {
     platforms: Vec<Block>,
     walls: Vec<Block>,
 }
 
-impl Known {
+impl RecordedObstacles {
     fn build(&self, extent: Extent) -> Result<MjModel, Error> {
         humanoid::build_in(|directory| {
             if self.platforms.is_empty() {
@@ -140,7 +145,7 @@ impl Known {
     }
 }
 
-impl Obstacles for Known {
+impl Obstacles for RecordedObstacles {
     fn draw(&self, extent: Extent, _: &mut Pcg64) -> Result<MjModel, Error> {
         self.build(extent)
     }
