@@ -14,19 +14,17 @@
 //! - [`quarantine`] keeps unrolls that were refused, for whoever looks into it.
 //! - [`security`] is who may talk to it; [`certs`] makes certificates for trying that out.
 //! - [`status`] and [`health`] are commands that ask another learner how it is.
-//! - [`sizes`] counts parameters, [`memory`] the bytes that buffers can take; [`bench`] times the update, [`load`] the
-//!   service.
+//! - [`sizes`] counts parameters, [`memory`] the bytes that buffers can take.
 //!
 //! There is no MuJoCo here: whatever needs a simulator is done by actors.
 
 pub mod adam;
 pub mod algorithm;
-pub mod bench;
 pub mod checkpoint;
 pub mod commands;
 pub mod device;
+pub mod document;
 pub mod error;
-pub mod load;
 mod log_limiter;
 pub mod observe;
 pub mod options;

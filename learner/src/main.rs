@@ -4,7 +4,6 @@ use std::io::{IsTerminal as _, Write as _};
 use std::process::ExitCode;
 
 use clap::Parser as _;
-use comic_learner::bench::Subject;
 use comic_learner::commands;
 use comic_learner::error::{Error, Result};
 use comic_learner::options::{Command, LogFormat, Options};
@@ -43,11 +42,6 @@ fn main() -> ExitCode {
 
 fn run(options: &Options) -> Result<()> {
     match &options.command {
-        Some(Command::Bench { threads, repeats, low_level, joint }) => {
-            let subject = if *joint { Subject::Joint } else { Subject::LowLevel(*low_level) };
-            let device = options.document.device.unwrap_or_default();
-            Ok(comic_learner::bench::run(*threads, *repeats, subject, device)?)
-        }
         Some(Command::Export { checkpoint, part, out }) => commands::export::run(checkpoint, *part, out),
         Some(Command::Sizes) => {
             let table = commands::sizes::table(&options.document)?;
@@ -57,7 +51,6 @@ fn run(options: &Options) -> Result<()> {
         Some(Command::Status(status)) => status.run(),
         Some(Command::Health(_)) => Ok(()),
         Some(Command::Certs(certs)) => certs.run(),
-        Some(Command::Load(load)) => Ok(load.run()?),
         Some(Command::Metrics) => Ok(comic_learner::observe::telemetry::print_reference()?),
         None => comic_learner::run::run(options),
     }

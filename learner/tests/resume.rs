@@ -11,10 +11,11 @@ use comic_experiment::{Experiment, TaskSpec, resolve};
 use comic_learner::checkpoint::{Snapshot, Store, find, read};
 use comic_learner::device::Backend;
 use comic_learner::observe::evaluation::Evaluation;
+use comic_learner::observe::probes::Probed as _;
 use comic_learner::publish::{Published, Publisher};
 use comic_learner::security::{ConnectionLimits, Security};
-use comic_learner::service::quarantine::QuarantineOptions;
-use comic_learner::service::{self, Shared};
+use comic_learner::service::quarantine::QuarantineArguments;
+use comic_learner::service::{self, Service};
 use comic_learner::train::trainer::{Ending, Setup, Trainer};
 use comic_proto::v1::{Behaviour, UnrollHeader};
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
@@ -138,7 +139,7 @@ fn live_evaluated(
     let config = Config { unrolls: experiment.unroll.batch, max_staleness: 1000, ahead: 1, order: BatchOrder::Arrival };
     let batcher = Batcher::new(layout.clone(), config, Phase::begin(epoch), ledger);
     let publisher = Publisher::new(epoch);
-    let shared = Shared::new(service::Setup {
+    let service = Service::new(service::Setup {
         run: run.to_path_buf(),
         id: store.run().unwrap(),
         security: Security::default(),
@@ -148,10 +149,10 @@ fn live_evaluated(
         assets: Vec::new(),
         batcher: batcher.clone(),
         publisher: publisher.clone(),
-        quarantine: QuarantineOptions::default(),
+        quarantine: QuarantineArguments::default(),
     })
     .unwrap();
-    assert!(evaluations.iter().all(|evaluation| shared.keep_evaluation(evaluation.clone())));
+    assert!(evaluations.iter().all(|evaluation| service.evaluations().add(evaluation.clone())));
     let pose = vec![0.1; spec.action];
     let run = run.to_path_buf();
     let joined = batcher.join(INCARNATION, None).unwrap();
@@ -193,12 +194,12 @@ fn live_evaluated(
         resume,
         batcher: batcher.clone(),
         publisher: publisher.clone(),
-        shared: shared.clone(),
+        service: service.trainer(),
     };
     let ended = Trainer::new(setup).unwrap().run();
     batcher.close();
     feeder.join().unwrap();
-    Epoch { ended, published: publisher.newest().unwrap(), telemetry: shared.metrics_page() }
+    Epoch { ended, published: publisher.newest().unwrap(), telemetry: service.probed().metrics_page() }
 }
 
 /// The last checkpoint after so many updates of a preset. The feeder gives exactly the unrolls that they need, so that the

@@ -8,7 +8,7 @@ use comic_experiment::Experiment;
 use comic_learner::algorithm::Algorithm as _;
 use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::vmpo::VmpoLearner;
-use comic_networks::{Memory, NormaliserStatistics, Routing};
+use comic_networks::{NormaliserStatistics, RecurrentState, Routing};
 use tch::{Device, Tensor};
 use vmpo_support::{LENGTH, Numbers, Unrolls, difference, every_low_level, joint_spec, learner_of, state};
 
@@ -62,7 +62,7 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
             let (proprioception, task) = (at(&unrolls.proprioception, LENGTH + 1, t), at(&unrolls.task, LENGTH + 1, t));
             let routing = Routing::grouped(&TASKS, 2);
             let observation = learner.policy().normalise(&proprioception, &task, None, &routing);
-            let memory = Memory { state: &remembered, first: None };
+            let memory = RecurrentState { state: &remembered, first: None };
             learner.policy().act(&observation, &previous, &at(&unrolls.latent_noise, LENGTH, t), memory)
         });
         let (mean, std, log_weights) = acting.action.to_rows();

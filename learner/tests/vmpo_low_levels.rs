@@ -9,7 +9,7 @@ use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives};
 use comic_learner::algorithm::Algorithm as _;
 use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::vmpo::VmpoLearner;
-use comic_networks::{Memory, Routing};
+use comic_networks::{RecurrentState, Routing};
 use tch::{Device, Kind, Tensor};
 use vmpo_support::{LENGTH, Numbers, Unrolls, assert_close, difference, experiment, learner};
 
@@ -83,7 +83,7 @@ fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
                 None,
                 &Routing::single(),
             );
-            let memory = Memory { state: &remembered, first: None };
+            let memory = RecurrentState { state: &remembered, first: None };
             learner.policy().act(&observation, &previous, &rows(&unrolls.latent_noise, LENGTH, t), memory)
         });
         let (mean, std, log_weights) = acting.action.to_rows();
@@ -222,7 +222,7 @@ fn a_policy_never_looks_across_an_episodes_beginning() {
             let first = tensor(&unrolls.first, LENGTH + 1).squeeze_dim(-1).narrow(1, 0, LENGTH as i64);
             let previous = tensor(&unrolls.previous_latent, LENGTH);
             let noise = tensor(&unrolls.latent_noise, LENGTH);
-            let memory = Memory { state: &state, first: Some(&first) };
+            let memory = RecurrentState { state: &state, first: Some(&first) };
             learner.policy().act(&observation, &previous, &noise, memory).action.mean()
         };
         let change = (means(&base) - means(&other)).abs().amax([-1], false);
@@ -241,7 +241,7 @@ fn primitives_never_see_the_reference() {
             let reference = zeros(4).set_requires_grad(true);
             let observation = learner.policy().normalise(&zeros(5), &reference, None, &Routing::single());
             let latent = experiment.network.latent.size as i64;
-            let memory = Memory { state: &zeros(0), first: None };
+            let memory = RecurrentState { state: &zeros(0), first: None };
             let acting = learner.policy().act(&observation, &zeros(latent), &zeros(latent), memory);
             let total = acting.action.mean().square().sum(Kind::Float) + acting.action.std().sum(Kind::Float);
             Tensor::run_backward(&[total], &[&reference], false, false)

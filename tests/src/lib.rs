@@ -5,6 +5,7 @@
 //! - [`compose`] runs a learner and actors in containers.
 //! - [`kubernetes`] renders the manifests and reads them.
 //! - [`lockstep`] is runs of which the seed decides every parameter.
+//! - [`modules`] finds circles among the modules of a crate.
 //! - [`process`] is one program that runs.
 //! - [`relay`] is a slow way to the learner.
 //! - [`repository`] looks at the workspace's own files and dependencies.
@@ -16,6 +17,7 @@ pub mod certificates;
 pub mod compose;
 pub mod kubernetes;
 pub mod lockstep;
+pub mod modules;
 pub mod process;
 pub mod relay;
 pub mod repository;

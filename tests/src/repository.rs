@@ -8,19 +8,15 @@ use std::process::Command;
 use anyhow::{Context, Result, bail};
 
 /// The crates' folders, as the root manifest lists them.
-pub const FOLDERS: [&str; 11] = [
-    "experiment",
-    "proto",
-    "clips",
-    "tasks",
-    "networks",
-    "replay",
-    "actor",
-    "learner",
-    "tests",
-    "deploy/setup",
-    "deploy/xtask",
-];
+///
+/// # Errors
+/// A manifest that cannot be read.
+pub fn folders() -> Result<Vec<String>> {
+    let manifest: toml::Table = fs::read_to_string(root().join("Cargo.toml"))?.parse()?;
+    let members = manifest.get("workspace").and_then(|workspace| workspace.get("members")?.as_array());
+    let members = members.context("Cargo.toml lists no members")?;
+    Ok(members.iter().filter_map(|member| member.as_str().map(str::to_owned)).collect())
+}
 
 /// The repository's root.
 pub fn root() -> PathBuf {
@@ -43,9 +39,10 @@ pub struct Source {
 pub fn sources() -> Result<Vec<Source>> {
     let root = root();
     let mut found = Vec::new();
-    for folder in FOLDERS {
+    for folder in folders()? {
         collect(&root, &root.join(folder), &mut found)?;
     }
+    found.sort_by(|a, b| a.path.cmp(&b.path));
     Ok(found)
 }
 

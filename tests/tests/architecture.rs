@@ -1,7 +1,8 @@
 //! The invariants of ARCHITECTURE.md that can be read off the repository itself.
 
 use anyhow::{Result, ensure};
-use comic_tests::repository::{FOLDERS, Source, dependencies, direct_dependencies, root, sources};
+use comic_tests::modules::circles;
+use comic_tests::repository::{Source, dependencies, direct_dependencies, folders, root, sources};
 
 const MUJOCO: [&str; 2] = ["mujoco-rs", "mujoco-sys"];
 const LIBTORCH: [&str; 2] = ["tch", "torch-sys"];
@@ -59,6 +60,34 @@ fn set_up_needs_nothing_of_what_it_sets_up() -> Result<()> {
     knows_nothing_of("xtask", &[&MUJOCO, &LIBTORCH, &GRPC])
 }
 
+/// A module and the modules inside it may need each other. With `--no-capture` this lists every circle in full.
+#[test]
+fn no_modules_import_each_other_in_a_circle() -> Result<()> {
+    let sources = sources()?;
+    let files = sources.iter().map(|source| (source.path.as_str(), source.text.as_str())).collect();
+    let mut found = Vec::new();
+    for root in sources.iter().filter(|source| is_crate_root(&source.path)) {
+        for circle in circles(&root.path, &files)? {
+            println!("{}: {circle}all of them:", root.path);
+            circle.edges.iter().for_each(|(from, to, place)| println!("  {from} -> {to} ({place})"));
+            found.push(format!("{}: {circle}", root.path));
+        }
+    }
+    ensure!(found.is_empty(), "{} circles\n{}", found.len(), found.join("\n"));
+    Ok(())
+}
+
+/// A library, a program, a test or a benchmark.
+fn is_crate_root(path: &str) -> bool {
+    let Some((folder, file)) = path.rsplit_once('/') else { return false };
+    let folder = folder.rsplit('/').next().unwrap_or_default();
+    match folder {
+        "src" => ["lib.rs", "main.rs"].contains(&file),
+        "bin" | "tests" | "benches" | "examples" | "targets" => true,
+        _ => file == "main.rs",
+    }
+}
+
 /// Files in which `holds` finds a line, as `path:line`.
 fn places(sources: &[Source], holds: impl Fn(&str) -> bool) -> Vec<String> {
     let lines = sources
@@ -67,13 +96,11 @@ fn places(sources: &[Source], holds: impl Fn(&str) -> bool) -> Vec<String> {
     lines.filter(|(_, _, line)| holds(line)).map(|(source, number, _)| format!("{}:{number}", source.path)).collect()
 }
 
-/// Benchmarks name their subject; whatever acts or learns takes the low level as it comes.
 #[test]
 fn neither_actor_nor_learner_asks_which_low_level_acts() -> Result<()> {
     let mut sources = sources()?;
     sources.retain(|source| ["actor/src/", "learner/src/"].iter().any(|crate_| source.path.starts_with(crate_)));
     ensure!(!sources.is_empty(), "the crates are not where this test looks for them");
-    sources.retain(|source| !source.path.contains("/bench"));
     let found = places(&sources, |line| line.contains(concat!("LowLevel", "Name::")) || line.contains(".low_level"));
     let found: Vec<_> = found.into_iter().filter(|place| !place.starts_with("learner/src/options.rs")).collect();
     ensure!(found.is_empty(), "{found:?}");
@@ -106,9 +133,7 @@ fn files_are_renamed_durably() -> Result<()> {
     let found = places(&sources()?, |line| line.contains(concat!("fs::", "rename(")));
     let others: Vec<_> = found
         .iter()
-        .filter(|place| {
-            !["learner/src/checkpoint", "deploy/setup/src/extract.rs"].iter().any(|at| place.starts_with(at))
-        })
+        .filter(|place| !["learner/src/checkpoint", "setup/src/extract.rs"].iter().any(|at| place.starts_with(at)))
         .collect();
     ensure!(others.is_empty(), "renames elsewhere: {others:?}");
     Ok(())
@@ -138,8 +163,8 @@ fn a_file_is_one_concept_long() -> Result<()> {
 
 #[test]
 fn every_crate_keeps_the_workspaces_lints() -> Result<()> {
-    for folder in FOLDERS {
-        let manifest = std::fs::read_to_string(root().join(folder).join("Cargo.toml"))?;
+    for folder in folders()? {
+        let manifest = std::fs::read_to_string(root().join(&folder).join("Cargo.toml"))?;
         let inherited = manifest.contains("[lints]\nworkspace = true");
         // Where unsafe code cannot be done without, a crate has its own copy, in which it is denied, not forbidden.
         let copied =

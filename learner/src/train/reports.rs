@@ -15,14 +15,14 @@ use crate::checkpoint::progress::Progress;
 use crate::error::Result;
 use crate::observe::metrics::{Metrics, Position};
 use crate::observe::telemetry::Telemetry;
-use crate::service::Shared;
+use crate::service::TrainerHandle;
 
 /// Counters, metric lines, and evaluations that came in.
 #[derive(Debug)]
 pub(super) struct Reports {
     metrics: Metrics,
-    /// Takes the newest metrics, and has the evaluations that actors reported.
-    shared: Arc<Shared>,
+    /// Shows the newest metrics, and collects the evaluations that actors report.
+    service: TrainerHandle,
     telemetry: Arc<Telemetry>,
     /// Seconds between two lines.
     interval: f64,
@@ -38,11 +38,11 @@ impl Reports {
     ///
     /// # Errors
     /// When their file cannot be opened.
-    pub(super) fn open(run: &Path, spec: &TaskSpec, learner: &Learner, shared: Arc<Shared>) -> Result<Self> {
+    pub(super) fn open(run: &Path, spec: &TaskSpec, learner: &Learner, service: TrainerHandle) -> Result<Self> {
         Ok(Self {
             metrics: Metrics::open(run, spec)?,
-            telemetry: Arc::clone(&shared.telemetry),
-            shared,
+            telemetry: service.telemetry.clone(),
+            service,
             interval: learner.metrics_seconds,
             tasks: spec.tasks.iter().map(|task| task.name.clone()).collect(),
             losses: Map::new(),
@@ -133,7 +133,7 @@ impl Reports {
 
     /// Writes the evaluations that actors reported since the last time, and returns what they say of checkpoints.
     pub(super) fn take_evaluations(&self) -> Vec<Evaluated> {
-        let evaluations = self.shared.take_evaluations();
+        let evaluations = self.service.take_evaluations();
         evaluations.iter().for_each(|evaluation| self.metrics.keep_evaluation(evaluation));
         evaluations.iter().filter_map(|evaluation| evaluation.evaluated()).collect()
     }
@@ -156,6 +156,6 @@ impl Reports {
         };
         let line = self.metrics.write(position, accounting, self.losses.clone());
         tracing::info!(target: "metrics", "{line}");
-        self.shared.set_metrics(line);
+        self.service.set_metrics(line);
     }
 }

@@ -1,7 +1,6 @@
 //! The trainer: one OS thread that owns the device. Batches in, parameters out.
 
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use comic_experiment::{Experiment, TaskSpec};
@@ -14,7 +13,7 @@ use crate::checkpoint::{Name, Snapshot, incompatible};
 use crate::device::Backend;
 use crate::error::{Error, Result};
 use crate::publish::Publisher;
-use crate::service::Shared;
+use crate::service::TrainerHandle;
 use crate::service::memory::{Bounds, Sizes};
 use crate::train::budget::BudgetClock;
 use crate::train::checkpoints::Checkpoints;
@@ -52,7 +51,7 @@ pub struct Setup {
     /// Where parameters are published.
     pub publisher: Publisher,
     /// The service, which shows the newest metrics and collects evaluations.
-    pub shared: Arc<Shared>,
+    pub service: TrainerHandle,
 }
 
 /// Why training ended.
@@ -85,19 +84,19 @@ impl Trainer {
     /// # Errors
     /// A checkpoint that does not fit the experiment; a disk that refuses.
     pub fn new(setup: Setup) -> Result<Self> {
-        let Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, shared } = setup;
+        let Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, service } = setup;
         backend.train_here()?;
-        let mut state = State::new(&experiment, &spec, &pose, backend.device(), shared.id(), epoch)?;
+        let mut state = State::new(&experiment, &spec, &pose, backend.device(), service.id(), epoch)?;
         if let Some(snapshot) = &resume {
-            state.restore(snapshot, shared.id(), epoch).map_err(|error| incompatible(&run, error))?;
+            state.restore(snapshot, service.id(), epoch).map_err(|error| incompatible(&run, error))?;
         }
-        let mut reports = Reports::open(&run, &spec, &experiment.learner, shared.clone())?;
+        let mut reports = Reports::open(&run, &spec, &experiment.learner, service.clone())?;
         reports.begin(&state.progress, batcher.accounting_by_task());
         let mut trainer = Self {
             skipped_steps: SkippedSteps::new(experiment.learner.restore_after),
             budget: BudgetClock::new(experiment.budget.clone(), state.progress.seconds),
             versions: Versions::new(batcher.clone(), publisher, experiment.unroll.lockstep),
-            checkpoints: Checkpoints::start(&run, &experiment.learner, shared.telemetry.clone())?,
+            checkpoints: Checkpoints::start(&run, &experiment.learner, service.telemetry.clone())?,
             experiment,
             spec,
             backend,
@@ -109,7 +108,7 @@ impl Trainer {
             Some(snapshot) => trainer.checkpoints.set_good(snapshot),
             None => trainer.write_checkpoint_if_sound(Name::Initial)?,
         }
-        tracing::info!("buffers take {}", trainer.memory(&shared));
+        tracing::info!("buffers take {}", trainer.memory(&service));
         Ok(trainer)
     }
 
@@ -425,12 +424,12 @@ impl Trainer {
     }
 
     /// How much memory the learner's buffers can take, now that every size is known.
-    fn memory(&self, shared: &Shared) -> Bounds {
+    fn memory(&self, service: &TrainerHandle) -> Bounds {
         Bounds::new(&Sizes {
             ahead: self.experiment.unroll.ahead,
             batch: self.experiment.unroll.batch,
             unroll: self.batcher.layout().size(),
-            ingest: shared.ingest(),
+            ingest: service.ingest(),
             parameters: self.state.target.len(),
             snapshot: self.checkpoints.good().parts.values().map(Vec::len).sum(),
         })

@@ -1,7 +1,7 @@
 //! Networks, multipliers and optimiser, stepped together.
 
 use comic_experiment::{Experiment, Prior, TaskSpec};
-use comic_networks::{Acting, ActionDistribution, Memory, NormaliserStatistics, Policy, Value, to_safetensors};
+use comic_networks::{Acting, ActionDistribution, NormaliserStatistics, Policy, RecurrentState, Value, to_safetensors};
 use comic_proto::{Field, UnrollShape};
 use tch::{Device, Kind, Tensor, nn};
 
@@ -182,7 +182,7 @@ impl VmpoLearner {
             &observation.first_steps(length),
             previous_latent,
             &minibatch[Field::LatentNoise],
-            Memory { state: &minibatch[Field::State], first: Some(&first) },
+            RecurrentState { state: &minibatch[Field::State], first: Some(&first) },
         );
         let (reward, discount) = (&minibatch[Field::Reward], &minibatch[Field::Discount]);
         let targets = returns(reward, discount, valid, &values, vmpo.discount, vmpo.lambda);

@@ -6,7 +6,7 @@ use comic_learner::algorithm::Algorithm as _;
 use comic_learner::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
 use comic_learner::algorithm::shape::MinibatchShape;
 use comic_learner::vmpo::VmpoLearner;
-use comic_networks::{Acting, Memory, Routing};
+use comic_networks::{Acting, RecurrentState, Routing};
 use comic_proto::{Field, PerField, UnrollShape};
 use tch::{Device, Kind, Tensor};
 
@@ -278,7 +278,7 @@ impl Unrolls {
             let acting = tch::no_grad(|| {
                 let state = s.narrow(1, 0, 0);
                 let observation = learner.policy().normalise(&s, &x, None, &Routing::single());
-                learner.policy().act(&observation, &z, &noise, Memory { state: &state, first: None })
+                learner.policy().act(&observation, &z, &noise, RecurrentState { state: &state, first: None })
             });
             means.extend(values(&acting.action.mean()));
             stds.extend(values(&acting.action.std()));
@@ -314,7 +314,7 @@ impl Unrolls {
             let (proprioception, task) = (steps(&self.proprioception, LENGTH + 1), steps(&self.task, LENGTH + 1));
             let observation = learner.policy().normalise(&proprioception, &task, None, routing);
             let (previous, noise) = (steps(&self.previous_latent, LENGTH), steps(&self.latent_noise, LENGTH));
-            let memory = Memory { state: &before, first: Some(&begins) };
+            let memory = RecurrentState { state: &before, first: Some(&begins) };
             learner.policy().act(&observation, &previous, &noise, memory)
         })
     }
