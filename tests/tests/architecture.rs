@@ -157,6 +157,36 @@ fn no_test_is_ignored_and_nothing_is_left_for_later() -> Result<()> {
     Ok(())
 }
 
+/// A test without what it needs fails, and `cargo xtask test` says which tests it leaves out: a test that returns early
+/// would count as passed. Files outside the repository are not needed at all.
+#[test]
+fn no_test_passes_without_running() -> Result<()> {
+    let signs = [concat!("\"", "skipped"), concat!("../", "shared"), concat!("\"", "shared\"")];
+    let found = places(&sources()?, |line| signs.iter().any(|sign| line.contains(sign)));
+    ensure!(found.is_empty(), "{found:?}");
+    let early: Vec<_> = sources()?.iter().flat_map(early_returns).collect();
+    ensure!(early.is_empty(), "tests that return before their end: {early:?}");
+    Ok(())
+}
+
+/// The tests of a file that return without a value, as `path: name`.
+fn early_returns(source: &Source) -> Vec<String> {
+    let mut found = Vec::new();
+    let mut lines = source.text.lines();
+    while let Some(line) = lines.next() {
+        if !["#[test]", "#[tokio::test"].iter().any(|sign| line.trim_start().starts_with(sign)) {
+            continue;
+        }
+        let Some(head) = lines.find(|line| line.contains("fn ")) else { break };
+        let end = format!("{}}}", &head[..head.len() - head.trim_start().len()]);
+        let mut body = lines.by_ref().take_while(|line| *line != end);
+        if body.any(|line| line.trim() == "return;" || line.contains("else { return };")) {
+            found.push(format!("{}: {}", source.path, head.trim()));
+        }
+    }
+    found
+}
+
 #[test]
 fn a_file_is_one_concept_long() -> Result<()> {
     let long = sources()?.into_iter().map(|source| (source.text.lines().count(), source.path));

@@ -25,7 +25,7 @@ const DISK: u64 = 64 << 20;
 const REFUSED: &str = "checkpoint not written";
 
 #[tokio::test]
-async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
+async fn on_a_full_disk_only_checkpoints_are_lost() -> Result<()> {
     // Without it nobody could read what is written below, whatever it is.
     python()?;
     let mut system = System::new(&[&SMALL[..], &["--metrics-port", "0"]].concat())?;
@@ -57,7 +57,7 @@ async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
 }
 
 #[tokio::test]
-async fn a_full_disk_changes_nothing_that_is_learnt() -> Result<()> {
+async fn on_a_full_disk_the_parameters_are_the_same() -> Result<()> {
     let mut system = lockstep(&[])?;
     system.disk = Some(DISK);
     system.start_learner(LIMIT).await?;
