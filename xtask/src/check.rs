@@ -22,13 +22,11 @@ pub(crate) struct TestOptions {
 
 /// Tests that not every machine can run.
 struct Demanding {
-    /// A file in `tests/tests`.
-    binary: &'static str,
-    /// What all of its tests' names begin with.
+    /// The prefix of the names of these tests, and of no others.
     prefix: &'static str,
-    /// What they do, and what that takes.
+    /// What they do, and what that needs.
     what: &'static str,
-    /// Whether it is there.
+    /// Whether this machine has it.
     possible: bool,
 }
 
@@ -56,12 +54,12 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
     command.args(["--release", "--workspace"]).args(&options.arguments);
     let mut left_out = demanding(options);
     left_out.retain(|tests| !tests.possible);
-    for Demanding { binary, what, .. } in &left_out {
-        eprintln!("NOT RUN: tests/tests/{binary}.rs, which {what}");
+    for Demanding { prefix, what, .. } in &left_out {
+        eprintln!("NOT RUN: the tests {prefix}…, which {what}");
     }
     if nextest && !left_out.is_empty() {
-        let binaries: Vec<_> = left_out.iter().map(|tests| format!("not binary({})", tests.binary)).collect();
-        command.args(["--filterset", &binaries.join(" and ")]);
+        let names: Vec<_> = left_out.iter().map(|tests| format!("not test(/(^|::){}/)", tests.prefix)).collect();
+        command.args(["--filterset", &names.join(" and ")]);
     } else if !left_out.is_empty() {
         command.arg("--").args(left_out.iter().map(|tests| format!("--skip={}", tests.prefix)));
     }
@@ -92,28 +90,29 @@ fn test_xla(arguments: &[String]) -> Result<()> {
 fn demanding(options: &TestOptions) -> Vec<Demanding> {
     vec![
         Demanding {
-            binary: "partition",
-            prefix: "a_network_that",
-            what: "cuts networks: that takes root and iproute2",
+            prefix: "a_network_that_",
+            what: "cut networks: that takes root and iproute2",
             possible: makes_hosts(),
         },
         Demanding {
-            binary: "disk_full",
-            prefix: "a_full_disk",
-            what: "fills a disk of its own: that takes root and util-linux",
+            prefix: "opengl_",
+            what: "draw: that takes OpenGL, for instance Debian's libegl1 and libgl1-mesa-dri",
+            possible: draws(),
+        },
+        Demanding {
+            prefix: "on_a_full_disk_",
+            what: "fill a disk of its own: that takes root and util-linux",
             // A disk that this process alone sees.
             possible: answers("unshare", &["--mount", "mount", "-t", "tmpfs", "tmpfs", "/mnt"]),
         },
         Demanding {
-            binary: "compose",
             prefix: "containers_",
-            what: "runs the images: that takes `cargo xtask test --docker`",
+            what: "run the images: that takes `cargo xtask test --docker`",
             possible: options.docker,
         },
         Demanding {
-            binary: "kustomize",
             prefix: "kustomize_",
-            what: "renders the Kubernetes manifests a second time: that takes kustomize or kubectl",
+            what: "render the Kubernetes manifests a second time: that takes kustomize or kubectl",
             possible: answers("kustomize", &["version"]) || answers("kubectl", &["version", "--client"]),
         },
     ]
@@ -122,6 +121,16 @@ fn demanding(options: &TestOptions) -> Vec<Demanding> {
 fn answers(program: &str, arguments: &[&str]) -> bool {
     let asked = Command::new(program).args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).status();
     asked.is_ok_and(|status| status.success())
+}
+
+/// Whether the actor finds OpenGL. Any other error is for the tests to report.
+fn draws() -> bool {
+    let film = std::env::temp_dir().join(format!("comic-probe-{}.gif", std::process::id()));
+    let Ok(actor) = workspace::program("comic-actor") else { return true };
+    let arguments = ["render", "--task", "get-up", "--seconds", "0.03", "--size", "16x16", "--out"];
+    let asked = Command::new(actor).args(arguments).arg(&film).output();
+    let _ = std::fs::remove_file(film);
+    !asked.is_ok_and(|output| String::from_utf8_lossy(&output.stderr).contains("no OpenGL"))
 }
 
 /// Whether network namespaces can be made here.

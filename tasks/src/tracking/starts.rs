@@ -99,11 +99,8 @@ mod tests {
 
     #[test]
     fn the_starts_are_dm_controls() {
-        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/golden/start_sampling.json");
-        let Ok(text) = std::fs::read_to_string(&path) else {
-            eprintln!("skipped: {} is not there", path.display());
-            return;
-        };
+        let fixtures = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fixtures/golden");
+        let text = std::fs::read_to_string(fixtures.join("start_sampling.json")).unwrap();
         let golden: serde_json::Value = serde_json::from_str(&text).unwrap();
         let starts = Starts::new(&four_clips(), 5, 10, false).unwrap();
         for (index, clip) in starts.clips().iter().enumerate() {

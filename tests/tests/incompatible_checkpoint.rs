@@ -1,5 +1,5 @@
-//! A checkpoint that verifies and cannot be gone on with: whoever starts the learner again would find the same, so it says so
-//! by its exit code.
+//! A checkpoint that is whole but incompatible: a restart would find the same one, so the learner ends with the exit code
+//! for errors that a restart does not repair.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -9,7 +9,7 @@ use comic_tests::steps::{LIMIT, checkpoint_in, leaves, newest_checkpoint};
 use comic_tests::system::{SMALL, System};
 
 #[tokio::test]
-async fn starting_again_does_not_help_and_the_exit_code_says_so() -> Result<()> {
+async fn an_incompatible_checkpoint_ends_the_learner_with_2() -> Result<()> {
     let mut system = System::new(&SMALL)?;
     system.start_learner(LIMIT).await?;
     let actor = system.start_actor()?;
@@ -24,7 +24,7 @@ async fn starting_again_does_not_help_and_the_exit_code_says_so() -> Result<()> 
         let mut without = parts.clone();
         without.remove(part).context("no such part")?;
         fs::write(&manifest, serde_json::to_vec(&without)?)?;
-        // It may serve for a moment: what the trainer needs, the trainer reads.
+        // The learner may serve for a moment, until the trainer reads its part of the checkpoint.
         let _ = system.start_learner(LIMIT).await;
         let mut learner = system.learner.take().context("no learner")?;
         let status = learner.until_it_ends(LIMIT).await.with_context(|| format!("without {part}"))?;
@@ -35,5 +35,5 @@ async fn starting_again_does_not_help_and_the_exit_code_says_so() -> Result<()> 
         }
     }
     fs::write(&manifest, &whole)?;
-    system.start_learner(LIMIT).await.context("nothing was lost meanwhile").map(drop)
+    system.start_learner(LIMIT).await.context("the run does not resume from the whole checkpoint").map(drop)
 }
