@@ -11,8 +11,10 @@ use std::time::Instant;
 use anyhow::{Result, anyhow};
 use clap::Args;
 use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
+use comic_learner::algorithm::Algorithm as _;
+use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::device::Backend;
-use comic_learner::vmpo::{MinibatchTensors, VmpoLearner};
+use comic_learner::vmpo::VmpoLearner;
 use comic_networks::to_safetensors;
 use serde_json::json;
 

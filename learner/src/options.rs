@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context as _, Result};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use comic_experiment::{DeviceName, Experiment};
 use comic_networks::export::Part;
@@ -10,6 +9,7 @@ use comic_networks::export::Part;
 use crate::commands::certs::Certs;
 use crate::commands::health::Health;
 use crate::commands::status::Status;
+use crate::error::{Error, Result};
 use crate::security::{ConnectionLimits, SecurityOptions};
 use crate::service::quarantine::QuarantineOptions;
 
@@ -98,7 +98,7 @@ impl Document {
         let device = self.device.map(|device| format!("learner.device=\"{device}\""));
         let overrides: Vec<String> = lockstep.chain(device).chain(self.overrides.iter().cloned()).collect();
         let experiment = comic_experiment::resolve(preset, &overrides)
-            .with_context(|| format!("the experiment `{preset}` is not usable"))?;
+            .map_err(Error::within(format!("the experiment `{preset}` cannot be used")))?;
         Ok(experiment.with_clips(&self.clips))
     }
 }

@@ -132,7 +132,8 @@ impl Field {
         }
     }
 
-    fn rows(self, length: usize) -> usize {
+    /// Rows in an unroll of `length` transitions: T, T + 1 or 1.
+    pub fn rows(self, length: usize) -> usize {
         match self {
             Self::Proprioception | Self::Task | Self::First | Self::Clip | Self::Image => length.saturating_add(1),
             Self::State => 1,
@@ -140,7 +141,8 @@ impl Field {
         }
     }
 
-    fn width(self, shape: &UnrollShape) -> usize {
+    /// Elements of a row.
+    pub fn width(self, shape: &UnrollShape) -> usize {
         match self {
             Self::Proprioception => shape.proprioception,
             Self::Task => shape.task,
@@ -153,6 +155,24 @@ impl Field {
             Self::Reward => shape.reward_terms,
             Self::Discount | Self::Valid | Self::First | Self::Clip => 1,
             Self::Image => shape.image,
+        }
+    }
+
+    /// What stands in a row that holds no transition, where nothing was decided: numbers that no formula can fail on.
+    /// `None` where such a row has a meaning of its own, as its observation has.
+    pub fn blank(self, shape: &UnrollShape) -> Option<f64> {
+        match self {
+            Self::PreviousLatent | Self::LatentNoise | Self::Action | Self::Mean | Self::Reward => Some(0.0),
+            Self::Std => Some(1.0),
+            Self::LogWeights => Some(-(shape.components as f64).ln()),
+            Self::Proprioception
+            | Self::Task
+            | Self::Discount
+            | Self::Valid
+            | Self::First
+            | Self::State
+            | Self::Clip
+            | Self::Image => None,
         }
     }
 

@@ -2,81 +2,55 @@
 
 use anyhow::{Context as _, Result};
 use comic_experiment::{Experiment, TaskSpec};
-use comic_learner::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors};
-use comic_proto::UnrollShape;
+use comic_learner::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
+use comic_learner::algorithm::shape::MinibatchShape;
+use comic_proto::{Field, PerField, UnrollLayout, UnrollShape};
 use tch::{Device, Kind, Tensor};
 
 /// A batch of random unrolls in the memory layout in which batches arrive.
 pub(super) struct Recorded {
     shape: MinibatchShape,
-    floats: [Vec<f32>; 13],
+    floats: PerField<Vec<f32>>,
     clips: Vec<u32>,
     tasks: Vec<usize>,
 }
 
 impl Recorded {
     pub(super) fn new(spec: &TaskSpec, experiment: &Experiment) -> Result<Self> {
-        let shape = UnrollShape::new(spec, experiment);
-        let unrolls = experiment.unroll.batch;
-        let (rows, observations) = (unrolls * shape.length, unrolls * (shape.length + 1));
-        let (components, weights) = (shape.components, if shape.components > 1 { shape.components } else { 0 });
-        let random = |count: usize| {
-            Vec::<f32>::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu))).context("random numbers")
-        };
+        let layout = UnrollLayout::new(UnrollShape::new(spec, experiment));
+        let (unroll, unrolls) = (*layout.shape(), experiment.unroll.batch);
+        let mut floats = PerField::from_fn(|_| Vec::new());
+        for (field, values) in floats.iter_mut() {
+            let count = layout.elements(field) * unrolls;
+            *values = match field {
+                Field::Discount | Field::Valid => vec![1.0; count],
+                Field::Std => vec![0.7; count],
+                Field::LogWeights => vec![-(unroll.components as f32).ln(); count],
+                Field::First | Field::State => vec![0.0; count],
+                Field::Clip | Field::Image => Vec::new(),
+                Field::Proprioception
+                | Field::Task
+                | Field::PreviousLatent
+                | Field::LatentNoise
+                | Field::Action
+                | Field::Mean
+                | Field::Reward => Vec::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu)))
+                    .context("cannot copy random numbers")?,
+            };
+        }
         // The tasks take turns; each has one clip here.
-        let tasks: Vec<usize> = (0..unrolls).map(|unroll| unroll % spec.tasks.len()).collect();
+        let tasks: Vec<usize> = (0..unrolls).map(|index| index % spec.tasks.len()).collect();
         Ok(Self {
-            floats: [
-                random(observations * shape.proprioception)?,
-                random(observations * shape.task)?,
-                random(rows * shape.latent)?,
-                random(rows * shape.latent)?,
-                random(rows * shape.action)?,
-                random(rows * components * shape.action)?,
-                vec![0.7; rows * components * shape.action],
-                vec![-(components as f32).ln(); rows * weights],
-                random(rows * shape.reward_terms)?,
-                vec![1.0; rows],
-                vec![1.0; rows],
-                vec![0.0; observations],
-                vec![0.0; unrolls * shape.state],
-            ],
-            clips: tasks.iter().flat_map(|task| vec![*task as u32; shape.length + 1]).collect(),
+            floats,
+            clips: tasks.iter().flat_map(|task| vec![*task as u32; layout.rows(Field::Clip)]).collect(),
             tasks,
-            shape: MinibatchShape { unrolls, tasks: spec.tasks.len(), unroll: shape },
+            shape: MinibatchShape { unrolls, tasks: spec.tasks.len(), unroll },
         })
     }
 
     pub(super) fn to_tensors(&self, device: Device) -> Result<MinibatchTensors> {
-        let [
-            proprioception,
-            task,
-            previous_latent,
-            latent_noise,
-            action,
-            mean,
-            std,
-            log_weights,
-            reward,
-            discount,
-            valid,
-            first,
-            state,
-        ] = &self.floats;
         let source = MinibatchSource {
-            proprioception,
-            task,
-            previous_latent,
-            latent_noise,
-            action,
-            mean,
-            std,
-            log_weights,
-            reward,
-            discount,
-            valid,
-            first,
-            state,
+            floats: self.floats.each_ref().map(|_, values| values.as_slice()),
             clip: &self.clips,
             image: &[],
             tasks: &self.tasks,

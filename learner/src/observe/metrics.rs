@@ -14,8 +14,8 @@ use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
 use comic_replay::{AccountingByTask, Batch};
 use serde_json::{Map, Value, json};
 
+use crate::observe::evaluation::Evaluation;
 use crate::observe::tensorboard::Events;
-use crate::service::Evaluation;
 
 /// Sums since the last line.
 #[derive(Debug, Default)]

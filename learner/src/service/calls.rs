@@ -15,7 +15,8 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::assignments::{Assignment, Denied};
 use super::roster::Admission;
-use super::{Evaluation, Shared, assets, status};
+use super::{Shared, assets, status};
+use crate::observe::evaluation::Evaluation;
 
 /// Bytes of an actor's name, as many as a host's can have.
 const NAME_LIMIT: usize = 253;

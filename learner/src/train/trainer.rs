@@ -15,6 +15,8 @@ use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use crate::algorithm::Algorithm as _;
+use crate::algorithm::losses::Losses;
 use crate::checkpoint::{Name, Snapshot, Store, incompatible};
 use crate::device::Backend;
 use crate::observe::metrics::{Metrics, Position};
@@ -23,7 +25,7 @@ use crate::service::Shared;
 use crate::train::skipped_steps::SkippedSteps;
 use crate::train::statistics::ObservationStatistics;
 use crate::train::writer::Writer;
-use crate::vmpo::{Losses, VmpoLearner};
+use crate::vmpo::VmpoLearner;
 
 /// How often a trainer without batches looks at the clock.
 const PATIENCE: std::time::Duration = std::time::Duration::from_millis(500);

@@ -8,9 +8,11 @@ use comic_proto::v1::Behaviour;
 use rand::Rng;
 use rand::seq::index::sample;
 
+use crate::algorithm::Algorithm as _;
+use crate::algorithm::losses::Losses;
+use crate::algorithm::minibatch::MinibatchTensors;
 use crate::checkpoint::Name;
 use crate::train::trainer::{Trainer, Wait};
-use crate::vmpo::{Losses, MinibatchTensors};
 
 /// Which unrolls of a batch demonstrate something; the others are masked.
 #[derive(Debug)]
@@ -76,7 +78,12 @@ impl Trainer {
                 && let Some(losses) = Losses::mean(&std::mem::take(&mut unreported))
             {
                 let losses = losses.to_values();
-                tracing::info!(step, regression = losses.regression_loss, latent_kl = losses.latent_kl, "regressing");
+                tracing::info!(
+                    step,
+                    regression = losses.get("regression_loss"),
+                    latent_kl = losses.get("latent_kl"),
+                    "regressing"
+                );
                 if self.report(&losses)? {
                     step = 0;
                     continue;

@@ -48,7 +48,7 @@ pub(crate) struct World {
     pub(crate) shared: Arc<Shared>,
     pub(crate) address: String,
     shutdown: Option<oneshot::Sender<()>>,
-    server: JoinHandle<Result<()>>,
+    server: JoinHandle<comic_learner::error::Result<()>>,
 }
 
 impl World {
@@ -189,7 +189,7 @@ impl World {
     }
 
     /// What [`serve`] returned after the signal.
-    pub(crate) async fn ended(self) -> Result<()> {
+    pub(crate) async fn ended(self) -> comic_learner::error::Result<()> {
         within(Duration::from_secs(20), self.server).await.unwrap()
     }
 }

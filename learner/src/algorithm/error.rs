@@ -1,9 +1,9 @@
-//! What can go wrong with a batch or a state.
+//! What can go wrong with a minibatch or a state.
 
-use super::MinibatchShape;
 use crate::adam::StateError;
+use crate::algorithm::shape::MinibatchShape;
 
-/// Errors of the learner.
+/// Errors of an algorithm.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -17,8 +17,8 @@ pub enum Error {
         /// Elements found.
         found: usize,
     },
-    /// An unroll of a task there is not.
-    #[error("an unroll is of task {task}, and there are {tasks}")]
+    /// An unroll names a task that does not exist.
+    #[error("an unroll is of task {task}, but there are only {tasks} tasks")]
     Task {
         /// As found.
         task: usize,
@@ -46,4 +46,14 @@ pub enum Error {
     /// libtorch refused an operation.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),
+}
+
+impl From<Error> for crate::error::Error {
+    fn from(error: Error) -> Self {
+        match error {
+            Error::Torch(error) => Self::Torch(error),
+            Error::Networks(error) => Self::Networks(error),
+            error => Self::Update(Box::new(error)),
+        }
+    }
 }
