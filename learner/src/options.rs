@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use comic_experiment::{DeviceName, Experiment};
+use comic_manual::Manual;
 use comic_networks::export::Part;
 
 use crate::commands::certs::Certs;
@@ -128,6 +129,9 @@ pub enum Command {
     Certs(Certs),
     /// Print what each metric means, as docs/metrics.md has it.
     Metrics,
+    /// Write shell completions and man pages.
+    #[command(hide = true)]
+    Manual(Manual),
 }
 
 /// The same on both sides; `docs/operations.md` says more.

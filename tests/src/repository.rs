@@ -8,7 +8,7 @@ use std::process::Command;
 use anyhow::{Context, Result, bail};
 
 /// The crates' folders, as the root manifest lists them.
-pub const FOLDERS: [&str; 12] = [
+pub const FOLDERS: [&str; 13] = [
     "experiment",
     "proto",
     "clips",
@@ -17,6 +17,7 @@ pub const FOLDERS: [&str; 12] = [
     "replay",
     "actor",
     "learner",
+    "manual",
     "bench",
     "tests",
     "setup",
