@@ -7,7 +7,7 @@
 //! - [`fuzz`] feeds random bytes to everything that reads bytes from outside.
 //! - [`train`] runs one learner and its actors on this machine and shows their progress.
 //! - [`sweep`] trains with varied fields of an experiment, and compares the runs.
-//! - [`bench`] measures; [`python`] runs other people's code for comparison.
+//! - [`mod@bench`] measures; [`python`] runs other people's code for comparison.
 //! - [`plot`] draws learning curves; [`metrics`] reads the files of metrics.
 //!
 //! This program runs before libtorch and MuJoCo are installed, so it links neither.
