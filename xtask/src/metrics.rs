@@ -1,4 +1,4 @@
-//! One line of `metrics.jsonl`, as the learner writes it; baselines' lines are read too.
+//! The lines of `metrics.jsonl`, as the learner writes them, and of baselines' files.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -6,7 +6,7 @@ use std::path::Path;
 use anyhow::{Context, Result};
 use serde::Deserialize;
 
-/// What a run's curve and display need of a line. A share of nothing is absent.
+/// The members of a line that curves and displays need. A mean over no episodes is absent.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
 pub(crate) struct Line {
@@ -17,28 +17,28 @@ pub(crate) struct Line {
     pub(crate) updates: u64,
     pub(crate) version: u64,
     pub(crate) steps_per_second: Option<f64>,
-    /// Reward per survived step / the most a step pays.
+    /// Reward per survived step / the largest reward of a step.
     pub(crate) reward_per_step: Option<f64>,
     /// Steps.
     #[serde(alias = "length")]
     pub(crate) episode_length: Option<f64>,
     pub(crate) episode_return: Option<f64>,
-    /// Return / (the most a step pays × the steps that were left at the episode's start).
+    /// Return / (the largest reward of a step × the steps that were left at the episode's start).
     pub(crate) normalised_reward: Option<f64>,
     pub(crate) fraction_survived: Option<f64>,
     /// m.
     pub(crate) head_height: Option<f64>,
-    /// Versions between the parameters that acted and those that were trained.
+    /// Versions between the parameters that acted and those that were updated.
     pub(crate) unroll_age: Option<f64>,
     pub(crate) accounting: Option<Accounting>,
-    /// Whatever the learner minimises, by name.
+    /// The learner's losses by name.
     pub(crate) losses: BTreeMap<String, serde_json::Value>,
-    /// In joint training the same of each task's own episodes.
+    /// In joint training the same for each task's own episodes.
     pub(crate) tasks: BTreeMap<String, Line>,
 }
 
 impl Line {
-    /// KL of the latent to its prior, nats a step, in the newest update.
+    /// KL divergence of the latent from its prior in the newest update, nats per step.
     pub(crate) fn latent_kl(&self) -> Option<f64> {
         self.losses.get("latent_kl")?.as_f64()
     }
@@ -48,7 +48,7 @@ impl Line {
 pub(crate) fn read(path: &Path) -> Result<Vec<Line>> {
     let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
     let line = |(number, line)| {
-        serde_json::from_str(line).with_context(|| format!("{}:{}: no line of metrics", path.display(), number + 1))
+        serde_json::from_str(line).with_context(|| format!("{}:{}: not a line of metrics", path.display(), number + 1))
     };
     text.lines().enumerate().map(line).collect()
 }
@@ -68,7 +68,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_learners_line_is_read_with_its_absent_shares() {
+    fn a_learners_line_is_read_with_its_absent_means() {
         let line: Line = serde_json::from_str(
             r#"{"seconds":5.0,"environment_steps":4096,"updates":1,"version":1,"episode_length":null,
                 "reward_terms":{"com":null},"losses":{"latent_kl":4.5},
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_no_metrics_is_refused_by_line() {
+    fn a_line_that_cannot_be_read_is_named() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("metrics.jsonl");
         std::fs::write(&path, "{}\nnonsense\n").unwrap();

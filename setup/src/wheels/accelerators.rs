@@ -1,7 +1,7 @@
-//! The wheels that other devices than the CPU take: NVIDIA's libraries, which a libtorch with CUDA links, and torch_xla with
-//! everything it imports. They are those that torch 2.9.0 and torch_xla 2.9.0 name, at versions seen to work together.
+//! The wheels for accelerators: NVIDIA's libraries, which a libtorch with CUDA links, and torch_xla with everything that it
+//! imports. torch 2.9.0 and torch_xla 2.9.0 name these packages; these versions work together.
 
-use crate::wheels::{Extent, Part, Wheel};
+use crate::wheel::{Extent, Part, Wheel};
 
 const fn wheel(name: &'static str, version: &'static str, sha256: &'static str, size: u64) -> Wheel {
     Wheel {
@@ -21,8 +21,8 @@ const fn nvidia(name: &'static str, version: &'static str, sha256: &'static str,
     Wheel { part: Part::Libtorch, from: Extent::Cuda, ..wheel(name, version, sha256, size) }
 }
 
-/// The small ones first.
-pub(crate) const ACCELERATORS: [Wheel; 31] = [
+/// Small wheels come first.
+pub(super) const WHEELS: [Wheel; 31] = [
     nvidia("nvidia-nvtx-cu12", "12.8.90", "5b17e2001cc0d751a5bc2c6ec6d26ad95913324a4adb86788c944f8ce9ba441f", 89_954),
     nvidia(
         "nvidia-cufile-cu12",
