@@ -21,7 +21,7 @@ fn the_sound_clip_is_sound() {
 
 #[test]
 fn missing_items() {
-    let missing = "missing; every clip of dm_control's layout has it";
+    let missing = "missing; every clip in dm_control's layout has it";
     assert_defect("joints_missing", "/walkers/walker_0/joints", missing);
     assert_defect("walker_missing", "/walkers/walker_0", missing);
     assert_defect("dt_missing", "@dt", missing);
@@ -143,7 +143,7 @@ fn weights_that_are_none() {
 
 #[test]
 fn no_source_at_all() {
-    let expected = "clips: no source with a weight above 0; name a file or a built-in clip";
+    let expected = "clips: no source has a weight above 0; name a file or a built-in clip";
     assert_eq!(Catalogue::open(&[]).unwrap_err().to_string(), expected);
     let never = |name| ClipSource { weight: 0.0, ..ClipSource::whole(name) };
     assert_eq!(refused(never("builtin:walk")), expected);
