@@ -1,4 +1,4 @@
-//! What people and Prometheus see of a run.
+//! Metrics of a run for people and for Prometheus.
 
 pub mod evaluation;
 pub mod metrics;

@@ -18,7 +18,7 @@ use crate::vmpo::stores::{named, trainable};
 
 /// The online networks, the multipliers and Adam.
 ///
-/// Nothing here is random after construction: the latent's noise comes with the unrolls. So state and minibatches decide
+/// Nothing is random after construction, because the latent's noise comes with the unrolls. So state and minibatches decide
 /// every later parameter, bit for bit on a CPU with the same number of threads.
 #[derive(Debug)]
 pub struct VmpoLearner {
@@ -43,7 +43,7 @@ struct Pass {
     values: Tensor,
     /// G_t, `[N, R]`.
     targets: Tensor,
-    /// Steps that are learnt from, `[N]`.
+    /// 1 for the steps that are learnt from, `[N]`.
     valid: Tensor,
     /// The steps that each E-step ranks, `[N]` booleans; together all of them.
     groups: Vec<Tensor>,
@@ -233,16 +233,16 @@ impl VmpoLearner {
         valid
     }
 
-    /// Clips where asked to, and steps networks and multipliers if every number is finite.
+    /// Clips the gradients if the experiment says so, and steps networks and multipliers if every number is finite.
     fn descend(&mut self, total: &Tensor, mut gradients: Vec<Tensor>, multipliers: Option<&[Tensor]>) -> Descent {
-        // A parameter that a loss does not reach has no gradient at all.
+        // A parameter that the loss does not depend on has no gradient tensor.
         for (gradient, parameter) in gradients.iter_mut().zip(self.adam.parameters(self.networks_group)) {
             if !gradient.defined() {
                 *gradient = parameter.detach().zeros_like();
             }
         }
         let norm = adam::global_norm(&gradients);
-        // Of the squares, since Adam keeps squares: where their sum is finite, each of them is.
+        // Of the squares, because Adam keeps squares: if their sum is finite, each of them is.
         let mut sum = total.detach() + norm.square();
         if let Some(multipliers) = multipliers {
             sum = &sum + adam::global_norm(multipliers).square();
@@ -409,7 +409,7 @@ fn variance_explained(pass: &Pass) -> Tensor {
         masked_mean(&(total - mean).square(), &pass.valid)
     };
     let unexplained = variance(&(&pass.targets - &pass.values));
-    // The floor keeps a batch whose returns are all the same finite.
+    // The floor keeps the result finite if all returns are equal.
     1.0 - unexplained / variance(&pass.targets).clamp_min(1e-12)
 }
 
