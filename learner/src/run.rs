@@ -22,7 +22,8 @@ use crate::publish::Publisher;
 use crate::security::Security;
 use crate::service::process::{allow_descriptors, runtime};
 use crate::service::{Service, serve};
-use crate::train::trainer::{Ending, Setup, Trainer};
+use crate::train::setup::{Ending, Setup};
+use crate::train::trainer::Trainer;
 
 /// File descriptors besides those of connections to actors.
 const OTHER_FILES: u64 = 256;
