@@ -65,11 +65,11 @@ impl Reader {
             return None;
         }
         let piece = if closing.is_given() {
-            parameters.farewell()
+            parameters.end_of_run()
         } else {
             tokio::select! {
                 biased;
-                () = closing.given() => parameters.farewell(),
+                () = closing.given() => parameters.end_of_run(),
                 piece = parameters.next() => piece,
             }
         };
