@@ -47,7 +47,7 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
     let (latent, state) = (experiment.network.latent.size, experiment.network.state_size());
     unrolls.state = numbers.take(COUNT * state);
     let matrix = |values: &[f32], width: usize| Tensor::from_slice(values).reshape([COUNT as i64, width as i64]);
-    let mut remembered = matrix(&unrolls.state, state);
+    let mut recurrent_state = matrix(&unrolls.state, state);
     let mut previous = matrix(&numbers.take(COUNT * latent), latent);
     let at = |values: &[f32], length: usize, t: usize| {
         let width = values.len() / (COUNT * length);
@@ -56,17 +56,17 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
     let (mut means, mut stds, mut weights, mut latents) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for t in 0..LENGTH {
         let within = 1.0 - at(&unrolls.first, LENGTH + 1, t);
-        (previous, remembered) = (previous * &within, remembered * within);
+        (previous, recurrent_state) = (previous * &within, recurrent_state * within);
         latents.push(previous.copy());
         let acting = tch::no_grad(|| {
             let (proprioception, task) = (at(&unrolls.proprioception, LENGTH + 1, t), at(&unrolls.task, LENGTH + 1, t));
             let routing = Routing::grouped(&TASKS, 2);
             let observation = learner.policy().normalise(&proprioception, &task, None, &routing);
-            let memory = RecurrentState { state: &remembered, first: None };
-            learner.policy().act(&observation, &previous, &at(&unrolls.latent_noise, LENGTH, t), memory)
+            let recurrent = RecurrentState { state: &recurrent_state, first: None };
+            learner.policy().act(&observation, &previous, &at(&unrolls.latent_noise, LENGTH, t), recurrent)
         });
         let (mean, std, log_weights) = acting.action.to_rows();
-        (previous, remembered) = (acting.latent, acting.state);
+        (previous, recurrent_state) = (acting.latent, acting.state);
         means.push(mean);
         stds.push(std);
         weights.extend(log_weights);

@@ -61,7 +61,7 @@ fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
     let mut numbers = Numbers::new(seed + 100);
     unrolls.latent_noise = numbers.take(count * LENGTH * latent);
     unrolls.state = numbers.take(count * state);
-    let mut remembered = Tensor::from_slice(&unrolls.state).reshape([count as i64, state as i64]);
+    let mut recurrent_state = Tensor::from_slice(&unrolls.state).reshape([count as i64, state as i64]);
     let mut previous = Tensor::from_slice(&numbers.take(count * latent)).reshape([count as i64, latent as i64]);
     let rows = |values: &[f32], length: usize, t: usize| {
         let width = values.len() / (count * length);
@@ -74,7 +74,7 @@ fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
     for t in 0..LENGTH {
         let begins = rows(&unrolls.first, LENGTH + 1, t);
         previous = (1.0 - &begins) * previous;
-        remembered = (1.0 - begins) * remembered;
+        recurrent_state = (1.0 - begins) * recurrent_state;
         previous_latents.push(previous.copy());
         let acting = tch::no_grad(|| {
             let observation = learner.policy().normalise(
@@ -83,11 +83,11 @@ fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
                 None,
                 &Routing::single(),
             );
-            let memory = RecurrentState { state: &remembered, first: None };
-            learner.policy().act(&observation, &previous, &rows(&unrolls.latent_noise, LENGTH, t), memory)
+            let recurrent = RecurrentState { state: &recurrent_state, first: None };
+            learner.policy().act(&observation, &previous, &rows(&unrolls.latent_noise, LENGTH, t), recurrent)
         });
         let (mean, std, log_weights) = acting.action.to_rows();
-        (previous, remembered) = (acting.latent, acting.state);
+        (previous, recurrent_state) = (acting.latent, acting.state);
         latents.push(previous.copy());
         means.push(mean);
         stds.push(std);
@@ -99,7 +99,7 @@ fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
     };
     (unrolls.mean, unrolls.std) = (unrolled(&means), unrolled(&stds));
     (unrolls.log_weights, unrolls.previous_latent) = (unrolled(&weights), unrolled(&previous_latents));
-    Acted { unrolls, latents: unrolled(&latents), state: remembered }
+    Acted { unrolls, latents: unrolled(&latents), state: recurrent_state }
 }
 
 fn minibatch(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> MinibatchTensors {
@@ -222,8 +222,8 @@ fn a_policy_uses_nothing_from_before_its_episode() {
             let first = tensor(&unrolls.first, LENGTH + 1).squeeze_dim(-1).narrow(1, 0, LENGTH as i64);
             let previous = tensor(&unrolls.previous_latent, LENGTH);
             let noise = tensor(&unrolls.latent_noise, LENGTH);
-            let memory = RecurrentState { state: &state, first: Some(&first) };
-            learner.policy().act(&observation, &previous, &noise, memory).action.mean()
+            let recurrent = RecurrentState { state: &state, first: Some(&first) };
+            learner.policy().act(&observation, &previous, &noise, recurrent).action.mean()
         };
         let change = (means(&base) - means(&other)).abs().amax([-1], false);
         let largest = |from: i64, rows: i64| change.narrow(0, from, rows).max().double_value(&[]);
@@ -241,8 +241,8 @@ fn primitives_never_see_the_reference() {
             let reference = zeros(4).set_requires_grad(true);
             let observation = learner.policy().normalise(&zeros(5), &reference, None, &Routing::single());
             let latent = experiment.network.latent.size as i64;
-            let memory = RecurrentState { state: &zeros(0), first: None };
-            let acting = learner.policy().act(&observation, &zeros(latent), &zeros(latent), memory);
+            let recurrent = RecurrentState { state: &zeros(0), first: None };
+            let acting = learner.policy().act(&observation, &zeros(latent), &zeros(latent), recurrent);
             let total = acting.action.mean().square().sum(Kind::Float) + acting.action.std().sum(Kind::Float);
             Tensor::run_backward(&[total], &[&reference], false, false)
                 .remove(0)

@@ -314,8 +314,8 @@ impl Unrolls {
             let (proprioception, task) = (steps(&self.proprioception, LENGTH + 1), steps(&self.task, LENGTH + 1));
             let observation = learner.policy().normalise(&proprioception, &task, None, routing);
             let (previous, noise) = (steps(&self.previous_latent, LENGTH), steps(&self.latent_noise, LENGTH));
-            let memory = RecurrentState { state: &before, first: Some(&begins) };
-            learner.policy().act(&observation, &previous, &noise, memory)
+            let recurrent = RecurrentState { state: &before, first: Some(&begins) };
+            learner.policy().act(&observation, &previous, &noise, recurrent)
         })
     }
 
