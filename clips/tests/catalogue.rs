@@ -4,7 +4,7 @@ mod support;
 
 use comic_clips::{Catalogue, Features, WalkerModel, pose_to_action};
 use comic_experiment::ClipSource;
-use support::{defects, names, refused, shared, tiny, wheel_clips, whole, with_ids};
+use support::{defects, golden, names, recordings, refused, tiny, wheel_clips, whole, with_ids};
 
 #[test]
 fn a_whole_file_is_all_its_clips_sorted_by_name() {
@@ -45,11 +45,10 @@ fn a_clip_has_one_entry_per_frame_in_every_field() {
     assert_eq!([body_positions.len(), body_quaternions.len()], [9 * 31 * 3, 9 * 31 * 4]);
 }
 
-/// The recorded clips are frame after frame, files are feature after feature: only a right transpose makes them equal.
+/// A file stores an array as [feature, frame], a clip stores it as [frame, feature]; a wrong transpose breaks this relation.
 #[test]
 fn frames_of_a_file_are_its_columns() {
-    let Some(file) = shared("clips/cmu_dev.h5") else { return };
-    let clip = Catalogue::open(&[with_ids(file, &["CMU_007_01"])]).unwrap().load(0).unwrap();
+    let clip = Catalogue::open(&[with_ids(recordings("clips.h5"), &["CMU_007_01"])]).unwrap().load(0).unwrap();
     let features = clip.features.as_ref().unwrap();
     for step in 0..clip.steps() {
         // The first tracking body, lhipjoint, hangs rigidly on the root.
@@ -61,23 +60,21 @@ fn frames_of_a_file_are_its_columns() {
 }
 
 #[test]
-fn files_of_dm_control_itself_open() {
-    if let Some(file) = wheel_clips() {
-        let catalogue = Catalogue::open(&[whole(file)]).unwrap();
-        assert_eq!(names(&catalogue), ["cmuv2019_001", "cmuv2019_002"]);
-        for (index, entry) in catalogue.entries().iter().enumerate() {
-            assert_eq!((entry.model, entry.dt, entry.steps), (WalkerModel::Cmu2019, 0.05, 10));
-            let features = catalogue.load(index).unwrap().features.unwrap();
-            assert_eq!((features.body_positions.len(), features.body_quaternions.len()), (900, 1200));
-        }
+fn the_test_clips_of_dm_control_open() {
+    let catalogue = Catalogue::open(&[whole(wheel_clips())]).unwrap();
+    assert_eq!(names(&catalogue), ["cmuv2019_001", "cmuv2019_002"]);
+    for (index, entry) in catalogue.entries().iter().enumerate() {
+        assert_eq!((entry.model, entry.dt, entry.steps), (WalkerModel::Cmu2019, 0.05, 10));
+        let features = catalogue.load(index).unwrap().features.unwrap();
+        assert_eq!((features.body_positions.len(), features.body_quaternions.len()), (900, 1200));
     }
-    if let Some(file) = shared("golden/synthetic_v2020.h5") {
-        let catalogue = Catalogue::open(&[whole(file)]).unwrap();
-        assert_eq!(names(&catalogue), ["SYN_001_01", "SYN_002_01", "SYN_003_01", "SYN_004_01"]);
-        for index in 0..4 {
-            assert_eq!(catalogue.load(index).unwrap().steps(), 120);
-        }
-    }
+}
+
+#[test]
+fn clips_that_a_script_wrote_with_h5py_open() {
+    let catalogue = Catalogue::open(&[whole(golden("synthetic_v2020.h5"))]).unwrap();
+    assert_eq!(names(&catalogue), ["DRAWN_001_01", "DRAWN_002_01"]);
+    assert_eq!([0, 1].map(|index| catalogue.load(index).unwrap().steps()), [40, 40]);
 }
 
 #[test]
@@ -105,11 +102,11 @@ fn a_subset_is_picked_from_a_file_and_what_is_missing_is_counted() {
 
 #[test]
 fn ids_beside_a_subset_choose_from_it() {
-    let Some(file) = shared("clips/cmu_dev.h5") else { return };
-    let source = |subset: &str, id: &str| ClipSource { subset: Some(subset.into()), ..with_ids(&file, &[id]) };
-    assert_eq!(names(&Catalogue::open(&[source("all", "CMU_002_01")]).unwrap()), ["CMU_002_01"]);
-    let message = refused(source("get_up", "CMU_002_01"));
-    assert!(message.contains("clip `CMU_002_01` is not in subset `get_up`"), "{message}");
+    let source =
+        |subset: &str, id: &str| ClipSource { subset: Some(subset.into()), ..with_ids(recordings("clips.h5"), &[id]) };
+    assert_eq!(names(&Catalogue::open(&[source("all", "CMU_007_01")]).unwrap()), ["CMU_007_01"]);
+    let message = refused(source("get_up", "CMU_007_01"));
+    assert!(message.contains("clip `CMU_007_01` is not in subset `get_up`"), "{message}");
 }
 
 #[test]

@@ -9,7 +9,7 @@ use comic_clips::check::{Checked, Kind, check};
 use comic_clips::import::import;
 use comic_clips::{Catalogue, Clip, ClipWriter, JOINTS, merge};
 use comic_experiment::ClipSource;
-use support::{defects, run_take, shared};
+use support::{defects, recordings, run_take};
 
 fn kinds(checked: &Checked) -> Vec<Kind> {
     let mut kinds: Vec<Kind> = checked.defects.iter().map(|defect| defect.kind).collect();
@@ -51,10 +51,9 @@ fn built_in_and_imported_clips_have_no_defect() {
 }
 
 #[test]
-fn the_clips_another_program_made_have_no_defect() {
-    let Some(file) = shared("clips/cmu_dev.h5") else { return };
-    let all = check(&file, &[]).unwrap();
-    assert_eq!(all.len(), 24);
+fn clips_that_another_program_made_have_no_defect() {
+    let all = check(&recordings("clips.h5"), &[]).unwrap();
+    assert_eq!(all.len(), 3);
     for checked in all {
         assert_eq!(checked.defects, [], "{}", checked.clip);
     }

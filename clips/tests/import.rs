@@ -6,7 +6,7 @@ mod support;
 use comic_clips::import::{Constants, Floor, Take, import, read_manifest};
 use comic_clips::{Catalogue, Clip, Features, Motion};
 use comic_experiment::ClipSource;
-use support::{run_take, shared, with_ids};
+use support::{recordings, run_take, with_ids};
 
 const TOLERANCE: f64 = 1e-6;
 
@@ -57,15 +57,14 @@ fn the_run_of_subject_2_is_the_built_in_one() {
     assert_eq!((taken.frames, taken.notes), (0..173, vec![]));
 }
 
-/// Every field of every recording in the manifest, against the file that its constants belong to.
+/// Compares every field of every recording in the manifest.
 #[test]
-fn the_shared_recordings_become_the_shared_clips() {
-    let (Some(manifest), Some(file)) = (shared("clips/raw/manifest.json"), shared("clips/cmu_dev.h5")) else { return };
-    let takes = read_manifest(&manifest).unwrap();
-    assert_eq!(takes.len(), 6);
+fn recordings_become_the_clips_that_mujoco_and_dm_control_made_of_them() {
+    let takes = read_manifest(&recordings("manifest.json")).unwrap();
+    assert_eq!(takes.len(), 3);
     for take in takes {
         let (clip, _) = import(&take).unwrap();
-        let expected = Catalogue::open(&[with_ids(&file, &[&take.name])]).unwrap().load(0).unwrap();
+        let expected = Catalogue::open(&[with_ids(recordings("clips.h5"), &[&take.name])]).unwrap().load(0).unwrap();
         assert_near(&take.name, &motion_differences(&clip.motion, &expected.motion));
         assert_near(&take.name, &feature_differences(&clip.features.unwrap(), &expected.features.unwrap()));
     }
@@ -85,9 +84,8 @@ fn without_constants_soles_and_floor_are_found_and_told() {
 }
 
 #[test]
-fn what_was_found_for_shared_recordings_is_near_what_a_person_chose() {
-    let Some(manifest) = shared("clips/raw/manifest.json") else { return };
-    for take in read_manifest(&manifest).unwrap() {
+fn soles_and_floor_are_found_near_the_constants_that_a_person_chose() {
+    for take in read_manifest(&recordings("manifest.json")).unwrap() {
         let chosen = take.constants.clone();
         let (_, taken) = import(&Take { constants: Constants::default(), ..take.clone() }).unwrap();
         println!("{}: found {taken}", take.name);

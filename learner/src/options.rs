@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Parser, Subcommand, ValueEnum};
+use comic_manual::Manual;
 use comic_networks::export::Part;
 
 use crate::commands::certs::Certs;
@@ -80,6 +81,9 @@ pub enum Command {
     Certs(Certs),
     /// Print what each metric means, as in docs/metrics.md.
     Metrics,
+    /// Write shell completions and man pages.
+    #[command(hide = true)]
+    Manual(Manual),
 }
 
 /// The actor has the same exit codes; `docs/operations.md` says more.

@@ -59,8 +59,8 @@ pub(super) fn prepare(
         quarantine: options.quarantine.clone(),
     })?;
     let run = options.run.clone();
-    let shared = service.trainer();
-    let setup = Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, shared };
+    let handle = service.trainer();
+    let setup = Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, service: handle };
     Ok((setup, service))
 }
 

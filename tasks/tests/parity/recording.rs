@@ -20,6 +20,11 @@ pub(crate) fn folder() -> PathBuf {
     }
 }
 
+/// The folder of dm_control's compiled models, and of the pictures that its cameras took.
+pub(crate) fn models() -> PathBuf {
+    workspace().join("tests/fixtures/golden/models")
+}
+
 pub(crate) fn workspace() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
@@ -35,7 +40,7 @@ pub(crate) fn files(folder: &Path, extension: &str) -> Result<Vec<PathBuf>, Stri
     Ok(paths)
 }
 
-/// The rollouts whose names begin and end so.
+/// The rollouts whose file names have this prefix and this suffix.
 pub(crate) fn rollouts(folder: &Path, (prefix, suffix): (&str, &str)) -> Result<Vec<Rollout>, String> {
     let name = |path: &PathBuf| path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
     files(folder, "npz")?
