@@ -201,7 +201,7 @@ fn start_trainer(setup: Setup) -> Result<Training> {
     std::thread::Builder::new()
         .name("trainer".into())
         .spawn(move || {
-            let ending = catch_unwind(AssertUnwindSafe(|| Ok(Trainer::new(setup)?.run()?)));
+            let ending = catch_unwind(AssertUnwindSafe(|| Trainer::new(setup)?.run()));
             let _ = ended.send(ending.unwrap_or(Err(Error::Panicked("the trainer"))));
         })
         .map_err(Error::system("cannot start the trainer's thread"))?;
