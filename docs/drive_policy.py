@@ -1,10 +1,11 @@
-"""Lets an exported policy act in dm_control's own tracking environment: python docs/drive_policy.py policy.pt walk.h5 0 24
+"""Lets an exported policy act in dm_control's own tracking environment.
 
     comic-learner export --checkpoint runs/mine --part policy --out policy.pt
     comic-actor clips merge builtin:walk --out walk.h5
+    python docs/drive_policy.py policy.pt walk.h5 0 24
 
-The numbers are frames of each clip at which an episode starts. It needs tests/python/requirements-export.txt, and prints a line of
-JSON a step. What follows the usage is ten statements.
+The numbers are frames of each clip at which an episode starts. The script prints one line of JSON a step. It needs the packages in
+tests/python/requirements-export.txt.
 """
 
 import itertools

@@ -1,8 +1,8 @@
-//! What every crate's build script does, and the few lines of C++ that other devices take: CUDA where libtorch has it, XLA
-//! with `--features xla`, which also wants to know where Python and its packages are.
+//! The run path, as for every crate, and the C++ files for devices: CUDA where libtorch has it, XLA with `--features xla`.
+//! XLA also needs the directories of Python and of its packages.
 
 #[allow(dead_code, reason = "its own `main` is for crates that need no more")]
-#[path = "../deploy/rpath.rs"]
+#[path = "../setup/rpath.rs"]
 mod rpath;
 
 use std::path::{Path, PathBuf};
@@ -14,22 +14,17 @@ fn main() {
     xla();
 }
 
-/// libtorch's CUDA registers itself when it is loaded, and nothing names what is in it: a linker would leave it out.
+/// Links CUDA where libtorch has it, and compiles the C++ that copies to a card.
 fn cuda() {
     println!("cargo:rustc-check-cfg=cfg(cuda)");
     let Some(libtorch) = std::env::var_os("LIBTORCH").map(PathBuf::from) else { return };
-    let libraries = libtorch.join("lib");
-    // The directory: of a file that is not there Cargo thinks that it has just gone, and builds everything anew each time.
-    println!("cargo:rerun-if-changed={}", libraries.display());
-    let library = libraries.join("libtorch_cuda.so");
-    if library.exists() {
-        println!("cargo:rustc-link-arg=-Wl,--allow-shlib-undefined,--no-as-needed,{},--as-needed", library.display());
+    if rpath::link_cuda() {
         println!("cargo:rustc-cfg=cuda");
         cpp(&libtorch, "src/device/cuda.cpp").compile("comic_cuda");
     }
 }
 
-/// A file of C++ that sees libtorch.
+/// A C++ file that is compiled with libtorch's headers.
 fn cpp(libtorch: &Path, file: &str) -> cc::Build {
     println!("cargo:rerun-if-changed={file}");
     let include = libtorch.join("include");
@@ -41,21 +36,14 @@ fn cpp(libtorch: &Path, file: &str) -> cc::Build {
 
 #[cfg(feature = "xla")]
 fn xla() {
-    use std::process::Command;
-
     let libtorch = PathBuf::from(std::env::var_os("LIBTORCH").expect("LIBTORCH is not set: `cargo xtask setup --xla`"));
-    // Nothing names what is in it: it registers itself, so all of it is linked.
+    // The object file registers itself and no symbol refers to it, so all of it is linked.
     cpp(&libtorch, "src/device/xla.cpp").cargo_metadata(false).compile("comic_xla");
     println!("cargo:rustc-link-search=native={}", std::env::var("OUT_DIR").expect("cargo sets OUT_DIR"));
     println!("cargo:rustc-link-lib=static:+whole-archive,-bundle=comic_xla");
     println!("cargo:rustc-link-lib=stdc++");
-    // torch, torch_xla and what they import, as `cargo xtask setup --xla` puts them beside libtorch.
+    // torch, torch_xla and what they import, where `cargo xtask setup --xla` puts them.
     let packages = libtorch.parent().map(|dependencies| dependencies.join("python")).unwrap_or_default();
     println!("cargo:rustc-env=COMIC_PYTHON_PACKAGES={}", packages.display());
-    println!("cargo:rerun-if-env-changed=PYO3_PYTHON");
-    let python = std::env::var("PYO3_PYTHON").unwrap_or_else(|_| "python3".into());
-    let asked =
-        Command::new(&python).args(["-c", "import sysconfig; print(sysconfig.get_config_var('LIBDIR'))"]).output();
-    let asked = asked.unwrap_or_else(|error| panic!("cannot run {python}: {error}"));
-    println!("cargo:rustc-link-arg=-Wl,-rpath,{}", String::from_utf8_lossy(&asked.stdout).trim());
+    rpath::find_python();
 }

@@ -19,7 +19,7 @@ use rand_pcg::Pcg64;
 
 use crate::Error;
 use crate::acting::{ActingSizes, ForwardPass};
-use crate::seeds::derive;
+use comic_experiment::seed::derive;
 
 pub use report::{ClipReport, Finished, Report};
 pub use rollout::{Audience, Evaluated, Start};

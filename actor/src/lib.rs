@@ -1,4 +1,4 @@
-//! Whatever needs a simulator: acting for a learner, evaluating a policy, measuring how fast both go.
+//! Whatever needs a simulator: acting for a learner, evaluating a policy.
 //!
 //! # Layout
 //! - [`worker`] is the hot path: one thread, its environments, one batched forward pass a step, unrolls out.
@@ -12,13 +12,11 @@
 //! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads what the learner wrote.
 //! - [`render`] films a policy at work, or shows it in a window.
 //! - [`clips`] is `comic-actor clips`: motion capture in files, and off the network.
-//! - [`mod@bench`] holds the figures of `comic-actor bench`.
 //!
 //! Nothing here knows a loss, and nothing here is unbounded: finished unrolls wait in a bounded channel, unrolls that
 //! are not acknowledged in a bounded window, and behind a full window the environments stand still.
 
 pub mod acting;
-pub mod bench;
 pub mod checkpoint;
 pub mod clips;
 pub mod dump;
@@ -30,7 +28,7 @@ pub mod pulse;
 pub mod render;
 pub mod round;
 pub mod run;
-mod seeds;
+pub mod seeds;
 pub mod session;
 pub mod worker;
 

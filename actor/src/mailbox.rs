@@ -4,15 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
 use bytes::Bytes;
-
-/// How to act.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Conduct {
-    /// By the policy.
-    Policy,
-    /// By the servo action with noise: material for the warm start.
-    Demonstrate,
-}
+use comic_proto::v1::Behaviour;
 
 /// One version of how to act; a version means nothing without its learner epoch.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -22,7 +14,7 @@ pub struct Directive {
     /// Its version within that life.
     pub version: u64,
     /// How to act with it.
-    pub conduct: Conduct,
+    pub behaviour: Behaviour,
     /// The acting parameters (safetensors); may be empty for a demonstration.
     pub parameters: Bytes,
 }
@@ -105,7 +97,7 @@ mod tests {
     use super::*;
 
     fn directive(version: u64) -> Directive {
-        Directive { learner_epoch: 1, version, conduct: Conduct::Policy, parameters: Bytes::new() }
+        Directive { learner_epoch: 1, version, behaviour: Behaviour::Policy, parameters: Bytes::new() }
     }
 
     #[test]

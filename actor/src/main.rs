@@ -12,7 +12,7 @@ use comic_actor::evaluate::command::Evaluate;
 use comic_actor::pulse::Health;
 use comic_actor::render::command::Render;
 use comic_actor::render::view::View;
-use comic_actor::{Error, bench, policy, run};
+use comic_actor::{Error, policy, run};
 use comic_proto::Access;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
@@ -50,9 +50,6 @@ enum Command {
     Replay(dump::Command),
     /// Exit with 0 if an actor steps environments and with 1 if not, for a container's health check.
     Health(Health),
-    /// Measures how fast an actor is, one JSON line a figure.
-    #[command(hide = true)]
-    Bench(bench::Bench),
 }
 
 #[derive(Args, Debug)]
@@ -91,9 +88,7 @@ enum LogFormat {
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
-    // Joining a learner of its own over and over is no news to who asked for figures.
-    let level = if matches!(arguments.command, Some(Command::Bench(_))) { "warn" } else { "info" };
-    start_logging(arguments.log_format, level);
+    start_logging(arguments.log_format);
     policy::use_one_torch_thread();
     match command(arguments) {
         Ok(()) => ExitCode::SUCCESS,
@@ -117,7 +112,6 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
         Some(Command::Clips(clips)) => clips.run().map_err(anyhow::Error::from),
         Some(Command::Replay(replay)) => replay.run().context("cannot replay"),
         Some(Command::Health(health)) => health.run(),
-        Some(Command::Bench(bench)) => bench.run().context("cannot measure"),
         None => {
             let Act { learner, access, name, threads, environments, cache, dump_diverged, pulse } = arguments.act;
             let learner = learner.ok_or_else(|| {
@@ -130,8 +124,8 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
     }
 }
 
-fn start_logging(format: LogFormat, level: &str) {
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+fn start_logging(format: LogFormat) {
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
     let builder = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)

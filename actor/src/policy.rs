@@ -1,7 +1,7 @@
 //! The forward pass through libtorch.
 
 use comic_experiment::{Experiment, InitialPose, TaskSpec};
-use comic_networks::{Memory, Policy, Routing};
+use comic_networks::{Policy, RecurrentState, Routing};
 use tch::nn::VarStore;
 use tch::{Device, Tensor};
 
@@ -94,7 +94,7 @@ impl ForwardPass for TorchPolicy {
                 &observation,
                 &matrix(&batch.previous_latent, sizes.latent)?,
                 &matrix(&batch.latent_noise, sizes.latent)?,
-                Memory { state: &matrix(&batch.state, sizes.state)?, first: None },
+                RecurrentState { state: &matrix(&batch.state, sizes.state)?, first: None },
             );
             let (mean, std, log_weights) = acting.action.to_rows();
             let read = |tensor: &Tensor, values: &mut [f32]| match values {

@@ -22,13 +22,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
 use comic_proto::UnrollLayout;
-use comic_proto::v1::EpisodeStatistics;
+use comic_proto::v1::{Behaviour, EpisodeStatistics};
 use comic_tasks::Environment;
 use tokio::sync::mpsc;
 
 use crate::Error;
 use crate::acting::{ActingBatch, ActingSizes, ForwardPass};
-use crate::mailbox::{Conduct, Directive, Mailbox};
+use crate::mailbox::{Directive, Mailbox};
 use crate::round::{Round, Ticket};
 use lane::Lane;
 
@@ -41,12 +41,14 @@ pub struct FinishedUnroll {
     pub learner_epoch: u64,
     /// Version of the parameters that acted, from the first row to the last.
     pub version: u64,
-    /// Acted by the servo, not by the policy.
-    pub demonstration: bool,
+    /// What acted, from the first row to the last.
+    pub behaviour: Behaviour,
     /// Episodes that ended in this unroll.
     pub episodes: Vec<EpisodeStatistics>,
     /// The environment's number.
     pub environment: u32,
+    /// Index of the unroll's task among the tasks of the experiment.
+    pub task: u32,
     /// Held until the learner has answered for it, if somebody waits for that.
     pub ticket: Option<Arc<Ticket>>,
 }
@@ -153,7 +155,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         if self.directive.as_ref().is_some_and(|current| Arc::ptr_eq(current, directive)) {
             return Ok(());
         }
-        if directive.conduct == Conduct::Policy {
+        if directive.behaviour == Behaviour::Policy {
             self.forward.load(&directive.parameters)?;
         }
         self.directive = Some(Arc::clone(directive));
@@ -221,26 +223,28 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     }
 
     fn finish(&mut self) -> Vec<FinishedUnroll> {
-        let demonstration = self.demonstrates();
-        let (learner_epoch, version) =
-            self.directive.as_ref().map_or((0, 0), |directive| (directive.learner_epoch, directive.version));
+        let (learner_epoch, version, behaviour) =
+            self.directive.as_ref().map_or((0, 0, Behaviour::Policy), |directive| {
+                (directive.learner_epoch, directive.version, directive.behaviour)
+            });
         let (lanes, batch, layout) = (&mut self.lanes, &mut self.batch, &self.layout);
         lanes
             .iter_mut()
             .enumerate()
             .map(|(index, lane)| {
                 let (payload, episodes) = lane.take_unroll(layout);
+                let task = lane.task();
                 if lane.at_episode_end() {
                     lane.begin_episode(&mut batch.row(index));
                 }
                 let environment = lane.number();
-                FinishedUnroll { payload, learner_epoch, version, demonstration, episodes, environment, ticket: None }
+                FinishedUnroll { payload, learner_epoch, version, behaviour, episodes, environment, task, ticket: None }
             })
             .collect()
     }
 
     fn demonstrates(&self) -> bool {
-        self.directive.as_ref().is_some_and(|directive| directive.conduct == Conduct::Demonstrate)
+        self.directive.as_ref().is_some_and(|directive| directive.behaviour == Behaviour::Demonstration)
     }
 
     /// The servo action as the mean. It has neither latent nor memory: z stays 0, so z_{t−1} is 0 throughout.

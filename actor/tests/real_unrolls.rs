@@ -6,12 +6,12 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use comic_actor::acting::{ActingBatch, ActingSizes, ForwardPass as _};
-use comic_actor::mailbox::{Conduct, Directive};
+use comic_actor::mailbox::Directive;
 use comic_actor::policy::TorchPolicy;
 use comic_actor::worker::{FinishedUnroll, Progress, Worker};
 use comic_clips::Catalogue;
 use comic_experiment::{Experiment, resolve};
-use comic_proto::v1::UnrollHeader;
+use comic_proto::v1::{Behaviour, UnrollHeader};
 use comic_proto::{Expected, Field, UnrollBuffer, UnrollLayout, UnrollShape, validate};
 use comic_tasks::Task;
 
@@ -34,32 +34,33 @@ fn setup() -> Setup {
 }
 
 /// Two rounds of unrolls, `[round][environment]`.
-fn record(setup: &Setup, conduct: Conduct) -> Vec<Vec<FinishedUnroll>> {
+fn record(setup: &Setup, behaviour: Behaviour) -> Vec<Vec<FinishedUnroll>> {
     let environments =
         (0..ENVIRONMENTS as u64).map(|seed| Arc::clone(&setup.task).environment(seed).unwrap()).collect();
     let policy = TorchPolicy::untrained(setup.task.spec(), &setup.experiment, 6, || Ok([0.0; 56])).unwrap();
     let mut worker = Worker::new(environments, policy, Arc::clone(&setup.layout), 0.1, 0, 9);
     let parameters = Bytes::from(setup.policy.to_parameters().unwrap());
-    worker.adopt(&Arc::new(Directive { learner_epoch: 2, version: 4, conduct, parameters })).unwrap();
+    worker.adopt(&Arc::new(Directive { learner_epoch: 2, version: 4, behaviour, parameters })).unwrap();
     (0..2).map(|_| worker.unroll(&|| false, &Progress::default()).unwrap().unwrap()).collect()
 }
 
 #[test]
 fn unrolls_pass_the_learners_validation() {
     let setup = setup();
-    for conduct in [Conduct::Policy, Conduct::Demonstrate] {
-        for unroll in record(&setup, conduct).into_iter().flatten() {
+    for behaviour in [Behaviour::Policy, Behaviour::Demonstration] {
+        for unroll in record(&setup, behaviour).into_iter().flatten() {
             let header = UnrollHeader {
                 learner_epoch: unroll.learner_epoch,
                 version: unroll.version,
                 layout_hash: setup.layout.hash().to_vec(),
-                demonstration: unroll.demonstration,
+                behaviour: unroll.behaviour.into(),
                 episodes: unroll.episodes,
+                task: unroll.task,
                 ..UnrollHeader::default()
             };
             let expected = Expected { clips: &[setup.task.spec().clips.len()], epoch: 2, newest_version: 4 };
             validate(&setup.layout, &header, &unroll.payload.clone().into(), &expected).unwrap();
-            assert_eq!(unroll.demonstration, conduct == Conduct::Demonstrate);
+            assert_eq!(unroll.behaviour, behaviour);
         }
     }
 }
@@ -67,7 +68,7 @@ fn unrolls_pass_the_learners_validation() {
 #[test]
 fn the_behaviour_policy_follows_from_what_is_recorded() {
     let mut setup = setup();
-    for round in record(&setup, Conduct::Policy) {
+    for round in record(&setup, Behaviour::Policy) {
         let mut unrolls: Vec<_> =
             round.iter().map(|unroll| UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap()).collect();
         let mut batch = ActingBatch::new(ENVIRONMENTS, ActingSizes::new(setup.task.spec(), &setup.experiment));
@@ -94,7 +95,7 @@ fn the_behaviour_policy_follows_from_what_is_recorded() {
 fn rewards_are_the_tracking_tasks() {
     let setup = setup();
     let mut best = 0.0_f32;
-    for unroll in record(&setup, Conduct::Demonstrate).into_iter().flatten() {
+    for unroll in record(&setup, Behaviour::Demonstration).into_iter().flatten() {
         let buffer = UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap();
         for t in 0..setup.layout.shape().length {
             let reward: f32 = buffer.row(Field::Reward, t).iter().sum();

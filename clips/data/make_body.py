@@ -21,7 +21,7 @@ HEADER = """\
 //! `CMUHumanoidPositionControlledV2020` in MuJoCo 3.17.0.
 #![allow(clippy::approx_constant, clippy::excessive_precision, reason = "the compiled model's own digits")]
 
-use super::{Body, Geom, Shape};
+use super::parts::{Body, Geom, Shape};
 
 """
 SHAPES = {int(mujoco.mjtGeom.mjGEOM_SPHERE): 1, int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2, int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): 3}

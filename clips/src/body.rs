@@ -1,64 +1,37 @@
 //! The CMU humanoid V2020 as rigid bodies: forward kinematics, centre of mass, and height above the floor.
 
+mod parts;
 mod table;
 
-use crate::JOINTS;
+pub(crate) use parts::Geom;
+use parts::Shape;
+
+use crate::humanoid::JOINTS;
 use crate::spatial::{
     IDENTITY, Matrix, Quaternion, Vector, about, add, dot, matrix, multiply, norm, normalize, rotate, scale, subtract,
 };
 
-/// A rigid body; its frame lies at `position` and `quaternion` in its parent's.
-pub(crate) struct Body {
-    pub(crate) name: &'static str,
-    parent: usize,
-    /// First and one past the last of its hinges in [`JOINTS`]; they turn in that order.
-    hinges: (usize, usize),
-    position: Vector,
-    quaternion: Quaternion,
-    /// Where its hinges sit, in its frame.
-    anchor: Vector,
-    /// kg.
-    mass: f64,
-    /// In its frame.
-    center_of_mass: Vector,
-}
-
-/// A colliding geom, at `position` and `quaternion` in the frame of `body`.
-pub(crate) struct Geom {
-    pub(crate) name: &'static str,
-    pub(crate) body: usize,
-    shape: Shape,
-    position: Vector,
-    quaternion: Quaternion,
-}
-
-/// Metres; a capsule lies along its z axis.
-enum Shape {
-    Sphere { radius: f64 },
-    Capsule { radius: f64, half_length: f64 },
-    Ellipsoid { semi_axes: Vector },
-}
-
-/// How many bodies there are, the free frame and the root included.
+/// The number of bodies, with the free frame and the root.
 pub(crate) const BODIES: usize = table::BODIES.len();
-/// The root; the bodies after it are the tracking bodies, in dm_control's order.
+/// Index of the root. The bodies after it are the tracking bodies, in dm_control's order.
 pub(crate) const ROOT: usize = 1;
 
-/// Where every body is, world frame.
+/// Position and orientation of every body in the world frame.
 pub(crate) struct Frames {
+    /// m.
     pub(crate) position: [Vector; BODIES],
     pub(crate) quaternion: [Quaternion; BODIES],
     pub(crate) rotation: [Matrix; BODIES],
-    /// The axis of each of [`JOINTS`], a unit vector.
+    /// The axis of each joint of [`JOINTS`], a unit vector.
     pub(crate) axis: [Vector; 56],
 }
 
-/// The place of the body of that name.
+/// Index of the body with this name.
 pub(crate) fn index(name: &str) -> Option<usize> {
     table::BODIES.iter().position(|body| body.name == name)
 }
 
-/// The place of a body of that name, which is one of the table's; for constants.
+/// Index of the body with this name, for constants. An unknown name fails to compile.
 pub(crate) const fn body(name: &str) -> usize {
     let mut index = 0;
     while index < BODIES {
@@ -70,7 +43,7 @@ pub(crate) const fn body(name: &str) -> usize {
     panic!("no body of that name; found while compiling")
 }
 
-/// The place of a joint of that name in [`JOINTS`].
+/// Index in [`JOINTS`] of the joint with this name, for constants. An unknown name fails to compile.
 pub(crate) const fn joint(name: &str) -> usize {
     let mut index = 0;
     while index < JOINTS.len() {
@@ -97,7 +70,7 @@ const fn same(a: &str, b: &str) -> bool {
     true
 }
 
-/// The coordinate axis (0, 1, 2) of a joint: names end in `rx`, `ry` or `rz`.
+/// The coordinate axis (0, 1 or 2) of a joint. The name of a joint ends in `rx`, `ry` or `rz`.
 fn axis(joint: usize) -> usize {
     match JOINTS[joint].as_bytes().last() {
         Some(b'x') => 0,
@@ -111,8 +84,8 @@ pub(crate) fn geoms() -> &'static [Geom] {
 }
 
 impl Frames {
-    /// Forward kinematics, in MuJoCo's order of operations (`mj_kinematics`), so that quaternions have its signs:
-    /// root at `position` (m) and `quaternion`, hinges at `joints` (rad, in the order of [`JOINTS`]).
+    /// Forward kinematics for the root at `position` (m) and `quaternion`, and the hinges at `joints` (rad, in the
+    /// order of [`JOINTS`]). The order of operations is MuJoCo's (`mj_kinematics`), so quaternions get the same signs.
     pub(crate) fn of(position: &Vector, quaternion: &Quaternion, joints: &[f64; 56]) -> Self {
         let free = normalize(*quaternion);
         let mut frames = Self {
@@ -141,12 +114,12 @@ impl Frames {
         frames
     }
 
-    /// At zero angles, the root at the origin.
+    /// All angles zero, the root at the origin.
     pub(crate) fn zero() -> Self {
         Self::of(&[0.0; 3], &IDENTITY, &[0.0; 56])
     }
 
-    /// Of the whole body, m, world frame.
+    /// Centre of mass of the whole body, m, world frame.
     pub(crate) fn center_of_mass(&self) -> Vector {
         let (mut moment, mut mass) = ([0.0; 3], 0.0);
         for (index, body) in table::BODIES.iter().enumerate() {
@@ -161,7 +134,7 @@ impl Frames {
     pub(crate) fn bottom(&self, geom: &Geom) -> f64 {
         let rotation = &self.rotation[geom.body];
         let center = self.position[geom.body][2] + dot(&rotation[2], &geom.position);
-        // World z in the geom's frame.
+        // The world's z axis in the geom's frame.
         let local = matrix(geom.quaternion);
         let up: Vector = std::array::from_fn(|column| (0..3).map(|row| rotation[2][row] * local[row][column]).sum());
         match geom.shape {
@@ -173,7 +146,7 @@ impl Frames {
         }
     }
 
-    /// Height of the lowest point of all colliding geoms, m, and which geom it is.
+    /// Height of the lowest point of all colliding geoms, m, world frame, and the geom that has it.
     pub(crate) fn lowest(&self) -> (f64, &'static Geom) {
         let mut lowest = (self.bottom(&table::GEOMS[0]), &table::GEOMS[0]);
         for geom in &table::GEOMS[1..] {

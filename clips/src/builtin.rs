@@ -1,18 +1,21 @@
-//! Clips that need no file: human motion compiled in, and `stand`, which is made here.
+//! Clips without a file: recorded human motion, compiled into the program, and `stand`, which is computed here.
 
 use std::sync::OnceLock;
 
-use crate::{Clip, Error, JOINT_RANGES, JOINTS, Motion, WalkerModel, nearest::hint};
+use crate::clip::{Clip, Motion};
+use crate::error::Error;
+use crate::humanoid::{JOINT_RANGES, JOINTS, WalkerModel};
+use crate::nearest::hint;
 
 /// Format: `data/make_builtin.py`; provenance: `data/README.md`, `data/builtin.json`.
 const BYTES: &[u8] = include_bytes!("../data/builtin.bin");
 const MAGIC: &[u8; 8] = b"COMICLIP";
 const VERSION: u32 = 1;
 const HEADER: usize = 32;
-/// Numbers a frame: position 3, quaternion 4, joints 56, and their velocities 3, 3, 56.
+/// Numbers per frame: position 3, quaternion 4, joints 56, and their velocities 3, 3, 56.
 const NUMBERS: usize = 125;
 
-/// Names people remember, and the clip each stands for.
+/// Short names, and the clip that each one means.
 const ALIASES: [(&str, &str); 9] = [
     ("walk", "CMU_007_01"),
     ("brisk-walk", "CMU_002_02"),
@@ -26,7 +29,7 @@ const ALIASES: [(&str, &str); 9] = [
 ];
 const STAND: &str = "stand";
 
-/// dm_control's control timestep for the CMU clips, s.
+/// Control time step of dm_control for the CMU clips, s.
 const DT: f64 = 0.03;
 /// Frames of `stand`: 3.6 s.
 const STAND_STEPS: usize = 120;
@@ -39,13 +42,13 @@ struct Stored {
     data: &'static [u8],
 }
 
-/// Names that can follow `builtin:`: `stand`, the aliases, and the recorded clips' own names.
+/// The names that can follow `builtin:`: `stand`, the aliases, and the recorded clips' own names.
 pub fn builtin_names() -> Vec<&'static str> {
     let aliases = ALIASES.into_iter().map(|(alias, _)| alias);
     std::iter::once(STAND).chain(aliases).chain(stored().iter().map(|clip| clip.name)).collect()
 }
 
-/// The clip's own name, its number of frames and its dt, for a name or an alias.
+/// For a name or an alias: the clip's own name, its number of frames, and its time step in s.
 pub(crate) fn describe(name: &str) -> Result<(&'static str, usize, f64), Error> {
     if name == STAND {
         return Ok((STAND, STAND_STEPS, DT));
@@ -54,7 +57,7 @@ pub(crate) fn describe(name: &str) -> Result<(&'static str, usize, f64), Error> 
     Ok((clip.name, clip.steps, clip.dt))
 }
 
-/// Reads or makes the clip of that name or alias.
+/// Reads or computes the clip with this name or alias.
 pub(crate) fn load(name: &str) -> Result<Clip, Error> {
     let (name, dt, motion) = if name == STAND {
         (STAND, DT, stand())
@@ -75,7 +78,7 @@ fn find(name: &str) -> Result<&'static Stored, Error> {
 
 fn stored() -> &'static [Stored] {
     static STORED: OnceLock<Vec<Stored>> = OnceLock::new();
-    // The bytes are the program's own, and a test reads them all; there is no reader to report damage to.
+    // The bytes are part of the program, and a test reads all of them, so they cannot be damaged here.
     STORED.get_or_init(|| parse(BYTES).unwrap_or_default())
 }
 
@@ -114,7 +117,7 @@ impl Stored {
     }
 }
 
-/// Takes a `[steps, N]` array off the front of `data`.
+/// Removes a `[steps, N]` array from the front of `data`.
 fn frames<const N: usize>(data: &mut &[u8], steps: usize) -> Vec<[f64; N]> {
     let (own, rest) = data.split_at(steps * N * size_of::<f64>());
     *data = rest;
@@ -126,11 +129,12 @@ fn frames<const N: usize>(data: &mut &[u8], steps: usize) -> Vec<[f64; N]> {
 
 /// Standing still with lowered arms.
 ///
-/// dm_control's own upright pose (a T-pose leaning 8.7° forwards) stands on its toes with heels 8 cm up, so nothing
-/// could track it. Here the ankles are turned until both soles lie flat, the root leans 4° forwards, which puts the
-/// centre of mass over the middle of the feet (0.041 m in front of the root, soles from −0.05 to 0.18 m), the upper
-/// arms hang 60° below horizontal (`rhumerusrz` ends at −1.1 rad), and the lowest point is 1.6 mm above the floor, as
-/// in dm_control's pose. All found with the compiled V2020 model; other angles are 0, or the nearest allowed.
+/// dm_control's own upright pose is a T-pose that leans 8.7° forwards on its toes, with the heels 8 cm above the floor.
+/// No policy can track it. In this pose both soles are flat. The root leans 4° forwards, so the centre of mass is above
+/// the middle of the feet: 0.041 m in front of the root, where the soles reach from −0.05 to 0.18 m. The upper arms
+/// hang 60° below horizontal (`rhumerusrz` ends at −1.1 rad). The lowest point is 1.6 mm above the floor, as in
+/// dm_control's pose. The numbers were found with the compiled V2020 model. All other angles are 0, or the nearest
+/// angle in their range.
 fn stand() -> Motion {
     const HEIGHT: f64 = 1.081;
     const LEAN_DEGREES: f64 = 4.0;
@@ -142,7 +146,7 @@ fn stand() -> Motion {
         let wanted = ANGLES.iter().find(|(joint, _)| *joint == name).map_or(0.0, |(_, angle)| *angle);
         *angle = f64::clamp(wanted, low, high);
     }
-    // Upright is (1, 1, 1, 1)/2, the root's y axis pointing up; the lean turns that about the world's y axis.
+    // Upright is (1, 1, 1, 1)/2: the root's y axis points up. The lean is a rotation about the world's y axis.
     let (sin, cos) = (LEAN_DEGREES.to_radians() / 2.0).sin_cos();
     let (less, more) = ((cos - sin) / 2.0, (cos + sin) / 2.0);
     Motion {

@@ -1,4 +1,4 @@
-//! The clips of an experiment: which there are, and how to get at each.
+//! The clips of an experiment: their list, and how to read each of them.
 
 use std::{
     fmt,
@@ -8,31 +8,38 @@ use std::{
 use comic_experiment::ClipSource;
 use sha2::{Digest, Sha256};
 
-use crate::{
-    Clip, Entry, Error, WalkerModel, builtin, file::ClipFile, file::Header, nearest::hint, pose_to_action, subset,
-};
+use crate::builtin;
+use crate::clip::Clip;
+use crate::entry::Entry;
+use crate::error::Error;
+use crate::file::{ClipFile, Header};
+use crate::humanoid::{WalkerModel, pose_to_action};
+use crate::nearest::hint;
+use crate::subsets::subset;
 
 const BUILTIN: &str = "builtin:";
 
-/// An experiment's clip sources, opened. Cheap to open and to hold, whatever the size of the files: only the
-/// attributes of the chosen clips are read, and motion when [`Catalogue::load`] asks for it.
+/// The opened clip sources of an experiment.
+///
+/// Opening reads only the attributes of the chosen clips, so it is cheap for files of any size. [`Catalogue::load`]
+/// reads the motion of one clip.
 pub struct Catalogue {
     entries: Vec<Entry>,
-    /// For each entry, its place in `sources`.
+    /// For each entry, the index of its source in `sources`.
     source_of: Vec<usize>,
     sources: Vec<Source>,
 }
 
-/// A file that a catalogue reads, for actors to fetch and verify.
+/// A file that a catalogue reads. Actors fetch it and verify its hash.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Asset {
-    /// As the experiment names it.
+    /// The source as the experiment names it.
     pub source: String,
-    /// Where it is here.
+    /// The local path.
     pub path: PathBuf,
-    /// Of the whole file.
+    /// SHA-256 of the whole file.
     pub sha256: [u8; 32],
-    /// Bytes.
+    /// Length of the file, bytes.
     pub size: u64,
 }
 
@@ -42,18 +49,18 @@ enum Source {
 }
 
 impl Catalogue {
-    /// Opens every source; a file's path is the source itself. Clips are in the order of the sources, sorted by name
-    /// within one.
+    /// Opens every source. The source of a file is its path. The clips are in the order of the sources; within one
+    /// source they are sorted by name.
     ///
     /// # Errors
-    /// [`Error`], for a source, subset, clip or sub-range that there is not, and for a file whose attributes are not
+    /// [`Error`], for a source, subset, clip or sub-range that does not exist, and for a file whose attributes are not
     /// those of a clip.
     pub fn open(sources: &[ClipSource]) -> Result<Self, Error> {
         Self::open_with(sources, |source| Some(PathBuf::from(source)))
     }
 
-    /// [`Catalogue::open`] where `locate` says in which local file a source is, or `None` when there is none. Built-in
-    /// clips are not asked for.
+    /// Like [`Catalogue::open`], but `locate` gives the local path of a source, or `None` if there is no local file. It
+    /// is not called for built-in clips.
     ///
     /// # Errors
     /// As [`Catalogue::open`].
@@ -74,15 +81,16 @@ impl Catalogue {
         Ok(catalogue)
     }
 
-    /// The clips; a clip's index is its place here.
+    /// All clips. The index of a clip is its index in this slice.
     pub fn entries(&self) -> &[Entry] {
         &self.entries
     }
 
-    /// Reads one clip, whole; its sub-range is [`Entry::frames`].
+    /// Reads all frames of one clip. The frames in use are [`Entry::frames`].
     ///
     /// # Errors
-    /// [`Error::Malformed`] when a dataset is missing, mis-shaped or not finite; [`Error::NoSuchIndex`].
+    /// [`Error::Malformed`] for a dataset that is missing, has the wrong shape or is not finite;
+    /// [`Error::NoSuchIndex`].
     pub fn load(&self, index: usize) -> Result<Clip, Error> {
         let (entry, source) = self.at(index)?;
         match source {
@@ -91,7 +99,7 @@ impl Catalogue {
         }
     }
 
-    /// The files behind the clips, hashed, each once; built-in clips have none.
+    /// The files of the clips with their hashes, each file once. Built-in clips have no file.
     ///
     /// # Errors
     /// [`Error::Unreadable`].
@@ -107,8 +115,9 @@ impl Catalogue {
         Ok(assets)
     }
 
-    /// The action that aims at the clips' mean pose: the mean of [`pose_to_action`] over the frames in use of every
-    /// clip, each counted with its clip's weight; in `ctrl` order. Of files, only the joint angles are read.
+    /// The servo action that aims at the mean pose of the clips, in `ctrl` order, each entry in [−1, 1]. It is the mean
+    /// of [`pose_to_action`] over the frames in use of every clip, weighted by the weight of the clip. Only the joint
+    /// angles are read from files.
     ///
     /// # Errors
     /// As [`Catalogue::load`].
@@ -177,7 +186,7 @@ impl fmt::Debug for Catalogue {
     }
 }
 
-/// The clips of `file` that `source` asks for, sorted.
+/// The names of the clips in `file` that `source` selects, sorted.
 fn choose(source: &ClipSource, file: &ClipFile) -> Result<Vec<String>, Error> {
     let has = |name: &String| file.names().binary_search(name).is_ok();
     let known = || file.names().iter().map(String::as_str);
@@ -234,7 +243,8 @@ fn first_few(names: &[&str]) -> String {
     if names.len() > FEW { format!("{list}, …") } else { list }
 }
 
-/// A built-in clip named without its prefix, or the nearest HDF5 files in the same directory.
+/// A hint for a source that does not exist: the built-in clip with this name, or similar HDF5 files in the same
+/// directory.
 fn hint_for_file(source: &str, path: Option<&Path>) -> String {
     if builtin::builtin_names().contains(&source) {
         return format!(" (did you mean `{BUILTIN}{source}`?)");

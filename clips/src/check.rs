@@ -1,8 +1,9 @@
-//! Defects of clips, all of them at once.
+//! A search for all defects of clips.
 //!
-//! The limits are this project's choice: no source fixes them. They are wide enough for what people do (a run, a jump
-//! from a height), also where it is scaled to the body's size.
+//! The limits are this project's choice; no publication defines them. They allow what people do (a run, a jump from a
+//! height), also after scaling to the size of the body.
 
+mod defect;
 mod stored;
 mod tally;
 
@@ -10,84 +11,37 @@ use std::path::Path;
 
 use serde::Serialize;
 
+use crate::error::Error;
 use crate::file::{ClipFile, Header};
-use crate::{Error, WalkerModel};
+use crate::humanoid::WalkerModel;
+pub use defect::{
+    AIRBORNE, Defect, JOINT_EXCESS, JOINT_SPEED, Kind, LONGEST_FLIGHT, PENETRATION, ROOT_SPEED, ROOT_TURN,
+};
+
+use defect::unreadable;
 use stored::Columns;
 
-/// m: how deep a geom may sink into the floor, the plane z = 0.
-pub const PENETRATION: f64 = 0.02;
-/// m: what is higher above the floor than this, is in the air.
-pub const AIRBORNE: f64 = 0.05;
-/// s: longest flight; a person's centre of mass that rises by 0.8 m is back after that time.
-pub const LONGEST_FLIGHT: f64 = 0.8;
-/// rad: how far a joint may leave its range.
-pub const JOINT_EXCESS: f64 = 0.01;
-/// m/s: fastest root; sprinters reach 12, and clips are scaled by up to 1.4.
-pub const ROOT_SPEED: f64 = 17.0;
-/// rad/s: fastest turn of the root; skaters reach 30.
-pub const ROOT_TURN: f64 = 35.0;
-/// rad/s: fastest joint; kicks and throws of recorded clips reach 25.
-pub const JOINT_SPEED: f64 = 40.0;
-
-/// What is wrong.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "snake_case")]
-#[non_exhaustive]
-pub enum Kind {
-    /// A dataset or attribute is missing, mis-shaped or damaged; `detail` has the reason.
-    Unreadable,
-    /// NaN or infinity; `worst` is how many such numbers.
-    NotFinite,
-    /// A quaternion's norm is not 1; `worst` is how far off.
-    QuaternionNorm,
-    /// A joint leaves its range by more than [`JOINT_EXCESS`]; `worst` in rad.
-    JointLimit,
-    /// A geom is deeper in the floor than [`PENETRATION`]; `worst` in m.
-    Penetration,
-    /// The whole body is above [`AIRBORNE`] for longer than [`LONGEST_FLIGHT`]; `worst` is its height in m.
-    Floating,
-    /// The root or a joint moves faster from one frame to the next than [`ROOT_SPEED`], [`ROOT_TURN`] or
-    /// [`JOINT_SPEED`]; `worst` in m/s or rad/s.
-    Jump,
-}
-
-/// One defect of a clip.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Defect {
-    /// What is wrong.
-    pub kind: Kind,
-    /// Where: a dataset, a joint, a geom, or `root`.
-    pub item: String,
-    /// In how many frames.
-    pub frames: usize,
-    /// The first of them.
-    pub first_frame: usize,
-    /// The worst of it, in the kind's unit; 0 for what has no size.
-    pub worst: f64,
-    /// In words.
-    pub detail: String,
-}
-
-/// A clip, searched.
+/// The result for one clip.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Checked {
     /// The clip's name.
     pub clip: String,
-    /// How many frames it has; 0 when that cannot be read.
+    /// Number of frames; 0 if it cannot be read.
     pub frames: usize,
-    /// Whether joints and floor were checked: only the V2020 body's are known.
+    /// Whether joints and floor were checked. That is possible only for the V2020 body.
     pub body_checked: bool,
-    /// The lowest and the highest of the heights of the body's lowest point, m, where the body was checked.
+    /// Minimum and maximum, over all frames, of the height of the body's lowest point, m. `None` if the body was not
+    /// checked.
     pub lowest_point: Option<[f64; 2]>,
     /// All defects, sorted by kind.
     pub defects: Vec<Defect>,
 }
 
-/// Searches every clip of a file, or those `chosen`.
+/// Checks the `chosen` clips of a file; all clips if `chosen` is empty.
 ///
 /// # Errors
-/// [`Error::Unreadable`], [`Error::Malformed`], [`Error::NoClips`] and [`Error::NoSuchClip`] when there is no clip to
-/// be found; what is wrong with a clip is no error but a [`Defect`].
+/// [`Error::Unreadable`], [`Error::Malformed`], [`Error::NoClips`] and [`Error::NoSuchClip`], if a clip cannot be
+/// found. A clip that is damaged is not an error: it has a [`Defect`].
 pub fn check(path: &Path, chosen: &[String]) -> Result<Vec<Checked>, Error> {
     let file = ClipFile::open(path)?;
     if file.names().is_empty() {
@@ -125,12 +79,4 @@ fn check_clip(file: &ClipFile, name: &str) -> Checked {
     columns.jumps(dt, &mut defects);
     defects.sort_by_key(|defect| defect.kind);
     Checked { clip: name.into(), frames: steps, body_checked, lowest_point, defects }
-}
-
-fn unreadable(item: &str, error: &Error) -> Defect {
-    let detail = match error {
-        Error::Malformed { item, reason, .. } => format!("{item}: {reason}"),
-        error => error.to_string(),
-    };
-    Defect { kind: Kind::Unreadable, item: item.into(), frames: 0, first_frame: 0, worst: 0.0, detail }
 }

@@ -1,19 +1,20 @@
 //! A clip in memory.
 
-use crate::WalkerModel;
+use crate::humanoid::WalkerModel;
 
-/// One clip, whole: `T` frames, `dt` apart.
+/// One whole clip: T frames, `dt` seconds apart.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clip {
     /// The clip's name in its file, or a built-in clip's own name.
     pub name: String,
-    /// The body it was made for.
+    /// The body that the clip was made for.
     pub model: WalkerModel,
     /// Seconds between frames.
     pub dt: f64,
     /// Pose and velocity of root and joints.
     pub motion: Motion,
-    /// What the task compares the body with; `None` for built-in clips, whose features follow by forward kinematics.
+    /// The quantities that the task compares with the simulated body. `None` for built-in clips: forward kinematics
+    /// computes them.
     pub features: Option<Features>,
 }
 
@@ -24,31 +25,31 @@ impl Clip {
     }
 }
 
-/// The humanoid's generalised coordinates and velocities, one entry per frame in each field.
+/// The humanoid's generalised coordinates and velocities. Each field has one entry per frame.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Motion {
     /// Position of the root, m, world frame, z up.
     pub position: Vec<[f64; 3]>,
-    /// Orientation of the root, w x y z, world frame.
+    /// Orientation of the root, a unit quaternion w x y z, world frame.
     pub quaternion: Vec<[f64; 4]>,
     /// Joint angles, rad, in the order of [`JOINTS`](crate::JOINTS).
     pub joints: Vec<[f64; 56]>,
     /// Linear velocity of the root, m/s, world frame.
     pub velocity: Vec<[f64; 3]>,
-    /// Angular velocity of the root, rad/s, in the root's own frame.
+    /// Angular velocity of the root, rad/s, root frame.
     pub angular_velocity: Vec<[f64; 3]>,
     /// Joint velocities, rad/s, in the order of [`JOINTS`](crate::JOINTS).
     pub joints_velocity: Vec<[f64; 56]>,
 }
 
-/// Quantities that follow from the pose, as the file has them; `B` is [`WalkerModel::bodies`].
+/// Quantities that follow from the pose, as a file stores them. B is [`WalkerModel::bodies`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Features {
-    /// Centre of mass of the whole body, m, world frame, per frame.
+    /// Centre of mass of the whole body, m, world frame, one entry per frame.
     pub center_of_mass: Vec<[f64; 3]>,
-    /// rradius, lradius, rfoot, lfoot relative to the root, m, root frame, per frame.
+    /// Positions of rradius, lradius, rfoot and lfoot relative to the root, m, root frame, one entry per frame.
     pub end_effectors: Vec<[f64; 12]>,
-    /// The same four and the head, per frame.
+    /// The same for these four bodies and then the head.
     pub appendages: Vec<[f64; 15]>,
     /// Positions of the tracking bodies, `[T, B, 3]`, m, world frame.
     pub body_positions: Vec<f64>,

@@ -1,14 +1,15 @@
-//! What is known of a clip before its motion is read.
+//! A clip of a catalogue, without its motion.
 
 use std::ops::Range;
 
-use crate::{Error, WalkerModel};
+use crate::error::Error;
+use crate::humanoid::WalkerModel;
 
-/// Two time steps that differ by less than this (s) are the same.
+/// Two time steps that differ by less than this are equal, s.
 const TIMESTEP_TOLERANCE: f64 = 1e-9;
 
-/// One clip of a catalogue. Its index in [`Catalogue::entries`](crate::Catalogue::entries) is the clip's index
-/// everywhere: in the value function's embedding, on the wire, in metrics.
+/// One clip of a catalogue. Its index in [`Catalogue::entries`](crate::Catalogue::entries) is the index of the clip
+/// everywhere: in the value function's embedding, on the wire, and in metrics.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Entry {
     /// The clip's name in its file, or a built-in clip's own name (not its alias).
@@ -17,35 +18,35 @@ pub struct Entry {
     pub steps: usize,
     /// Seconds between frames.
     pub dt: f64,
-    /// The body it was made for.
+    /// The body that the clip was made for.
     pub model: WalkerModel,
-    /// First frame used.
+    /// The first frame in use.
     pub start_step: usize,
-    /// Last frame used, or `None` for the clip's end. At most `steps`; see [`Entry::frames`] and [`Entry::starts`].
+    /// The last frame in use, at most `steps`; `None` for the end of the clip. See [`Entry::frames`] and
+    /// [`Entry::starts`].
     pub end_step: Option<usize>,
-    /// Relative probability of each of its starts.
+    /// Relative probability of each start in this clip.
     pub weight: f64,
 }
 
 impl Entry {
-    /// The frames of the clip that the task sees: dm_control slices `[start_step : end_step + 1)`, one frame more
-    /// than starts are counted in, or up to the clip's end without `end_step`
+    /// The frames of the clip that the task uses. dm_control takes `[start_step : end_step + 1)`, which is one frame
+    /// more than [`Entry::starts`] counts; without `end_step`, all frames to the end of the clip
     /// (`locomotion/mocap/trajectory.py`, `Trajectory.as_dict`).
     pub fn frames(&self) -> Range<usize> {
         let end = self.end_step.map_or(self.steps, |end| (end + 1).min(self.steps));
         self.start_step..end
     }
 
-    /// Frames of the clip at which an episode may start when the task looks `look_ahead` frames ahead and an episode
-    /// must be able to last `min_steps` steps (`tracking.py`, `_get_possible_starts`); empty when there are none.
+    /// The frames at which an episode may start, possibly none. The task looks `look_ahead` frames ahead, and an
+    /// episode must be able to last `min_steps` steps (`tracking.py`, `_get_possible_starts`).
     pub fn starts(&self, look_ahead: usize, min_steps: usize) -> Range<usize> {
         let end = self.end_step.unwrap_or(self.steps).saturating_sub(look_ahead.saturating_add(min_steps));
         self.start_step..end.max(self.start_step)
     }
 
-    /// Whether a task can track this clip: its body is `expected`, its frames are `control_dt` seconds apart (to
-    /// 1e-9), and at least one frame can be a start, with the farthest reference `look_ahead` frames ahead and
-    /// `min_steps` steps left.
+    /// Checks that a task can track this clip: its body is `expected`, its time step is `control_dt` seconds (to 1e-9
+    /// s), and [`Entry::starts`] is not empty for `look_ahead` and `min_steps`.
     ///
     /// # Errors
     /// [`Error::WrongModel`], [`Error::WrongTimestep`], [`Error::TooShort`].
@@ -59,7 +60,7 @@ impl Entry {
         if self.model != expected {
             return Err(Error::WrongModel { name: self.name.clone(), has: self.model, expected });
         }
-        // Put so that a NaN is refused.
+        // The comparison refuses NaN.
         let same = (self.dt - control_dt).abs() < TIMESTEP_TOLERANCE;
         if !same {
             return Err(Error::WrongTimestep { name: self.name.clone(), dt: self.dt, expected: control_dt });
@@ -79,7 +80,7 @@ impl Entry {
         Ok(())
     }
 
-    /// Checks the sub-range against the clip's length.
+    /// Checks that the sub-range lies within the clip.
     pub(crate) fn check_range(&self) -> Result<(), Error> {
         let error =
             |field, value, allowed| Error::Range { name: self.name.clone(), field, value, allowed, steps: self.steps };
@@ -87,7 +88,7 @@ impl Entry {
             return Err(error("start_step", self.start_step, format!("at most {}", self.steps - 1)));
         }
         match self.end_step {
-            // dm_control takes larger ones and then starts episodes beyond the clip's end.
+            // dm_control accepts a larger `end_step`, and then starts episodes beyond the end of the clip.
             Some(end) if end <= self.start_step || end > self.steps => {
                 Err(error("end_step", end, format!("{} to {}", self.start_step + 1, self.steps)))
             }

@@ -1,90 +1,90 @@
-//! What can be wrong with a clip, a file of clips, or the choice of them.
+//! The errors of clips, of files of clips, and of the selection of clips.
 
 use std::path::PathBuf;
 
-use crate::WalkerModel;
+use crate::humanoid::WalkerModel;
 
-/// Every error of this crate; each message names file and item, and what to do.
+/// Every error of this crate. Each message names the file and the item, and says what to do.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The source is no file, and no built-in clip.
+    /// The source is neither a file nor a built-in clip.
     #[error("no clip file `{source_name}`{hint}")]
     NoSuchFile {
-        /// As the experiment names it.
+        /// The source as the experiment names it.
         source_name: String,
-        /// The nearest names beside it.
+        /// Similar names in the same directory.
         hint: String,
     },
-    /// The file is there and cannot be read.
+    /// The file exists and cannot be read.
     #[error("{}: cannot be read: {reason}", path.display())]
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// The operating system's words.
+        /// The operating system's error.
         reason: std::io::Error,
     },
-    /// Not HDF5, or damaged, or not in dm_control's layout.
+    /// The file is not HDF5, is damaged, or is not in dm_control's layout.
     #[error("{}: {item}: {reason}", path.display())]
     Malformed {
         /// The file.
         path: PathBuf,
         /// Group, attribute or dataset, as a path inside the file.
         item: String,
-        /// What is wrong with it, and what it should be.
+        /// What is wrong, and what is expected.
         reason: String,
     },
-    /// A file without a single clip.
-    #[error("{}: holds no clips; a clip is a group at the top of the file", path.display())]
+    /// The file has no clip.
+    #[error("{}: has no clips; a clip is a group at the top of the file", path.display())]
     NoClips {
         /// The file.
         path: PathBuf,
     },
-    /// The file has no clip of that name.
+    /// The file has no clip with this name.
     #[error("{}: no clip `{name}`{hint}", path.display())]
     NoSuchClip {
         /// The file.
         path: PathBuf,
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// The nearest names.
+        /// Similar names.
         hint: String,
     },
     /// `builtin:NAME` with an unknown NAME.
     #[error("no built-in clip `{name}`{hint}; built-in clips are {known}")]
     NoSuchBuiltin {
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// The nearest names.
+        /// Similar names.
         hint: String,
-        /// All of them.
+        /// All known names.
         known: String,
     },
-    /// An unknown subset.
+    /// No subset has this name.
     #[error("no subset `{name}`{hint}; subsets are {known}")]
     NoSuchSubset {
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// The nearest names.
+        /// Similar names.
         hint: String,
-        /// All of them.
+        /// All known names.
         known: String,
     },
-    /// The file lacks clips of the subset.
+    /// The file does not have all clips of the subset.
     #[error("{}: {missing} of the {total} clips of subset `{subset}` are missing: {first}; list the ids you have, or get the whole file", path.display())]
     SubsetIncomplete {
         /// The file.
         path: PathBuf,
         /// The subset.
         subset: String,
-        /// How many are missing.
+        /// Number of missing clips.
         missing: usize,
-        /// How many the subset has.
+        /// Number of clips in the subset.
         total: usize,
-        /// The first few of them.
+        /// The first missing names.
         first: String,
     },
-    /// A clip that is named although the subset does not have it.
+    /// A listed clip is not in the subset.
     #[error("{source_name}: clip `{name}` is not in subset `{subset}`{hint}; leave out the subset, or the clip")]
     NotInSubset {
         /// The source.
@@ -93,47 +93,47 @@ pub enum Error {
         name: String,
         /// The subset.
         subset: String,
-        /// The nearest names of the subset.
+        /// Similar names in the subset.
         hint: String,
     },
-    /// The same clip twice in one source.
-    #[error("{source_name}: clip `{name}` is listed twice; use weight to have more of it")]
+    /// A source lists the same clip twice.
+    #[error("{source_name}: clip `{name}` is listed twice; set weight to use it more often")]
     ListedTwice {
         /// The source.
         source_name: String,
         /// The clip.
         name: String,
     },
-    /// `subset` or `ids` with a built-in clip.
-    #[error("{source_name}: a built-in clip is a single clip, so it takes neither subset nor ids")]
+    /// A built-in clip has `subset` or `ids`.
+    #[error("{source_name}: a built-in clip is a single clip and has neither subset nor ids")]
     BuiltinSelection {
         /// The source.
         source_name: String,
     },
-    /// A sub-range that the clip does not have.
+    /// A sub-range is not within the clip.
     #[error("clip `{name}`: {field} = {value}: must be {allowed}; the clip has {steps} frames")]
     Range {
         /// The clip.
         name: String,
         /// `start_step` or `end_step`.
         field: &'static str,
-        /// As given.
+        /// The given value.
         value: usize,
-        /// What it may be.
+        /// The allowed values.
         allowed: String,
-        /// T.
+        /// T, the number of frames.
         steps: usize,
     },
-    /// A weight that is none.
+    /// A weight is negative or not finite.
     #[error("{source_name}: weight = {weight}: must be a finite number, 0 or more")]
     Weight {
         /// The source.
         source_name: String,
-        /// As given.
+        /// The given value.
         weight: f64,
     },
-    /// A clip for another body.
-    #[error("clip `{name}` was made for the {has} ({} bodies), this is the {expected} ({} bodies); use clips of that body", has.bodies(), expected.bodies())]
+    /// The clip was made for another body.
+    #[error("clip `{name}` was made for the {has} ({} bodies), not for the {expected} ({} bodies); use clips of that body", has.bodies(), expected.bodies())]
     WrongModel {
         /// The clip.
         name: String,
@@ -142,101 +142,101 @@ pub enum Error {
         /// The body in use.
         expected: WalkerModel,
     },
-    /// A clip whose frames are not one control step apart.
+    /// The time step of the clip is not the control time step.
     #[error(
         "clip `{name}` has dt = {dt} s, expected {expected} s; a control step is one frame, so all clips of an experiment have the same dt"
     )]
     WrongTimestep {
         /// The clip.
         name: String,
-        /// Its dt, s.
+        /// Time step of the clip, s.
         dt: f64,
-        /// The control timestep, s.
+        /// The control time step, s.
         expected: f64,
     },
-    /// No frame of the clip can be a start.
+    /// No frame of the clip can be the start of an episode.
     #[error(
-        "clip `{name}` is too short: its frames {first} to {last} are {frames}, but looking {look_ahead} frames ahead for at least {min_steps} steps needs {needed}; lower tracking.reference_steps or tracking.min_steps, or leave it out"
+        "clip `{name}` is too short: frames {first} to {last} are {frames} frames, but {min_steps} steps that look {look_ahead} frames ahead need {needed}; lower tracking.reference_steps or tracking.min_steps, or remove the clip"
     )]
     TooShort {
         /// The clip.
         name: String,
         /// First frame that may be a start.
         first: usize,
-        /// Last frame that counts for starts.
+        /// Last frame that may be a start.
         last: usize,
-        /// How many that are.
+        /// Number of these frames.
         frames: usize,
-        /// The farthest reference frame.
+        /// Distance to the farthest reference, frames.
         look_ahead: usize,
-        /// Steps a started episode must at least be able to last.
+        /// Least number of steps that an episode must be able to last.
         min_steps: usize,
-        /// How many frames it would take.
+        /// Number of frames that are needed.
         needed: usize,
     },
-    /// A clip's index beyond the catalogue.
+    /// The catalogue has no clip with this index.
     #[error("no clip with index {index}; the experiment has {clips} clips")]
     NoSuchIndex {
         /// The index.
         index: usize,
-        /// How many there are.
+        /// Number of clips.
         clips: usize,
     },
-    /// A line of an ASF or AMC file.
+    /// A line of an ASF or AMC file is invalid.
     #[error("{}:{line}: {reason}", path.display())]
     Line {
         /// The file.
         path: PathBuf,
-        /// Counted from 1.
+        /// Number of the line, from 1.
         line: usize,
-        /// What is wrong with it, and what it should be.
+        /// What is wrong, and what is expected.
         reason: String,
     },
-    /// A recording, skeleton or manifest that cannot be imported.
+    /// A recording, skeleton or manifest cannot be imported.
     #[error("{}: {reason}", path.display())]
     Recording {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         reason: String,
     },
-    /// A constant of an import that is out of bounds.
+    /// A constant of an import is out of bounds.
     #[error("{what} {value}: expected {expected}")]
     Constant {
-        /// Which.
+        /// Name of the constant.
         what: &'static str,
-        /// As given.
+        /// The given value.
         value: String,
-        /// What it may be.
+        /// The allowed values.
         expected: &'static str,
     },
-    /// The output is there already.
+    /// The output file exists already.
     #[error("{} exists; add --force to replace it, or name another file", path.display())]
     Exists {
         /// The file.
         path: PathBuf,
     },
-    /// A file cannot be written.
+    /// The file cannot be written.
     #[error("{}: cannot be written: {reason}", path.display())]
     Unwritable {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         reason: String,
     },
-    /// Two clips of one name in one file.
-    #[error("clip `{name}` comes twice, and a file has each name once; choose clips with FILE.h5#CLIP,CLIP")]
+    /// A file has two clips with the same name.
+    #[error("clip `{name}` occurs twice, but names in a file are unique; select clips with FILE.h5#CLIP,CLIP")]
     NameTaken {
         /// The name.
         name: String,
     },
-    /// A name that no clip can have.
-    #[error("`{name}` is no name for a clip: it takes 1 to 200 characters, none of them `/` or `.` or a space")]
+    /// The name is not allowed for a clip.
+    #[error("`{name}` is not a valid name of a clip: a name has 1 to 200 bytes, without `/`, `.` and spaces")]
     Name {
         /// The name.
         name: String,
     },
-    /// An experiment without a clip source, or with weight 0 for each.
-    #[error("clips: no source with a weight above 0; name a file or a built-in clip")]
+    /// The experiment has no clip source with a weight above 0.
+    #[error("clips: no source has a weight above 0; name a file or a built-in clip")]
     NoSources,
 }

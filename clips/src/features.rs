@@ -1,14 +1,15 @@
-//! What follows from the pose by forward kinematics.
+//! The features of a motion, by forward kinematics.
 
 use crate::body::{BODIES, Frames, ROOT, body};
+use crate::clip::{Features, Motion};
 use crate::spatial::{subtract, unrotate};
-use crate::{Features, Motion};
 
-/// dm_control's order of `appendages`: the four end effectors, then the head.
+/// The bodies of `appendages` in dm_control's order: the four end effectors, then the head.
 const APPENDAGES: [usize; 5] = [body("rradius"), body("lradius"), body("rfoot"), body("lfoot"), body("head")];
 
 impl Features {
-    /// Forward kinematics of the CMU humanoid V2020 over a motion, as dm_control's converters store it.
+    /// Computes the features of every frame of a motion for the CMU humanoid V2020, in the layout of dm_control's
+    /// converters.
     pub fn of(motion: &Motion) -> Self {
         let mut features = Self::default();
         for ((position, quaternion), joints) in motion.position.iter().zip(&motion.quaternion).zip(&motion.joints) {

@@ -1,4 +1,4 @@
-//! An HDF5 file in the layout of dm_control's mocap files, read clip by clip.
+//! An HDF5 file in the layout of dm_control's mocap files. Each clip is read on its own.
 
 use std::{
     ops::RangeInclusive,
@@ -9,27 +9,30 @@ use std::{
 
 use hdf5_reader::{FileStorage, Hdf5File, OpenOptions, Storage, error::Error as Hdf5Error, group::Group};
 
-use crate::{Clip, Error, Features, Motion, WalkerModel};
+use crate::clip::{Clip, Features, Motion};
+use crate::error::Error;
+use crate::humanoid::WalkerModel;
 
-/// Longest clip taken: 50 minutes at 0.03 s; the longest of CMU's has 6,371 frames. It bounds what a hostile
-/// `num_steps` can make us allocate (340 MB).
+/// Allowed number of frames: at most 50 minutes at 0.03 s. The longest clip of CMU has 6,371 frames. The limit bounds
+/// the memory that a hostile `num_steps` can claim to 340 MB.
 const STEPS: RangeInclusive<u64> = 1..=100_000;
-/// Longest time step taken, s; dm_control's files have 0.03 and 0.05.
+/// Longest allowed time step, s. dm_control's files have 0.03 and 0.05.
 const LONGEST_TIMESTEP: f64 = 1.0;
-/// How far a quaternion's norm may be from 1.
+/// Greatest difference between the norm of a quaternion and 1.
 pub(crate) const NORM_TOLERANCE: f64 = 1e-2;
-/// The largest dataset of the longest clip: 31 quaternions a frame.
+/// Bytes of the largest dataset of the longest clip: 31 quaternions per frame.
 const LARGEST_READ: usize = 100_000 * 31 * 4 * size_of::<f64>();
 
-/// A dataset as stored.
+/// A dataset as the file stores it.
 pub(crate) struct Stored {
     pub(crate) field: &'static str,
-    /// Numbers a frame.
+    /// Numbers per frame.
     pub(crate) width: usize,
+    /// `(width, T)`, row by row.
     pub(crate) rows: Result<Vec<f64>, Error>,
 }
 
-/// Every dataset of a clip and how many numbers it has a frame.
+/// Every dataset of a clip, with its numbers per frame.
 pub(crate) fn widths(model: WalkerModel) -> [(&'static str, usize); 11] {
     let bodies = model.bodies();
     [
@@ -47,7 +50,7 @@ pub(crate) fn widths(model: WalkerModel) -> [(&'static str, usize); 11] {
     ]
 }
 
-/// What a clip's attributes say.
+/// The attributes of a clip.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Header {
     pub(crate) steps: usize,
@@ -55,10 +58,10 @@ pub(crate) struct Header {
     pub(crate) model: WalkerModel,
 }
 
-/// An open file; reading needs no lock, and takes from the file only what it returns.
+/// An open file. Reading needs no lock, and reads from the disk only what it returns.
 pub(crate) struct ClipFile {
     path: PathBuf,
-    /// Read by position, not mapped: a file cut short under a map would kill the process.
+    /// The file is read by position and not memory-mapped: if a mapped file is truncated, the process dies.
     storage: Arc<dyn Storage>,
     names: Vec<String>,
 }
@@ -77,7 +80,7 @@ impl ClipFile {
         Ok(Self { path: path.into(), storage, names })
     }
 
-    /// Every clip of the file, sorted.
+    /// The names of all clips of the file, sorted.
     pub(crate) fn names(&self) -> &[String] {
         &self.names
     }
@@ -86,7 +89,7 @@ impl ClipFile {
         &self.path
     }
 
-    /// Reads the attributes of these clips, none of their data.
+    /// Reads the attributes of these clips, without their datasets.
     pub(crate) fn headers(&self, names: &[String]) -> Result<Vec<Header>, Error> {
         let root = self.root()?;
         names.iter().map(|name| self.header(&root, name)).collect()
@@ -126,8 +129,8 @@ impl ClipFile {
         Ok(Clip { name: name.into(), model, dt, motion, features: Some(features) })
     }
 
-    /// Reads whatever can be read of a clip, for a search for defects: its header, and each dataset, `(width, T)` row
-    /// by row, its shape checked and nothing else.
+    /// Reads a clip for the check for defects: the header and each dataset that can be read. Only the shape of a
+    /// dataset is checked.
     pub(crate) fn stored(&self, name: &str) -> Result<(Header, Vec<Stored>), Error> {
         let root = self.root()?;
         let header = self.header(&root, name)?;
@@ -152,18 +155,19 @@ impl ClipFile {
         let group = self.guarded(&clip, || root.group(name))?;
         let dt = self.number(&group, &clip, "dt")?;
         if !(dt > 0.0 && dt <= LONGEST_TIMESTEP) {
-            return Err(self.malformed(&format!("{clip}@dt"), format!("{dt} s is no time step; dm_control's is 0.03")));
+            return Err(self
+                .malformed(&format!("{clip}@dt"), format!("{dt} s is not a valid time step; dm_control uses 0.03 s")));
         }
         let steps = self.whole(&group, &clip, "num_steps")?;
         if !STEPS.contains(&steps) {
-            let reason = format!("{steps} frames; a clip has {} to {}", STEPS.start(), STEPS.end());
+            let reason = format!("{steps} frames; a clip must have {} to {}", STEPS.start(), STEPS.end());
             return Err(self.malformed(&format!("{clip}@num_steps"), reason));
         }
         let item = format!("{clip}/walkers/walker_0");
         let walker = self.guarded(&item, || group.group("walkers")?.group("walker_0"))?;
         let model = self.whole(&walker, &item, "model")?;
         let model = WalkerModel::from_attribute(model).ok_or_else(|| {
-            let reason = format!("unknown body {model}; known are 1 (CMU humanoid V2019) and 4 (CMU humanoid V2020)");
+            let reason = format!("unknown body {model}; expected 1 (CMU humanoid V2019) or 4 (CMU humanoid V2020)");
             self.malformed(&format!("{item}@model"), reason)
         })?;
         Ok(Header { steps: steps as usize, dt, model })
@@ -175,11 +179,11 @@ impl ClipFile {
 
     fn whole(&self, group: &Group, item: &str, attribute: &str) -> Result<u64, Error> {
         let number = self.number(group, item, attribute)?;
-        // Every whole number that means anything here is far below 2^53.
+        // Every valid number here is far below 2^53, so f64 represents it exactly.
         if number.fract() == 0.0 && (0.0..=1e15).contains(&number) {
             Ok(number as u64)
         } else {
-            Err(self.malformed(&format!("{item}@{attribute}"), format!("{number} is no count")))
+            Err(self.malformed(&format!("{item}@{attribute}"), format!("{number} is not a valid count")))
         }
     }
 
@@ -192,7 +196,7 @@ impl ClipFile {
     }
 }
 
-/// The reader keeps what it has parsed for as long as it lives, so each call has its own.
+/// The HDF5 reader never frees what it has parsed, so every call makes a new one.
 fn hdf5(storage: &Arc<dyn Storage>) -> Result<Hdf5File, Hdf5Error> {
     let options = OpenOptions::default()
         .with_chunk_cache_bytes(0)
@@ -202,13 +206,12 @@ fn hdf5(storage: &Arc<dyn Storage>) -> Result<Hdf5File, Hdf5Error> {
     Hdf5File::from_storage_with_options(storage.clone(), options)
 }
 
-/// Runs the HDF5 reader. It reports damage as errors; should a damaged file make it panic all the same, that is an
-/// error too.
+/// Runs the HDF5 reader. It reports damage as errors; if it panics on a damaged file, the panic becomes an error too.
 fn guarded<T>(path: &Path, item: &str, read: impl FnOnce() -> Result<T, Hdf5Error>) -> Result<T, Error> {
     let reason = match catch_unwind(AssertUnwindSafe(read)) {
         Ok(Ok(value)) => return Ok(value),
         Ok(Err(error)) => reason(&error),
-        Err(_) => "damaged: the HDF5 reader gave up; get the file again".into(),
+        Err(_) => "damaged: the HDF5 reader failed; get the file again".into(),
     };
     Err(Error::Malformed { path: path.into(), item: item.into(), reason })
 }
@@ -217,7 +220,7 @@ fn reason(error: &Hdf5Error) -> String {
     match error {
         Hdf5Error::Context { source, .. } => reason(source),
         Hdf5Error::GroupNotFound(_) | Hdf5Error::DatasetNotFound(_) | Hdf5Error::AttributeNotFound(_) => {
-            "missing; every clip of dm_control's layout has it".into()
+            "missing; every clip in dm_control's layout has it".into()
         }
         Hdf5Error::InvalidMagic => "not an HDF5 file".into(),
         error => error.to_string(),
@@ -233,21 +236,21 @@ struct Walker<'a> {
 }
 
 impl Walker<'_> {
-    /// A dataset `(N, T)` as T frames.
+    /// Reads a dataset `(N, T)` as T frames.
     fn frames<const N: usize>(&self, field: &str) -> Result<Vec<[f64; N]>, Error> {
         let rows = self.rows(field, N)?;
         let steps = self.header.steps;
         Ok((0..steps).map(|t| std::array::from_fn(|row| rows[row * steps + t])).collect())
     }
 
-    /// A dataset `(width, T)` as `[T, width]`, flattened.
+    /// Reads a dataset `(width, T)` as `[T, width]`, flattened.
     fn flat(&self, field: &str, width: usize) -> Result<Vec<f64>, Error> {
         let rows = self.rows(field, width)?;
         let steps = self.header.steps;
         Ok((0..steps).flat_map(|t| rows.iter().skip(t).step_by(steps).copied()).collect())
     }
 
-    /// A dataset as stored, `(width, T)` row by row, its shape and every number checked.
+    /// Reads a dataset `(width, T)` row by row. Checks its shape and that every number is finite.
     fn rows(&self, field: &str, width: usize) -> Result<Vec<f64>, Error> {
         let (rows, steps) = (self.stored(field, width)?, self.header.steps);
         match rows.iter().position(|number: &f64| !number.is_finite()) {
@@ -260,7 +263,7 @@ impl Walker<'_> {
         }
     }
 
-    /// The same, whatever the numbers.
+    /// Reads a dataset `(width, T)` row by row. Checks only its shape.
     fn stored(&self, field: &str, width: usize) -> Result<Vec<f64>, Error> {
         let item = format!("{}/{field}", self.item);
         let steps = self.header.steps;
@@ -284,7 +287,7 @@ impl Walker<'_> {
         let per_frame = quaternions.len() / 4 / self.header.steps;
         for (index, quaternion) in quaternions.chunks_exact(4).enumerate() {
             let norm = quaternion.iter().map(|part| part * part).sum::<f64>().sqrt();
-            // A norm may overflow to infinity, but is no NaN: the numbers are finite.
+            // The norm may overflow to infinity, but it cannot be NaN, because all numbers are finite.
             if (norm - 1.0).abs() >= NORM_TOLERANCE {
                 let reason = format!("a quaternion of frame {} has norm {norm}, expected 1", index / per_frame);
                 return Err(self.file.malformed(&format!("{}/{field}", self.item), reason));

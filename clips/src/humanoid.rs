@@ -1,9 +1,9 @@
-//! The CMU humanoid's hinges, in the two orders in use, and the map from a pose to an action.
+//! The CMU humanoid's hinges in the two orders that are in use, and the map from a pose to a servo action.
 
 use std::fmt;
 
-/// Hinges in the order of `qpos[7:]` and of every clip: depth first through the body, `rz`, `ry`, `rx` within one
-/// (dm_control's `_CMU_MOCAP_JOINTS`).
+/// Hinges in the order of `qpos[7:]` and of every clip: depth first through the bodies, and `rz`, `ry`, `rx` within one
+/// body (dm_control's `_CMU_MOCAP_JOINTS`).
 #[rustfmt::skip]
 pub const JOINTS: [&str; 56] = [
     "lfemurrz", "lfemurry", "lfemurrx", "ltibiarx", "lfootrz", "lfootrx", "ltoesrx", "rfemurrz", "rfemurry",
@@ -15,7 +15,7 @@ pub const JOINTS: [&str; 56] = [
     "rradiusrx", "rwristry", "rhandrz", "rhandrx", "rfingersrx", "rthumbrz", "rthumbrx",
 ];
 
-/// Lowest and highest angle of each of [`JOINTS`], rad (`humanoid_CMU_V2020.xml`).
+/// Lowest and highest angle of each joint of [`JOINTS`], rad (`humanoid_CMU_V2020.xml`).
 #[rustfmt::skip]
 #[allow(clippy::approx_constant, reason = "the XML's own digits")]
 pub const JOINT_RANGES: [[f64; 2]; 56] = [
@@ -33,7 +33,8 @@ pub const JOINT_RANGES: [[f64; 2]; 56] = [
     [-1.5708, 1.5708], [0.0, 1.5708], [-0.785398, 0.785398], [0.0, 1.57],
 ];
 
-/// Hinges in the order of `ctrl`, and so of an action: alphabetical, as dm_control adds the position actuators.
+/// Hinges in the order of `ctrl` and of an action: alphabetical, the order in which dm_control adds the position
+/// actuators.
 #[rustfmt::skip]
 pub const ACTUATORS: [&str; 56] = [
     "headrx", "headry", "headrz", "lclaviclery", "lclaviclerz", "lfemurrx", "lfemurry", "lfemurrz", "lfingersrx",
@@ -45,14 +46,14 @@ pub const ACTUATORS: [&str; 56] = [
     "upperbackrx", "upperbackry", "upperbackrz", "upperneckrx", "upperneckry", "upperneckrz",
 ];
 
-/// For each of [`ACTUATORS`] its place in [`JOINTS`].
+/// For each actuator of [`ACTUATORS`], the index of its hinge in [`JOINTS`].
 #[rustfmt::skip]
 pub const ACTUATOR_JOINTS: [usize; 56] = [
     31, 30, 29, 33, 32, 2, 1, 0, 41, 5, 4, 40, 39, 36, 35, 34, 16, 15, 14, 25, 24, 23, 37, 43, 42, 3, 6, 38, 45,
     44, 9, 8, 7, 53, 12, 11, 52, 51, 48, 47, 46, 49, 55, 54, 10, 13, 50, 22, 21, 20, 19, 18, 17, 28, 27, 26,
 ];
 
-/// Which of dm_control's CMU humanoids a clip was made for.
+/// A version of dm_control's CMU humanoid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum WalkerModel {
     /// `humanoid_CMU_V2019.xml`.
@@ -62,7 +63,7 @@ pub enum WalkerModel {
 }
 
 impl WalkerModel {
-    /// Tracking bodies, all but the root: 30, or 31 with V2020's `face`.
+    /// Number of tracking bodies, which are all bodies except the root: 30, or 31 for V2020, which has `face`.
     pub const fn bodies(self) -> usize {
         match self {
             Self::Cmu2019 => 30,
@@ -70,7 +71,7 @@ impl WalkerModel {
         }
     }
 
-    /// As the attribute `model` has it.
+    /// The value of the attribute `model` in a file.
     pub(crate) fn attribute(self) -> i64 {
         match self {
             Self::Cmu2019 => 1,
@@ -78,7 +79,7 @@ impl WalkerModel {
         }
     }
 
-    /// From the attribute `model` of a file (`WalkerModel` in dm_control's `mocap.proto`).
+    /// The body with this value of the attribute `model` (`WalkerModel` in dm_control's `mocap.proto`).
     pub(crate) fn from_attribute(number: u64) -> Option<Self> {
         match number {
             1 => Some(Self::Cmu2019),
@@ -97,9 +98,11 @@ impl fmt::Display for WalkerModel {
     }
 }
 
-/// The action, in `ctrl` order and each in [−1, 1], whose position servos aim at the pose `joints` (rad, in `qpos`
-/// order): u = (2q − (hi + lo)) / (hi − lo), clipped where the pose is beyond the V2020 ranges
-/// (dm_control's `cmu_pose_to_actuation`).
+/// The servo action that aims at the pose `joints` (rad, in `qpos` order). The action is in `ctrl` order, and each
+/// entry is in [−1, 1].
+///
+/// u = (2q − (hi + lo)) / (hi − lo), clipped if the pose is beyond the V2020 ranges (dm_control's
+/// `cmu_pose_to_actuation`).
 pub fn pose_to_action(joints: &[f64; 56]) -> [f64; 56] {
     ACTUATOR_JOINTS.map(|joint| {
         let [low, high] = JOINT_RANGES[joint];

@@ -1,9 +1,13 @@
-//! Clips from CMU's own recordings: ASF (a skeleton) and AMC (its angles, 120 frames a second).
+//! Makes clips from CMU's own recordings: ASF (a skeleton) and AMC (its angles, 120 frames per second).
 //!
 //! # Layout
-//! The order of the work: `asf` and `amc` read, `sole` takes the subject's soles off the ankles, `angles` brings angles
-//! into the body's ranges and `arms` the arms that do not fit, `resample` smooths and goes from 1/120 s to 0.03 s,
-//! `floor` sets the body on the floor, and velocities and features follow from the poses.
+//! The modules in the order of their work:
+//! - `asf` and `amc` read the files;
+//! - `sole` corrects the ankles by the pitch of the subject's soles;
+//! - `angles` moves angles into the body's ranges, and `arms` fits the arms that are outside their ranges;
+//! - `resample` smooths, and goes from 1/120 s to 0.03 s per frame;
+//! - `floor` puts the body on the floor;
+//! - `velocity` computes velocities from the poses, and [`Features::of`] the features.
 
 mod amc;
 mod angles;
@@ -20,43 +24,32 @@ mod velocity;
 
 use std::f64::consts::FRAC_PI_2;
 use std::ops::Range;
-use std::path::PathBuf;
 
-pub use constants::{Constants, Floor, Taken};
+pub use constants::{Constants, Floor, Take, UsedConstants};
 pub use manifest::read_manifest;
 
+use crate::clip::{Clip, Features};
+use crate::error::Error;
+use crate::humanoid::WalkerModel;
 use crate::spatial::{Quaternion, Vector, about, multiply};
-use crate::{Clip, Error, Features, WalkerModel};
 use amc::Recording;
 use asf::Skeleton;
 use floor::Poses;
 
-/// s: dm_control's control timestep for the CMU clips.
+/// Control time step of dm_control for the CMU clips, s.
 const DT: f64 = 0.03;
-/// The smoothing looks this many recorded frames beyond the ones in use.
+/// Recorded frames beyond the frames in use that the smoothing reads, on each side.
 const SMOOTHING_REACH: usize = 2;
 
-/// A recording and what its clip shall be.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Take {
-    /// The clip's name.
-    pub name: String,
-    /// The subject's skeleton.
-    pub asf: PathBuf,
-    /// The recording.
-    pub amc: PathBuf,
-    /// What is known of it.
-    pub constants: Constants,
-}
-
-/// Converts a recording to a clip of the CMU humanoid V2020, 0.03 s a frame.
+/// Converts a recording to a clip of the CMU humanoid V2020 with 0.03 s per frame. Also returns the constants that were
+/// used.
 ///
-/// Velocities are central differences, since what is compared with them is an instantaneous velocity. Everything but
-/// the time is scaled by the body's leg over the subject's.
+/// Velocities are central differences, because the task compares them with instantaneous velocities. Lengths are scaled
+/// by the ratio of the body's leg to the subject's leg; the time is not scaled.
 ///
 /// # Errors
 /// [`Error::Unreadable`], [`Error::Line`] and [`Error::Recording`] for files that are not CMU's; [`Error::Constant`].
-pub fn import(take: &Take) -> Result<(Clip, Taken), Error> {
+pub fn import(take: &Take) -> Result<(Clip, UsedConstants), Error> {
     let constants = &take.constants;
     constants.check()?;
     let skeleton = Skeleton::read(&take.asf)?;
@@ -64,7 +57,7 @@ pub fn import(take: &Take) -> Result<(Clip, Taken), Error> {
     let frames = window(take, recording.root.len())?;
     let mut notes = Vec::new();
     if let Some(gap) = recording.gap {
-        notes.push(format!("frame {gap} of {} does not follow the one before it", take.amc.display()));
+        notes.push(format!("frame {gap} of {} does not follow the previous frame", take.amc.display()));
     }
 
     let scale = constants.scale.unwrap_or(skeleton.scale);
@@ -94,30 +87,30 @@ pub fn import(take: &Take) -> Result<(Clip, Taken), Error> {
     let features = Features::of(&motion);
     let name = take.name.clone();
     let clip = Clip { name, model: WalkerModel::Cmu2020, dt: DT, motion, features: Some(features) };
-    Ok((clip, Taken { scale, sole_degrees, floor, arm_regularisation, frames, notes }))
+    Ok((clip, UsedConstants { scale, sole_degrees, floor, arm_regularisation, frames, notes }))
 }
 
-/// The recorded frames in use; there must be two poses in them, for a velocity.
+/// The recorded frames in use. They must give two poses, because a velocity needs two.
 fn window(take: &Take, recorded: usize) -> Result<Range<usize>, Error> {
     let Range { start, end } = take.constants.frames.clone().unwrap_or(0..recorded);
     let frames = start..end.min(recorded);
     if resample::poses(&frames) < 2 {
         let reason = format!(
-            "frames {start}..{end} of {recorded} are too few: a clip takes at least 5 frames, which are counted from 0"
+            "frames {start}..{end} of {recorded} are too few: a clip needs at least 5 frames; frames are counted from 0"
         );
         return Err(Error::Recording { path: take.amc.clone(), reason });
     }
     Ok(frames)
 }
 
-/// The root of every recorded frame, in the body's world: z up, m.
+/// The root in every recorded frame: position (m) and orientation in the world frame, z up.
 struct Root {
     position: Vec<Vector>,
     quaternion: Vec<Quaternion>,
 }
 
 impl Root {
-    /// `meters` in one of the file's units; there y is up.
+    /// Converts from the file's frame, in which y is up. One unit of the file is `meters` m.
     fn of(recording: &Recording, meters: f64) -> Self {
         let turn = |[_, _, _, x, y, z]: &[f64; 6]| {
             let [x, y, z] = [x, y, z].map(|degrees| degrees.to_radians());
@@ -131,20 +124,21 @@ impl Root {
     }
 }
 
-/// The sole pitch of the frames in use, with a note for a foot that has none.
+/// The sole pitch in the frames in use, degrees, left and right. Adds a note for a foot without one.
 fn find_soles(root: &Root, recorded: &[[f64; 56]], frames: &Range<usize>, notes: &mut Vec<String>) -> [f64; 2] {
     let fitted = angles::fit(recorded, frames);
     let poses = frames.clone().map(|frame| (root.position[frame], root.quaternion[frame], fitted.joints[frame]));
     let found = sole::find(poses);
     for (side, _) in ["left", "right"].iter().zip(found).filter(|(_, found)| found.is_none()) {
         notes.push(format!(
-            "the {side} foot never stands, so its sole is left as recorded; give --sole-deg if it is not level"
+            "the {side} foot never stands, so its sole pitch is not corrected; give --sole-deg if the sole is not level"
         ));
     }
     found.map(Option::unwrap_or_default)
 }
 
 impl Poses {
+    /// Moves all poses so that the first one is at x = y = 0.
     fn start_at_origin(&mut self) {
         let [x, y, _] = self.position.first().copied().unwrap_or_default();
         for position in &mut self.position {

@@ -1,18 +1,19 @@
-//! Motion-capture clips: what the humanoid is asked to track. Knows neither simulator nor wire nor networks.
+//! Motion-capture clips: the reference motions of the tracking task. This crate uses no simulator, no gRPC and no
+//! networks.
 //!
 //! # Layout
-//! - [`Catalogue`] is the entry: an experiment's clip sources, opened. Its [`Entry`]s tell names, lengths, sub-ranges
-//!   and weights without reading any motion; [`Catalogue::load`] reads one [`Clip`].
-//! - [`JOINTS`], [`JOINT_RANGES`], [`ACTUATORS`] are the CMU humanoid's hinges; [`pose_to_action`] turns a pose into
-//!   the action whose servos aim at it.
-//! - [`import`] makes clips of CMU's ASF and AMC files, [`check`] finds defects, [`ClipWriter`] writes files that
-//!   dm_control reads, [`merge()`] makes one of several. They know the body as rigid bodies, by forward kinematics.
-//! - [`subset`] knows dm_control's named subsets, [`builtin_names`] what can follow `builtin:`.
+//! - [`Catalogue`] is the entry point: the opened clip sources of an experiment. Its [`Entry`]s have names, lengths,
+//!   sub-ranges and weights, without the motion; [`Catalogue::load`] reads one [`Clip`].
+//! - [`JOINTS`], [`JOINT_RANGES`] and [`ACTUATORS`] describe the CMU humanoid's hinges; [`pose_to_action`] computes the
+//!   servo action that aims at a pose.
+//! - [`import`] makes clips from CMU's ASF and AMC files, [`check`] finds defects, [`ClipWriter`] writes files that
+//!   dm_control reads, and [`merge()`] joins several files. They compute body positions by forward kinematics.
+//! - [`subset`] lists dm_control's named subsets, [`builtin_names`] the names that can follow `builtin:`.
 //!
 //! A source is `builtin:NAME` (compiled in, or made by the program) or the path of an HDF5 file in the layout of
-//! dm_control's mocap files: a group per clip, in it `walkers/walker_0` with one float64 dataset `(dim, T)` per
-//! quantity. Files are read lazily, by position, in pure Rust; whatever a file holds, the outcome is a clip or an
-//! [`Error`] that names file and dataset, never a panic.
+//! dm_control's mocap files. Such a file has a group per clip. The group has a group `walkers/walker_0` with one
+//! float64 dataset `(dim, T)` per quantity. Files are read lazily, by position, in pure Rust. For any content, reading
+//! gives a clip or an [`Error`] that names file and dataset; it never panics.
 
 mod body;
 mod builtin;

@@ -1,17 +1,21 @@
-//! One file of several.
+//! Joining several files into one.
 
 use std::path::Path;
 
 use comic_experiment::ClipSource;
 
-use crate::{Catalogue, ClipWriter, Error};
+use crate::catalogue::Catalogue;
+use crate::error::Error;
+use crate::write::ClipWriter;
 
-/// Writes the clips of all `sources` into one new file, whole, in the order of the sources; returns how many. Built-in
-/// clips get their features by forward kinematics. Only what is used of a clip goes along: markers, props and dates of
-/// the recording do not.
+/// Writes all frames of the clips of all `sources` into one new file, in the order of the sources. Returns the number
+/// of clips. `progress` gets the number of written clips and the total.
+///
+/// Forward kinematics computes the features of built-in clips. Markers, props and dates of a recording are not copied.
 ///
 /// # Errors
-/// As [`Catalogue::open`], [`Catalogue::load`] and [`ClipWriter`]: a clip that cannot be read is not merged.
+/// The errors of [`Catalogue::open`], [`Catalogue::load`] and [`ClipWriter`]. If one clip cannot be read, no file is
+/// written.
 pub fn merge(
     sources: &[ClipSource],
     path: &Path,

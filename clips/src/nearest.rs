@@ -1,11 +1,11 @@
-//! "Did you mean": the nearest known names.
+//! Suggestions of similar names for a name that is unknown.
 
 use strsim::normalized_damerau_levenshtein;
 
-/// Below this similarity a name is no help.
+/// Least similarity of a suggested name.
 const SIMILAR: f64 = 0.55;
 
-/// ` (did you mean `a`, `b` or `c`?)`, the nearest first, or nothing when no name is near.
+/// ` (did you mean `a`, `b` or `c`?)` with the most similar names first, or an empty string if no name is similar.
 pub(crate) fn hint<'a>(wanted: &str, known: impl IntoIterator<Item = &'a str>) -> String {
     let lower = wanted.to_lowercase();
     let mut near: Vec<(f64, &str)> = known
@@ -13,7 +13,8 @@ pub(crate) fn hint<'a>(wanted: &str, known: impl IntoIterator<Item = &'a str>) -
         .map(|name| (normalized_damerau_levenshtein(&lower, &name.to_lowercase()), name))
         .filter(|(similarity, _)| *similarity >= SIMILAR)
         .collect();
-    // Of names as near as each other, those that begin alike: CMU's names begin with the subject.
+    // Among equally similar names, the one with the longest common beginning is first: CMU's names begin with the
+    // subject.
     let alike = |name: &str| lower.chars().zip(name.to_lowercase().chars()).take_while(|(a, b)| a == b).count();
     near.sort_by(|a, b| b.0.total_cmp(&a.0).then(alike(b.1).cmp(&alike(a.1))).then(a.1.cmp(b.1)));
     let names: Vec<String> = near.iter().take(3).map(|(_, name)| format!("`{name}`")).collect();

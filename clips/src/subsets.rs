@@ -2,14 +2,16 @@
 
 use comic_experiment::SUBSETS;
 
-use crate::{Error, nearest::hint};
+use crate::error::Error;
+use crate::nearest::hint;
 
 const TEXT: &str = include_str!("../data/subsets.txt");
 
-/// The clips of a subset, 36, 50, 7, 316 or 836 of them, sorted by name (dm_control 1.0.49, `locomotion/tasks/reference_pose/cmu_subsets.py`).
+/// The names of the clips of a subset, sorted. The subsets have 36, 50, 7, 316 and 836 clips (dm_control 1.0.49,
+/// `locomotion/tasks/reference_pose/cmu_subsets.py`).
 ///
 /// # Errors
-/// [`Error::NoSuchSubset`] for a name that is none of [`SUBSETS`].
+/// [`Error::NoSuchSubset`] if the name is not in [`SUBSETS`].
 pub fn subset(name: &str) -> Result<Vec<String>, Error> {
     if !SUBSETS.contains(&name) {
         return Err(Error::NoSuchSubset { name: name.into(), hint: hint(name, SUBSETS), known: SUBSETS.join(", ") });
@@ -30,7 +32,7 @@ pub fn subset(name: &str) -> Result<Vec<String>, Error> {
     Ok(ids)
 }
 
-/// The subsets that have a clip of that name, in the order of [`SUBSETS`].
+/// The subsets that contain the clip with this name, in the order of [`SUBSETS`].
 pub fn subsets_with(name: &str) -> Vec<&'static str> {
     SUBSETS.into_iter().filter(|set| subset(set).is_ok_and(|ids| ids.iter().any(|id| id == name))).collect()
 }

@@ -1,4 +1,4 @@
-//! Files in dm_control's layout, written whole or not at all.
+//! Writes files in dm_control's layout. A file is written completely or not at all.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -9,17 +9,18 @@ use hdf5_pure::{
 };
 use tempfile::NamedTempFile;
 
-use crate::{Clip, Error, Features, Motion};
+use crate::clip::{Clip, Features, Motion};
+use crate::error::Error;
 
-/// Bytes of datasets that are held in memory before they go to the file.
+/// Bytes of datasets that are kept in memory before they are written.
 const STAGED: usize = 64 << 20;
-/// Longest name of a clip, bytes.
+/// Greatest length of a clip's name, bytes.
 const LONGEST_NAME: usize = 200;
-/// 6 is zlib's own choice.
+/// Compression level; 6 is zlib's default.
 const DEFLATE: u32 = 6;
 
-/// Writes clips into a temporary file beside `path`, which [`ClipWriter::finish`] syncs and moves there; dropped before,
-/// it leaves nothing. Memory does not grow with the file.
+/// Writes clips into a temporary file beside `path`. [`ClipWriter::finish`] syncs the file and moves it to `path`; a
+/// writer that is dropped earlier leaves no file. Memory use does not grow with the file.
 pub struct ClipWriter {
     path: PathBuf,
     overwrite: bool,
@@ -30,7 +31,7 @@ pub struct ClipWriter {
 }
 
 impl ClipWriter {
-    /// Begins a file; an existing one is only replaced with `overwrite`.
+    /// Begins a file. An existing file is replaced only if `overwrite` is true.
     ///
     /// # Errors
     /// [`Error::Exists`], [`Error::Unwritable`].
@@ -40,7 +41,7 @@ impl ClipWriter {
         }
         let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
         let temporary = temporary(directory).map_err(|error| unwritable(path, &error))?;
-        // One sync at the end: until then the file has no name.
+        // One sync at the end is enough: until then the file is temporary.
         let access = FileAccessProperties::new()
             .with_sync_policy(SyncPolicy::OnClose)
             .with_memory_strategy(MemoryStrategy::Bounded);
@@ -49,13 +50,13 @@ impl ClipWriter {
         Ok(Self { path: path.into(), overwrite, temporary, file, names: BTreeSet::new(), staged: 0 })
     }
 
-    /// Adds a clip. What a clip lacks of features follows by forward kinematics of the V2020 body.
+    /// Adds a clip. Forward kinematics of the V2020 body computes the features of a clip that has none.
     ///
     /// # Errors
     /// [`Error::Name`], [`Error::NameTaken`], [`Error::Unwritable`].
     pub fn add(&mut self, clip: &Clip) -> Result<(), Error> {
-        let unfit = |character: char| matches!(character, '/' | '.') || character.is_whitespace();
-        if clip.name.is_empty() || clip.name.len() > LONGEST_NAME || clip.name.chars().any(unfit) {
+        let forbidden = |character: char| matches!(character, '/' | '.') || character.is_whitespace();
+        if clip.name.is_empty() || clip.name.len() > LONGEST_NAME || clip.name.chars().any(forbidden) {
             return Err(Error::Name { name: clip.name.clone() });
         }
         if !self.names.insert(clip.name.clone()) {
@@ -77,10 +78,10 @@ impl ClipWriter {
         self.file.commit().map_err(|error| unwritable(&self.path, &error))
     }
 
-    /// Puts the file in its place, durably.
+    /// Syncs the file, moves it to its path, and syncs the directory.
     ///
     /// # Errors
-    /// [`Error::Exists`] when another file came there meanwhile; [`Error::Unwritable`].
+    /// [`Error::Exists`] if another file was created at the path in the meantime; [`Error::Unwritable`].
     pub fn finish(mut self) -> Result<(), Error> {
         self.commit()?;
         let Self { path, overwrite, temporary, file, .. } = self;
@@ -92,7 +93,7 @@ impl ClipWriter {
             _ => unwritable(&path, &failed.error),
         })?;
         drop(file);
-        // The name is durable when the directory is.
+        // A crash cannot lose the new name after the directory is synced.
         let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
         std::fs::File::open(directory)
             .and_then(|directory| directory.sync_all())
@@ -104,7 +105,7 @@ fn unwritable(path: &Path, error: &dyn std::fmt::Display) -> Error {
     Error::Unwritable { path: path.into(), reason: error.to_string() }
 }
 
-/// With a new file's usual permissions; temporary files are their owner's alone otherwise.
+/// A temporary file with the usual permissions of a new file. By default only the owner can read it.
 fn temporary(directory: &Path) -> std::io::Result<NamedTempFile> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(".clips-").suffix(".part");
@@ -116,7 +117,7 @@ fn temporary(directory: &Path) -> std::io::Result<NamedTempFile> {
     builder.tempfile_in(directory)
 }
 
-/// Each dataset, frame after frame.
+/// All datasets, each frame by frame.
 fn datasets<'a>(motion: &'a Motion, features: &'a Features) -> [(&'static str, &'a [f64]); 11] {
     [
         ("position", motion.position.as_flattened()),
@@ -133,7 +134,8 @@ fn datasets<'a>(motion: &'a Motion, features: &'a Features) -> [(&'static str, &
     ]
 }
 
-/// dm_control's layout (`locomotion/mocap/loader.py`, `mocap.proto`): what its loader looks for must be there, if empty.
+/// Stages one clip in dm_control's layout (`locomotion/mocap/loader.py`, `mocap.proto`). Its loader needs every group
+/// and attribute, so unknown ones are empty.
 fn stage(group: &mut StagedGroup<'_>, clip: &Clip, datasets: &[(&str, &[f64])]) {
     let steps = clip.steps();
     for date in ["year", "month", "day"] {
@@ -156,7 +158,7 @@ fn stage(group: &mut StagedGroup<'_>, clip: &Clip, datasets: &[(&str, &[f64])]) 
     });
 }
 
-/// `(dim, T)`: a column per frame, in one compressed chunk, since clips are read whole.
+/// A dataset `(dim, T)` with a column per frame. It is one compressed chunk, because clips are read as a whole.
 fn columns(dataset: &mut DatasetBuilder, frames: &[f64], steps: usize) {
     let width = frames.len() / steps.max(1);
     let rows: Vec<f64> = (0..width).flat_map(|row| frames.iter().skip(row).step_by(width).copied()).collect();

@@ -33,7 +33,7 @@ fn a_2019_clip_on_the_2020_body_is_refused() {
     let clip = Entry { model: Cmu2019, ..entry(87, 0, None) };
     assert_eq!(
         clip.check(Cmu2020, 0.03, 5, 10).unwrap_err().to_string(),
-        "clip `walk` was made for the CMU humanoid V2019 (30 bodies), this is the CMU humanoid V2020 (31 bodies); use \
+        "clip `walk` was made for the CMU humanoid V2019 (30 bodies), not for the CMU humanoid V2020 (31 bodies); use \
          clips of that body"
     );
     clip.check(Cmu2019, 0.03, 5, 10).unwrap();
@@ -56,8 +56,8 @@ fn a_clip_too_short_for_its_look_ahead_is_refused() {
     entry(16, 0, None).check(Cmu2020, 0.03, 5, 10).unwrap();
     assert_eq!(
         entry(15, 0, None).check(Cmu2020, 0.03, 5, 10).unwrap_err().to_string(),
-        "clip `walk` is too short: its frames 0 to 14 are 15, but looking 5 frames ahead for at least 10 steps needs \
-         16; lower tracking.reference_steps or tracking.min_steps, or leave it out"
+        "clip `walk` is too short: frames 0 to 14 are 15 frames, but 10 steps that look 5 frames ahead need 16; lower \
+         tracking.reference_steps or tracking.min_steps, or remove the clip"
     );
     entry(87, 10, Some(26)).check(Cmu2020, 0.03, 5, 10).unwrap();
     assert!(entry(87, 10, Some(25)).check(Cmu2020, 0.03, 5, 10).is_err());
@@ -69,7 +69,7 @@ fn a_sub_range_of_a_file_is_checked_like_any_other() {
     let source = ClipSource { start_step: 80, ..with_ids(recordings("clips.h5"), &["CMU_007_01"]) };
     let catalogue = Catalogue::open(&[source]).unwrap();
     let message = catalogue.entries()[0].check(Cmu2020, 0.03, 5, 10).unwrap_err().to_string();
-    assert!(message.contains("its frames 80 to 86 are 7"), "{message}");
+    assert!(message.contains("frames 80 to 86 are 7 frames"), "{message}");
 }
 
 #[test]

@@ -62,12 +62,12 @@ fn numbers_that_are_none() {
 #[test]
 fn attributes() {
     for (clip, number) in [("dt_zero", "0"), ("dt_nan", "NaN"), ("dt_huge", "30")] {
-        assert_defect(clip, "@dt", &format!("{number} s is no time step; dm_control's is 0.03"));
+        assert_defect(clip, "@dt", &format!("{number} s is not a valid time step; dm_control uses 0.03 s"));
     }
-    assert_defect("steps_zero", "@num_steps", "0 frames; a clip has 1 to 100000");
-    assert_defect("steps_negative", "@num_steps", "-3 is no count");
-    assert_defect("steps_huge", "@num_steps", "9223372036854776000 is no count");
-    let unknown = "unknown body 2; known are 1 (CMU humanoid V2019) and 4 (CMU humanoid V2020)";
+    assert_defect("steps_zero", "@num_steps", "0 frames; a clip must have 1 to 100000");
+    assert_defect("steps_negative", "@num_steps", "-3 is not a valid count");
+    assert_defect("steps_huge", "@num_steps", "9223372036854776000 is not a valid count");
+    let unknown = "unknown body 2; expected 1 (CMU humanoid V2019) or 4 (CMU humanoid V2020)";
     assert_defect("model_unknown", "/walkers/walker_0@model", unknown);
 }
 
@@ -90,7 +90,7 @@ fn no_such_clip_names_the_nearest() {
 #[test]
 fn a_clip_listed_twice() {
     let message = refused(with_ids(tiny(), &["TINY_001_01", "TINY_001_02", "TINY_001_01"]));
-    assert_eq!(message, format!("{}: clip `TINY_001_01` is listed twice; use weight to have more of it", tiny()));
+    assert_eq!(message, format!("{}: clip `TINY_001_01` is listed twice; set weight to use it more often", tiny()));
 }
 
 #[test]

@@ -35,18 +35,21 @@ fn a_bad_line_is_named_with_its_number_and_what_it_should_be() {
     };
     for (message, expected) in [
         (amc("\nlowerback ", "\nlowerback NaN "), "m.amc:6: lowerback has 4 numbers, expected 3"),
-        (amc("\nrradius ", "\nrradius x"), "is no number"),
-        (amc("\nrradius ", "\nrradius 1e99\nrradius "), "is no length or angle of a recording"),
+        (amc("\nrradius ", "\nrradius x"), "is not a number"),
+        (amc("\nrradius ", "\nrradius 1e99\nrradius "), "is too large for a length or angle of a recording"),
         (amc("\nrradius ", "\nrtail "), "unknown bone `rtail`; CMU's skeletons have lowerback, upperback"),
         (amc("\nroot ", "\nrtoes 0\n#root "), "frame 1 has no `root`"),
         (amc(":DEGREES", ":RADIANS"), "m.amc:3: angles must be in degrees"),
-        (amc("\n1\n", "\n"), "expected a frame's number: is this an AMC file?"),
+        (amc("\n1\n", "\n"), "expected the number of a frame: is this an AMC file?"),
         (asf("angle deg", "angle rad"), "s.asf:8: angles must be in degrees: `angle deg`"),
         (asf("dof rx ry rz", "dof rz ry rx"), "bone lfemur: has dof `rz ry rx`, expected `rx ry rz`"),
-        (asf("axis 0 0 20", "axis 0 0 30"), "not the body's; only skeletons of the CMU database can be imported"),
-        (asf("name lfemur", "name lthigh"), "bone lthigh: moves (rx ry rz), and the body has no joint for it"),
-        (asf("TX TY TZ RX RY RZ", "RX RY RZ TX TY TZ"), "only `TX TY TZ RX RY RZ` is known"),
-        (asf("length 0.45", "length 0"), "0 is no length"),
+        (
+            asf("axis 0 0 20", "axis 0 0 30"),
+            "which differs from the body's; only skeletons of the CMU database can be imported",
+        ),
+        (asf("name lfemur", "name lthigh"), "bone lthigh: moves (rx ry rz), but the body has no joint for it"),
+        (asf("TX TY TZ RX RY RZ", "RX RY RZ TX TY TZ"), "expected `TX TY TZ RX RY RZ`"),
+        (asf("length 0.45", "length 0"), "0 is not a valid length"),
     ] {
         assert!(message.contains(expected), "{message}\ndoes not contain\n{expected}");
     }
@@ -58,7 +61,7 @@ fn a_recording_that_was_cut_off_is_recognised_by_the_bones_it_lacks() {
     let cut = |text: String| text[..text.rfind("\nlfemur").unwrap() + 1].to_string();
     let message = changed(directory.path(), same, cut).unwrap_err();
     assert!(message.contains("has other bones than the first (they differ in lfemur"), "{message}");
-    assert!(message.ends_with("is the file whole?"), "{message}");
+    assert!(message.ends_with("is the file complete?"), "{message}");
 }
 
 #[test]
@@ -69,7 +72,7 @@ fn a_file_of_another_kind_is_recognised() {
     let message = changed(directory.path(), same, |_| String::new()).unwrap_err();
     assert!(message.ends_with("m.amc: no frames: is this an AMC file?"), "{message}");
     let message = changed(directory.path(), same, |_| "x".repeat(5000)).unwrap_err();
-    assert!(message.ends_with("m.amc:1: over 4096 bytes in a line: is this a text file?"), "{message}");
+    assert!(message.ends_with("m.amc:1: a line of 4096 bytes or more: is this a text file?"), "{message}");
     let take = Take { asf: "/no/such.asf".into(), ..run_take() };
     assert!(import(&take).unwrap_err().to_string().starts_with("/no/such.asf: cannot be read"));
 }
@@ -83,7 +86,7 @@ fn constants_out_of_bounds_are_refused() {
     assert_eq!(message, "sole pitch 91: expected degrees from -90 to 90");
     for frames in [170..173, 500..600] {
         let message = refused(Constants { frames: Some(frames), ..Constants::default() });
-        assert!(message.contains("of 173 are too few: a clip takes at least 5 frames"), "{message}");
+        assert!(message.contains("of 173 are too few: a clip needs at least 5 frames"), "{message}");
     }
 }
 
@@ -103,7 +106,7 @@ fn a_manifest_that_is_none_says_where() {
     let path = directory.path().join("manifest.json");
     std::fs::write(&path, "[\n {\"key\": \"A\", \"asf\": \"a.asf\"}\n]").unwrap();
     let message = read_manifest(&path).unwrap_err().to_string();
-    assert!(message.contains("no manifest: missing field `amc` at line 2"), "{message}");
+    assert!(message.contains("not a manifest: missing field `amc` at line 2"), "{message}");
 }
 
 proptest! {

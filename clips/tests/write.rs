@@ -86,7 +86,7 @@ fn a_merged_file_has_the_clips_of_all_sources() {
 
     let twice = [whole(tiny()), with_ids(tiny(), &["TINY_001_02"])];
     let message = merge(&twice, &directory.path().join("twice.h5"), false, |_, _| ()).unwrap_err().to_string();
-    assert!(message.starts_with("clip `TINY_001_02` comes twice"), "{message}");
+    assert!(message.starts_with("clip `TINY_001_02` occurs twice"), "{message}");
     assert_eq!(files_in(directory.path()), 1);
 }
 

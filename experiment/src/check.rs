@@ -1,41 +1,25 @@
-//! Values that parse but mean nothing. NaN is refused everywhere: every rule is put so that only sense passes.
+//! Finds values that parse but mean nothing. Every rule refuses NaN.
 
-use std::fmt::{Debug, Display};
+use crate::clips::{ClipSource, SUBSETS};
+use crate::document::Experiment;
+use crate::fault::{AT_LEAST_ONE, Fault, NOT_NEGATIVE, POSITIVE, ensure, not_negative, positive};
+use crate::network::{Network, Prior};
+use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
+use crate::tasks::{TaskName, Vision};
 
-use crate::{
-    Actor, BallCatch, Budget, ClipSource, Corridor, Experiment, Gaps, GetUp, GoToTarget, Learner, Network, Optimiser,
-    Prior, SUBSETS, TRACKING_OBSERVATIONS, TaskName, Tracking, Unroll, Vision, Vmpo, Walls, WarmStart,
-    tracking_observation_size,
-};
-
-/// A field whose value is outside its meaning.
-pub(crate) struct Fault {
-    pub(crate) field: String,
-    pub(crate) value: String,
-    pub(crate) remedy: String,
-}
-
-const AT_LEAST_ONE: &str = "must be at least 1";
-/// Below it a squared ratio of float32 numbers overflows; the wire refuses it too.
+/// The squared ratio of two float32 numbers overflows with a smaller deviation. The wire refuses a smaller one, too.
 const SMALLEST_STD: f64 = 1e-6;
 const AT_LEAST_STD: &str = "must be at least 1e-6";
-/// Beyond it an action is nothing but noise; the wire refuses a thousand times as much.
+/// With a larger deviation an action is only noise. The wire's limit is a thousand times as large.
 const LARGEST_STD: f64 = 1e3;
 const AT_MOST_STD: &str = "must be at most 1000";
-const POSITIVE: &str = "must be positive";
-const NOT_NEGATIVE: &str = "must be 0 or more";
 
 /// The first fault, in the order of the document.
 pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
     ensure("clips", &experiment.clips, !experiment.clips.is_empty(), "name at least one clip source")?;
     joint(experiment)?;
     experiment.clips.iter().enumerate().try_for_each(|(index, source)| clips(index, source))?;
-    tracking(&experiment.tracking)?;
-    go_to_target(&experiment.go_to_target)?;
-    gaps(&experiment.gaps)?;
-    walls(&experiment.walls)?;
-    get_up(&experiment.get_up)?;
-    ball_catch(&experiment.ball_catch)?;
+    TaskName::ALL.into_iter().try_for_each(|task| experiment.parameters(task).check(task.section()))?;
     network(&experiment.network)?;
     vmpo(&experiment.vmpo, &experiment.unroll)?;
     optimiser(&experiment.optimiser)?;
@@ -45,21 +29,6 @@ pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
     together(experiment)?;
     learner(&experiment.learner)?;
     budget(&experiment.budget)
-}
-
-fn ensure(field: &str, value: impl Debug, holds: bool, remedy: impl Display) -> Result<(), Fault> {
-    if holds {
-        return Ok(());
-    }
-    Err(Fault { field: field.to_string(), value: format!("{value:?}"), remedy: remedy.to_string() })
-}
-
-fn positive(number: f64) -> bool {
-    number > 0.0 && number.is_finite()
-}
-
-fn not_negative(number: f64) -> bool {
-    number >= 0.0 && number.is_finite()
 }
 
 fn joint(experiment: &Experiment) -> Result<(), Fault> {
@@ -76,20 +45,22 @@ fn joint(experiment: &Experiment) -> Result<(), Fault> {
         return Ok(());
     }
     let sum: f64 = joint.iter().map(|complement| complement.probability).sum();
-    ensure("joint", sum, sum < 1.0, "probabilities must add up to less than 1: the rest is the experiment's task's")?;
-    for (name, section, corridor) in
-        [(TaskName::Gaps, "gaps", &experiment.gaps.corridor), (TaskName::Walls, "walls", &experiment.walls.corridor)]
-    {
-        let plays = *task == name || joint.iter().any(|complement| complement.task == name);
-        let holds = !plays || corridor.vision == Vision::Off;
-        ensure(&format!("{section}.corridor.vision"), corridor.vision, holds, "must be off in joint training")?;
+    ensure(
+        "joint",
+        sum,
+        sum < 1.0,
+        "the sum of the probabilities must be less than 1; the experiment's `task` has the remaining probability",
+    )?;
+    for (task, _) in experiment.tasks() {
+        let Some((name, vision)) = experiment.parameters(task).vision() else { continue };
+        task.section().ensure(name, vision, vision == Vision::Off, "must be off in joint training")?;
     }
     let lstm = &network.value_lstm;
     ensure(
         "network.value_lstm",
         lstm,
         lstm.is_empty(),
-        "must be empty in joint training, whose value functions are feed-forward",
+        "must be empty in joint training, where value functions are feed-forward",
     )
 }
 
@@ -105,120 +76,6 @@ fn clips(index: usize, source: &ClipSource) -> Result<(), Fault> {
         ensure(&field("end_step"), end_step, end_step > start_step, "must exceed start_step")?;
     }
     ensure(&field("weight"), weight, not_negative(*weight), NOT_NEGATIVE)
-}
-
-fn tracking(tracking: &Tracking) -> Result<(), Fault> {
-    let Tracking { reference_steps, min_steps, termination_threshold, time_limit, observations, .. } = tracking;
-    ensure(
-        "tracking.reference_steps",
-        reference_steps,
-        (1..=64).contains(&reference_steps.len()) && reference_steps.iter().all(|step| (1..=1000).contains(step)),
-        "must be 1 to 64 numbers of frames ahead, each 1 to 1000",
-    )?;
-    ensure("tracking.min_steps", min_steps, (1..=100_000).contains(min_steps), "must be 1 to 100000")?;
-    ensure("tracking.termination_threshold", termination_threshold, *termination_threshold > 0.0, POSITIVE)?;
-    ensure("tracking.time_limit", time_limit, *time_limit > 0.0, "must be positive seconds")?;
-    for (index, name) in observations.iter().enumerate() {
-        let field = format!("tracking.observations.{index}");
-        let known = tracking_observation_size(name, 1).is_some();
-        ensure(&field, name, known, format!("must be one of {}", TRACKING_OBSERVATIONS.join(", ")))?;
-    }
-    Ok(())
-}
-
-/// Seconds an episode may last at most: beyond it a number is a slip of the keyboard.
-const LONGEST_EPISODE: f64 = 3600.0;
-
-fn seconds(field: &str, value: f64) -> Result<(), Fault> {
-    ensure(field, value, value > 0.0 && value <= LONGEST_EPISODE, "must be positive seconds, at most 3600")
-}
-
-fn metres(field: &str, value: f64) -> Result<(), Fault> {
-    ensure(field, value, value > 0.0 && value <= 1e4, "must be positive metres, at most 10000")
-}
-
-/// `[low, high]` within the limits.
-fn range(field: &str, value: [f64; 2], [least, most]: [f64; 2]) -> Result<(), Fault> {
-    let [low, high] = value;
-    let holds = least <= low && low <= high && high <= most;
-    ensure(field, value, holds, format!("must be [low, high] within {least} to {most}"))
-}
-
-fn deviation(field: &str, value: f64) -> Result<(), Fault> {
-    ensure(field, value, (0.0..=100.0).contains(&value), "must be 0 to 100")
-}
-
-fn go_to_target(task: &GoToTarget) -> Result<(), Fault> {
-    metres("go_to_target.half_width", task.half_width)?;
-    metres("go_to_target.tolerance", task.tolerance)?;
-    ensure("go_to_target.steps_at_target", task.steps_at_target, task.steps_at_target > 0, AT_LEAST_ONE)?;
-    seconds("go_to_target.time_limit", task.time_limit)
-}
-
-fn corridor(section: &str, corridor: &Corridor) -> Result<(), Fault> {
-    let field = |name: &str| format!("{section}.corridor.{name}");
-    let length = corridor.length;
-    ensure(&field("length"), length, (10.0..=1000.0).contains(&length), "must be 10 to 1000 metres")?;
-    let width = corridor.width;
-    ensure(&field("width"), width, (1.0..=1000.0).contains(&width), "must be 1 to 1000 metres")?;
-    ensure(&field("target_velocity"), corridor.target_velocity, positive(corridor.target_velocity), POSITIVE)?;
-    let fall = corridor.fall_height;
-    ensure(&field("fall_height"), fall, fall.is_finite(), "must be a height in metres")?;
-    seconds(&field("time_limit"), corridor.time_limit)
-}
-
-fn gaps(task: &Gaps) -> Result<(), Fault> {
-    range("gaps.platform", task.platform, [0.1, 1000.0])?;
-    range("gaps.gap", task.gap, [0.0, 1000.0])?;
-    corridor("gaps", &task.corridor)
-}
-
-fn walls(task: &Walls) -> Result<(), Fault> {
-    let spacing = task.spacing;
-    ensure("walls.spacing", spacing, (0.5..=1000.0).contains(&spacing), "must be 0.5 to 1000 metres")?;
-    range("walls.wall_width", task.wall_width, [0.01, task.corridor.width])?;
-    range("walls.wall_height", task.wall_height, [0.01, 100.0])?;
-    corridor("walls", &task.corridor)
-}
-
-fn get_up(task: &GetUp) -> Result<(), Fault> {
-    let share = task.lying_share;
-    ensure("get_up.lying_share", share, (0.0..=1.0).contains(&share), "must be in [0, 1]")?;
-    metres("get_up.target_height", task.target_height)?;
-    range("get_up.drop_height", task.drop_height, [0.0, 10.0])?;
-    deviation("get_up.tilt", task.tilt)?;
-    deviation("get_up.joint_noise", task.joint_noise)?;
-    deviation("get_up.velocity_noise", task.velocity_noise)?;
-    deviation("get_up.angular_velocity_noise", task.angular_velocity_noise)?;
-    seconds("get_up.time_limit", task.time_limit)
-}
-
-fn ball_catch(task: &BallCatch) -> Result<(), Fault> {
-    range("ball_catch.radius", task.radius, [0.01, 1.0])?;
-    range("ball_catch.mass", task.mass, [0.001, 1000.0])?;
-    ensure("ball_catch.balls", task.balls, (1..=1024).contains(&task.balls), "must be 1 to 1024")?;
-    range("ball_catch.distance", task.distance, [0.0, 100.0])?;
-    range("ball_catch.lateral", task.lateral, [-100.0, 100.0])?;
-    range("ball_catch.height", task.height, [0.0, 100.0])?;
-    ensure("ball_catch.aim_distance", task.aim_distance, task.aim_distance.abs() <= 100.0, "must be within 100 m")?;
-    range("ball_catch.aim_lateral", task.aim_lateral, [-100.0, 100.0])?;
-    range("ball_catch.aim_height", task.aim_height, [0.0, 100.0])?;
-    range("ball_catch.flight_time", task.flight_time, [0.01, 100.0])?;
-    deviation("ball_catch.spin", task.spin)?;
-    for (field, reward) in [
-        ("ball_catch.failure_reward", task.failure_reward),
-        ("ball_catch.touch_reward", task.touch_reward),
-        ("ball_catch.standing_reward", task.standing_reward),
-        ("ball_catch.walking_reward", task.walking_reward),
-    ] {
-        ensure(field, reward, reward.abs() <= 1000.0, "must be within ±1000")?;
-    }
-    ensure("ball_catch.hold_steps", task.hold_steps, task.hold_steps > 0, AT_LEAST_ONE)?;
-    ensure("ball_catch.walking_speed", task.walking_speed, positive(task.walking_speed), POSITIVE)?;
-    let distance = task.target_distance;
-    ensure("ball_catch.target_distance", distance, distance.abs() <= 1000.0, "must be within 1000 m")?;
-    metres("ball_catch.target_height", task.target_height)?;
-    seconds("ball_catch.time_limit", task.time_limit)
 }
 
 fn network(network: &Network) -> Result<(), Fault> {
@@ -334,19 +191,18 @@ fn warm_start(warm_start: &WarmStart) -> Result<(), Fault> {
 fn together(experiment: &Experiment) -> Result<(), Fault> {
     let Experiment { network, vmpo, warm_start, unroll, budget, .. } = experiment;
     let holds = vmpo.value_burn_in == 0 || !network.value_lstm.is_empty();
-    let remedy = "wakes a recurrent value function, and network.value_lstm names none: set one of the two";
+    let remedy = "must be 0 without a recurrent value function; set network.value_lstm, or leave this 0";
     ensure("vmpo.value_burn_in", vmpo.value_burn_in, holds, remedy)?;
-    let demonstrates = experiment.tasks().iter().any(|(task, _)| *task == TaskName::Tracking);
+    let demonstrates = experiment.tasks().iter().any(|(task, _)| experiment.parameters(*task).follows_clips());
     let holds = warm_start.steps == 0 || demonstrates;
-    ensure("warm_start.steps", warm_start.steps, holds, "must be 0 without tracking, whose reference is demonstrated")?;
+    ensure("warm_start.steps", warm_start.steps, holds, "must be 0 unless a task has a reference, as tracking has")?;
     let holds = warm_start.steps == 0 || network.low_level.imitates();
     let remedy = format!("must be 0 with network.low_level = \"{}\"", network.low_level);
     ensure("warm_start.steps", warm_start.steps, holds, &remedy)?;
     let holds = !unroll.lockstep || unroll.ahead == 0;
-    ensure("unroll.ahead", unroll.ahead, holds, "must be 0 with unroll.lockstep, in which nothing is made ahead")?;
+    ensure("unroll.ahead", unroll.ahead, holds, "must be 0 with unroll.lockstep")?;
     let holds = !unroll.lockstep || budget.minutes == 0.0;
-    let remedy =
-        "must be 0 with unroll.lockstep, which goes by no clock: set budget.updates or budget.environment_steps";
+    let remedy = "must be 0 with unroll.lockstep, which uses no clock; set budget.updates or budget.environment_steps";
     ensure("budget.minutes", budget.minutes, holds, remedy)
 }
 

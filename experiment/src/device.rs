@@ -1,20 +1,20 @@
-//! Where a learner computes, as experiments and command lines write it.
+//! The device of the learner, as experiments and command lines write it.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// Where the update runs.
+/// The device on which the update runs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum DeviceName {
-    /// `cpu`: this machine's processors.
+    /// `cpu`: the processors of the learner's machine.
     #[default]
     Cpu,
-    /// `cuda` or `cuda:N`: an NVIDIA card, numbered as CUDA does.
+    /// `cuda` or `cuda:N`: an NVIDIA GPU, with CUDA's number.
     Cuda(usize),
-    /// `xla` or `xla:N`: what PJRT_DEVICE names, a TPU or a CPU.
+    /// `xla` or `xla:N`: the kind of device that PJRT_DEVICE names, a TPU or a CPU.
     Xla(usize),
 }
 
@@ -56,11 +56,11 @@ impl From<DeviceName> for String {
     }
 }
 
-/// How precisely XLA multiplies float32 matrices. A TPU multiplies bfloat16 and makes float32 of several passes.
+/// How precisely XLA multiplies float32 matrices. A TPU multiplies bfloat16 numbers; several passes give a float32 result.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MatmulPrecision {
-    /// Six passes, about 22 bits; V-MPO's limit of 1e-5 on the covariance does not survive less.
+    /// Six passes, about 22 bits. V-MPO's limit of 1e-5 on the covariance needs this precision.
     #[default]
     Highest,
     /// Three passes, about 14 bits.
@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_device_is_read_as_it_is_written() {
+    fn reading_inverts_writing_a_device() {
         for device in [DeviceName::Cpu, DeviceName::Cuda(0), DeviceName::Cuda(3), DeviceName::Xla(255)] {
             assert_eq!(device.to_string().parse(), Ok(device));
         }
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_device_is_refused_with_those_there_are() {
+    fn an_unknown_device_is_refused_with_the_list_of_devices() {
         for name in ["", "gpu", "cpu:0", "cuda:", "cuda:-1", "xla:256", "CUDA", "xla:0:0", "tpu"] {
             let refused = name.parse::<DeviceName>().unwrap_err();
             assert!(refused.contains(&format!("`{name}`")) && refused.contains("cuda:N"), "{refused}");

@@ -1,28 +1,21 @@
-//! Fields by their dotted names: found by how they end, guessed when misspelt, compared between two experiments.
+//! Fields by their dotted names: finds a field by the end of its name, and compares two experiments field by field.
 
 use toml::{Table, Value};
 
-use crate::resolve::{join, vocabulary};
-use crate::{Error, Experiment};
+use crate::document::Experiment;
+use crate::error::Error;
+use crate::nearest::nearest;
+use crate::vocabulary::{join, vocabulary};
 
-/// Of `known`, the name that `name` is most likely a misspelling of.
-pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
-    /// Jaro-Winkler similarity from which a name is taken for a misspelling.
-    const SIMILAR: f64 = 0.7;
-    let scored = known.into_iter().map(|known| (strsim::jaro_winkler(known, name), known));
-    let (similarity, known) = scored.max_by(|a, b| a.0.total_cmp(&b.0))?;
-    (similarity > SIMILAR).then_some(known)
-}
-
-/// The whole name of the field that `name` means. A name that begins with a section is whole already, and whether there
-/// is such a field is for [`resolve`](crate::resolve) to say; any other is the end of exactly one field's name, as
-/// `latent.beta` is of `network.latent.beta`. `origin` is where it stands, for errors.
+/// The whole name of the field that `name` means. A name that begins with a section is returned as it is, without a check
+/// that the field exists. Any other name must be the end of exactly one field's name: `latent.beta` means
+/// `network.latent.beta`. Errors say that the name was written in `origin`.
 ///
 /// # Errors
 /// [`Error::UnknownField`] with the nearest name when no field's name ends like this; [`Error::AmbiguousField`] when
 /// several do.
 pub fn find_field(origin: &str, name: &str) -> Result<String, Error> {
-    // The defaults have every name there is, and TOML can write them all.
+    // TOML can write all default values, so the vocabulary is never empty.
     let everything = vocabulary().unwrap_or_default();
     let first = name.split('.').next().unwrap_or(name);
     if everything.contains_key(first) {
@@ -32,16 +25,16 @@ pub fn find_field(origin: &str, name: &str) -> Result<String, Error> {
     collect_fields("", &everything, &mut fields);
     let depth = name.split('.').count();
     let ends: Vec<&str> = fields.iter().map(|field| end_of(field, depth)).collect();
-    let meant = |end: &str| -> Vec<&str> {
+    let ending_with = |end: &str| -> Vec<&str> {
         fields.iter().zip(&ends).filter(|(_, other)| **other == end).map(|(field, _)| field.as_str()).collect()
     };
-    match meant(name)[..] {
+    match ending_with(name)[..] {
         [field] => Ok(field.to_string()),
         [] => Err(Error::UnknownField {
             origin: origin.to_string(),
             field: name.to_string(),
             hint: match nearest(name, ends.iter().copied()) {
-                Some(end) => format!("; did you mean `{}`?", meant(end).join("` or `")),
+                Some(end) => format!("; did you mean `{}`?", ending_with(end).join("` or `")),
                 None => format!("; sections are {}", everything.keys().cloned().collect::<Vec<_>>().join(", ")),
             },
         }),
@@ -53,7 +46,7 @@ pub fn find_field(origin: &str, name: &str) -> Result<String, Error> {
     }
 }
 
-/// The whole name of every field that is no section.
+/// Collects the whole name of every field that is not a section.
 fn collect_fields(prefix: &str, table: &Table, fields: &mut Vec<String>) {
     for (key, value) in table {
         let name = join(prefix, key);
@@ -69,19 +62,19 @@ fn end_of(field: &str, depth: usize) -> &str {
     field.rmatch_indices('.').nth(depth.saturating_sub(1)).map_or(field, |(dot, _)| &field[dot + 1..])
 }
 
-/// A field in which two experiments differ, and its values as TOML.
+/// A field with different values in two experiments.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Difference {
     /// Dotted name.
     pub field: String,
-    /// The one's value; "nothing" where the field is absent.
+    /// The first experiment's value as TOML; "nothing" when it does not have the field.
     pub ours: String,
-    /// The other's.
+    /// The second experiment's value as TOML.
     pub theirs: String,
 }
 
 impl Experiment {
-    /// Every field in which `other` is another experiment.
+    /// Every field that `other` has with another value.
     ///
     /// # Errors
     /// [`Error::Malformed`] when a number is beyond what TOML can write.

@@ -1,32 +1,50 @@
-//! One experiment is one TOML document; this crate is its types, its defaults and its errors, and nothing else.
+//! An experiment is one TOML document. This crate has its types, its defaults and its errors.
 //!
 //! # Layout
-//! - [`Experiment`] is the resolved document. Learner and actors read the very same one: the learner is started with
-//!   it, actors receive it when they join.
-//! - [`presets`] holds the built-in documents.
-//! - [`resolve`] turns a preset or a file plus `--set key=value` overrides into an [`Experiment`],
-//!   refusing unknown fields with the nearest known name.
-//! - [`find_field`] knows a field by the end of its name, [`Experiment::difference`] the field in which two differ.
-//! - [`TaskSpec`] is what networks, wire and learner know of a task: sizes and names.
+//! - [`Experiment`] is the resolved document. The learner is started with it; actors receive the same document when they
+//!   join.
+//! - [`presets`] holds the built-in documents: every file `presets/*.toml`.
+//! - [`resolve`] turns a preset or a file plus `--set key=value` overrides into an [`Experiment`]. It refuses unknown
+//!   fields and names the nearest known one.
+//! - [`find_field`] finds a field by the end of its name. [`Experiment::differences`] compares two experiments.
+//! - [`for_each_task`] lists all tasks. [`TaskSpec`] is what networks, wire and learner know of a task: sizes and names.
+//! - [`seed`] derives independent seeds; [`statistics`] has the median. Every crate uses the same ones.
 //!
-//! Every default is the paper's: (S) the CoMic supplement, (V) V-MPO, (D) a decision of this project where both are
-//! silent. A preset that deviates says so in its own file.
+//! Every default is the paper's: (S) the CoMic supplement, (V) V-MPO. (D) is a decision of this project where both are
+//! silent. A preset with other values gives the reason in its file.
 
+mod body;
 mod check;
+mod clips;
 mod device;
 mod document;
+mod error;
+mod fault;
 mod fields;
 mod lines;
+mod nearest;
 mod network;
 pub mod presets;
 mod resolve;
+pub mod seed;
+mod settings;
 mod spec;
+pub mod statistics;
 mod tasks;
+mod vocabulary;
 
-pub use device::*;
-pub use document::*;
-pub use fields::{Difference, find_field, nearest};
-pub use network::*;
-pub use resolve::{Error, resolve};
-pub use spec::*;
-pub use tasks::*;
+pub use body::{ACTION_SIZE, IMAGE_SIZE, PROPRIOCEPTION, PROPRIOCEPTION_SIZE};
+pub use clips::{ClipSource, SUBSETS};
+pub use device::{DeviceName, MatmulPrecision};
+pub use document::{Complement, Experiment};
+pub use error::Error;
+pub use fields::{Difference, find_field};
+pub use nearest::nearest;
+pub use network::{InitialPose, Latent, LowLevelName, Lstm, Mlp, Network, Primitives, Prior};
+pub use resolve::resolve;
+pub use settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
+pub use spec::{TaskPart, TaskSpec};
+pub use tasks::{
+    BallCatch, Corridor, Gaps, GetUp, GoToTarget, LyingPose, StartPose, TRACKING_MAX_REWARD, TRACKING_OBSERVATIONS,
+    TRACKING_REWARD_TERMS, TaskName, TerminationError, Tracking, Vision, WallSide, Walls, tracking_observation_size,
+};

@@ -1,9 +1,9 @@
-//! On which line of a document a field stands.
+//! Finds the line of a field in a document.
 
 use toml::de::{DeTable, DeValue};
 
-/// The line, counted from 1, of the field with this dotted name, or of as much of its path as the text names; `None`
-/// when it names nothing of it.
+/// The line, counted from 1, of the field with this dotted name, or of the deepest part of its path in the text. `None`
+/// when the text has no part of the path.
 pub(crate) fn line_of(text: &str, field: &str) -> Option<usize> {
     let document = DeTable::parse(text).ok()?;
     let mut found = None;

@@ -8,9 +8,9 @@ use serde::{Deserialize, Serialize};
 pub struct Network {
     /// Hidden sizes of the reference encoder (S: 2×1024).
     pub encoder: Vec<usize>,
-    /// A linear path from the encoder's input to its output (S: with the MLP low level); unused without a bottleneck.
+    /// Adds a linear path from the encoder's input to its output (S: with the MLP low level). Not used without a bottleneck.
     pub encoder_linear_path: bool,
-    /// What turns latent and proprioception into an action; the section of its name holds its sizes.
+    /// The low level, which turns latent and proprioception into an action. The section of the same name holds its sizes.
     pub low_level: LowLevelName,
     /// The MLP low level.
     pub mlp: Mlp,
@@ -20,24 +20,25 @@ pub struct Network {
     pub primitives: Primitives,
     /// Hidden sizes of the value function (S: 3×1024).
     pub value: Vec<usize>,
-    /// LSTM layers of the value function after its hidden ones; none is feed-forward (S: recurrent beside the LSTM low
-    /// level, whose sizes are taken (D)).
+    /// LSTM layers of the value function, after its hidden layers. An empty list makes it feed-forward (S: recurrent with
+    /// the LSTM low level; its sizes are the low level's (D)).
     pub value_lstm: Vec<usize>,
-    /// Width of the learned clip embedding the value function sees (S: 30).
+    /// Width of the learned clip embedding, an input of the value function (S: 30).
     pub clip_embedding: usize,
-    /// What is left of an image, in tasks that see (D).
+    /// Outputs of the image encoder, in tasks with camera images (D).
     pub image_features: usize,
     /// The latent between encoder and low level.
     pub latent: Latent,
-    /// The policy's standard deviation before learning (D; softplus at 0 is ln 2).
+    /// The policy's standard deviation before learning (D: softplus of 0, ln 2).
     pub initial_std: f64,
-    /// Floor of the policy's standard deviation (D).
+    /// Smallest standard deviation of the policy (D).
     pub min_std: f64,
     /// Scale of the policy head's initial weights, relative to the other layers' (D).
     pub policy_head_scale: f64,
-    /// Where the policy's mean starts: the middle of every joint's range, or the clips' mean pose as an action (D).
+    /// The policy's mean before learning (D).
     pub initial_pose: InitialPose,
-    /// Observations are normalised by the mean and standard deviation of the first so many steps; 0 leaves them raw (D).
+    /// Steps whose mean and standard deviation normalise the observations: the first ones of the run. 0 is no
+    /// normalisation (D).
     pub normaliser_steps: u64,
 }
 
@@ -64,7 +65,7 @@ impl Default for Network {
     }
 }
 
-/// The low levels.
+/// A low level.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LowLevelName {
@@ -82,7 +83,7 @@ impl LowLevelName {
     /// All of them.
     pub const ALL: [Self; 4] = [Self::Mlp, Self::Lstm, Self::Mixture, Self::Product];
 
-    /// As experiments and command lines write it; the paper's preset is `tracking-` and this.
+    /// As experiments and command lines write it. The paper's preset has the name `tracking-` with this at the end.
     pub fn name(self) -> &'static str {
         match self {
             Self::Mlp => "mlp",
@@ -92,13 +93,13 @@ impl LowLevelName {
         }
     }
 
-    /// Whether an encoder can weigh its primitives without a latent between.
+    /// Whether it works without a latent: the encoder then gives the weights of the primitives.
     pub(crate) fn acts_without_bottleneck(self) -> bool {
         matches!(self, Self::Mixture | Self::Product)
     }
 
-    /// Whether demonstrations teach it: a product's mean hangs on its primitives' deviations, which a regression on the mean
-    /// alone would ruin.
+    /// Whether it learns from demonstrations. The mean of a product depends on the deviations of its primitives. Regression
+    /// of the mean alone would spoil these deviations.
     pub(crate) fn imitates(self) -> bool {
         self != Self::Product
     }
@@ -147,19 +148,19 @@ impl Default for Lstm {
     }
 }
 
-/// Primitives: Gaussians of proprioception alone, combined by weights that a gate makes of the latent.
+/// Primitives: Gaussians that depend on proprioception alone. A gate computes their weights from the latent.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Primitives {
     /// K (S: 5).
     pub count: usize,
-    /// Hidden sizes of the torso they share (S: 2×512).
+    /// Hidden sizes of the torso, which all primitives share (S: 2×512).
     pub torso: Vec<usize>,
-    /// Units of the layer each has for itself (S: 256).
+    /// Units of each primitive's own layer (S: 256).
     pub hidden: usize,
-    /// Hidden sizes between latent and weights (S: 2×400); unused without a bottleneck.
+    /// Hidden sizes of the gate (S: 2×400). Not used without a bottleneck.
     pub gate: Vec<usize>,
-    /// A fixed bias on each primitive's mean, evenly from −0.66 to 0.66 (S).
+    /// Adds a fixed bias to each primitive's mean. The biases are evenly spaced from −0.66 to 0.66 (S).
     pub biases: bool,
 }
 
@@ -170,24 +171,24 @@ impl Default for Primitives {
 }
 
 impl Network {
-    /// Gaussians that the action's distribution is made of: K for a mixture, else 1.
+    /// Gaussians in the action's distribution: K for a mixture, else 1.
     pub fn components(&self) -> usize {
         if self.low_level == LowLevelName::Mixture { self.primitives.count } else { 1 }
     }
 
-    /// Numbers that the low level remembers from step to step: a hidden and a cell state for each unit of an LSTM.
+    /// Size of the recurrent state: a hidden and a cell state for each unit of an LSTM, else 0.
     pub fn state_size(&self) -> usize {
         if self.low_level == LowLevelName::Lstm { 2 * self.lstm.units.iter().sum::<usize>() } else { 0 }
     }
 }
 
-/// Where the policy's mean starts.
+/// The policy's mean before learning.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum InitialPose {
     /// Action 0: the middle of every joint's range.
     MidRange,
-    /// The mean pose of the reference clips, as an action.
+    /// The action whose servos hold the mean pose of the reference clips.
     ReferenceMean,
 }
 
@@ -195,15 +196,15 @@ pub enum InitialPose {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Latent {
-    /// Dimensions of z (S: 60). 0 is no bottleneck, for mixture and product: the encoder gives their weights itself.
+    /// Dimensions of z (S: 60). 0 is no bottleneck, for mixture and product: the encoder gives the weights directly.
     pub size: usize,
-    /// β: strength of the KL to the prior (S: 5e-4).
+    /// β: weight of the KL divergence from the prior (S: 5e-4).
     pub beta: f64,
-    /// Floor of the encoder's standard deviation (D).
+    /// Smallest standard deviation of the encoder (D).
     pub min_std: f64,
     /// The encoder's standard deviation before learning (D).
     pub initial_std: f64,
-    /// p(z_t | z_{t−1}).
+    /// The prior p(z_t | z_{t−1}).
     pub prior: Prior,
 }
 

@@ -1,135 +1,65 @@
-//! What a task looks like from outside the simulator: sizes and names.
+//! What networks, wire and learner know of a task: sizes and names.
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Experiment, TaskName, Tracking, Vision};
+use crate::body::{ACTION_SIZE, IMAGE_SIZE, PROPRIOCEPTION_SIZE};
+use crate::document::Experiment;
+use crate::tasks::{TaskName, TaskParameters, Tracking, Vision};
 
-/// Tracking bodies of the V2020 humanoid, `face` among them.
-const BODIES: usize = 31;
-/// Hinges, and so actuators, of the CMU humanoid.
-pub const ACTION_SIZE: usize = 56;
-/// Proprioception (supplement 1.1, with MoCapAct's order): what it is made of, by dm_control's names without `walker/`,
-/// and how many numbers each has.
-pub const PROPRIOCEPTION: [(&str, usize); 9] = [
-    ("joints_pos", ACTION_SIZE),
-    ("joints_vel", ACTION_SIZE),
-    ("sensors_velocimeter", 3),
-    ("sensors_gyro", 3),
-    ("end_effectors_pos", 12),
-    ("world_zaxis", 3),
-    ("actuator_activation", ACTION_SIZE),
-    ("sensors_touch", 10),
-    ("sensors_torque", 6),
-];
-/// Length of proprioception: all of [`PROPRIOCEPTION`].
-pub const PROPRIOCEPTION_SIZE: usize = 205;
-/// Reward terms of the tracking task, in the order of dm_control's sorted reward channels.
-pub const TRACKING_REWARD_TERMS: [&str; 5] =
-    ["appendages", "body_quaternions", "center_of_mass", "joints_velocity", "termination"];
-/// The most a tracking step can pay: 0.5 + 0.5·(0.1 + 1 + 0.15 + 0.65).
-pub const TRACKING_MAX_REWARD: f64 = 1.45;
+/// The reward term of joint training.
+const JOINT_REWARD_TERMS: [&str; 1] = ["reward"];
 
-/// Sizes and names of what is learnt, one task or several: all that networks, wire and learner know of it.
+/// Sizes and names of one task, or of all tasks of joint training.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskSpec {
     /// Length of the proprioception vector.
     pub proprioception: usize,
-    /// Length of the task observation vector (for tracking, the references); in joint training the longest, and zeros
-    /// stand before a shorter one.
+    /// Length of the task observation vector (for tracking, the references). In joint training it is the longest task's
+    /// length. A shorter observation has zeros in front.
     pub task: usize,
-    /// Bytes of an image of what the humanoid sees: 64 rows of 64 pixels of red, green and blue; 0 when it is blind.
+    /// Bytes of a camera image: 64 rows of 64 pixels of red, green and blue. 0 in a task without images.
     pub image: usize,
     /// Length of the action vector, each in [−1, 1].
     pub action: usize,
-    /// Names of the reward terms; their sum is the reward. Joint training has one, the reward itself.
+    /// Names of the reward terms. Their sum is the reward. Joint training has one term, the reward itself.
     pub reward_terms: Vec<String>,
-    /// Names of the clips, task by task; a clip's index is its place here.
+    /// Names of the clips, task by task. A clip's index is its place in this list.
     pub clips: Vec<String>,
     /// The tasks, the experiment's `task` first.
     pub tasks: Vec<TaskPart>,
 }
 
-/// What is one task's own.
+/// What belongs to one task.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskPart {
     /// The task's name.
     pub name: String,
-    /// Length of its observation: the last so many entries of the task observation vector.
+    /// Length of its observation, which fills the end of the task observation vector.
     pub observation: usize,
     /// Number of its clips.
     pub clips: usize,
-    /// The most a step of it can pay: what normalised rewards are relative to.
+    /// The largest reward of one step. Normalised rewards are divided by it.
     pub max_reward: f64,
-    /// Whether it has a reference, whose servo action is a demonstration.
+    /// Whether it has a reference. The reference's servo action is a demonstration.
     pub demonstrated: bool,
 }
 
-/// Reward terms of go-to-target.
-pub const GO_TO_TARGET_REWARD_TERMS: [&str; 1] = ["target"];
-/// Reward terms of the corridors.
-pub const CORRIDOR_REWARD_TERMS: [&str; 1] = ["velocity"];
-/// Reward terms of get-up-and-stand.
-pub const GET_UP_REWARD_TERMS: [&str; 1] = ["height"];
-/// Reward terms of ball catching.
-pub const BALL_CATCH_REWARD_TERMS: [&str; 4] = ["failure", "touch", "standing", "walking"];
-/// Height and width of the egocentric camera's image, in pixels of three bytes (C).
-pub const IMAGE_SIZE: usize = 64;
-
-/// The reward term of joint training.
-pub const JOINT_REWARD_TERMS: [&str; 1] = ["reward"];
-
 impl Experiment {
-    fn image_bytes(&self, task: TaskName) -> usize {
-        let vision = match task {
-            TaskName::Gaps => self.gaps.corridor.vision,
-            TaskName::Walls => self.walls.corridor.vision,
-            _ => Vision::Off,
-        };
-        if vision == Vision::Off { 0 } else { IMAGE_SIZE * IMAGE_SIZE * 3 }
-    }
-
-    /// What one of its tasks observes beside proprioception: names and sizes, in the order of the task observation
-    /// vector; tracking's names are dm_control's without `walker/`.
+    /// What one of its tasks observes besides proprioception: names and sizes, in the order of the task observation
+    /// vector. Tracking's names are dm_control's without `walker/`.
     ///
     /// # Errors
     /// The name of an observation that the tracking task does not have.
     pub fn observations(&self, task: TaskName) -> Result<Vec<(String, usize)>, String> {
-        let parts: &[(&str, usize)] = match task {
-            TaskName::Tracking => return tracking_observations(&self.tracking),
-            // In the root's frame, m.
-            TaskName::GoToTarget => &[("target", 3)],
-            // The root's height, m.
-            TaskName::Gaps | TaskName::Walls | TaskName::GetUp => &[("body_height", 1)],
-            // In the root's frame: m, m/s, rad/s, m, m.
-            TaskName::BallCatch => &[
-                ("ball_position", 3),
-                ("ball_velocity", 3),
-                ("ball_angular_velocity", 3),
-                ("ball_radius", 1),
-                ("target", 3),
-            ],
-        };
-        Ok(parts.iter().map(|(name, size)| ((*name).to_string(), *size)).collect())
-    }
-
-    /// The most a step of the task can pay.
-    fn max_reward(&self, task: TaskName) -> f64 {
-        match task {
-            TaskName::Tracking => TRACKING_MAX_REWARD,
-            TaskName::GoToTarget | TaskName::Gaps | TaskName::Walls | TaskName::GetUp => 1.0,
-            TaskName::BallCatch => {
-                let ball = &self.ball_catch;
-                2.0 * ball.touch_reward + ball.standing_reward + ball.walking_reward
-            }
-        }
+        self.parameters(task).observations()
     }
 }
 
 impl TaskSpec {
-    /// The experiment's task, or tasks, over these clips, whose names only tracking keeps: any other task is a clip of its
-    /// own.
+    /// The experiment's task, or its tasks. `clips` names the clips of the tracking task. Any other task counts as one
+    /// clip with the task's name.
     ///
     /// # Errors
     /// The name of an observation that the tracking task does not have.
@@ -142,54 +72,46 @@ impl TaskSpec {
         Ok(spec)
     }
 
-    /// One of the experiment's tasks alone.
+    /// One task of the experiment alone.
     ///
     /// # Errors
     /// The name of an observation that the tracking task does not have.
     pub fn of_task(experiment: &Experiment, task: TaskName, clips: Vec<String>) -> Result<Self, String> {
-        let terms: &[&str] = match task {
-            TaskName::Tracking => return Self::tracking(&experiment.tracking, clips),
-            TaskName::GoToTarget => &GO_TO_TARGET_REWARD_TERMS,
-            TaskName::Gaps | TaskName::Walls => &CORRIDOR_REWARD_TERMS,
-            TaskName::GetUp => &GET_UP_REWARD_TERMS,
-            TaskName::BallCatch => &BALL_CATCH_REWARD_TERMS,
-        };
-        let name = task.name().to_string();
-        let observation = total(&experiment.observations(task)?);
-        let mut spec = Self::alone(name.clone(), observation, experiment.max_reward(task), terms, vec![name]);
-        spec.image = experiment.image_bytes(task);
-        Ok(spec)
+        Self::alone(task, experiment.parameters(task), clips)
     }
 
-    /// The tracking task over these clips.
+    /// The tracking task with these clips.
     ///
     /// # Errors
     /// The name of an observation that the tracking task does not have.
     pub fn tracking(config: &Tracking, clips: Vec<String>) -> Result<Self, String> {
-        let observation = total(&tracking_observations(config)?);
-        let name = TaskName::Tracking.name().to_string();
-        Ok(Self::alone(name, observation, TRACKING_MAX_REWARD, &TRACKING_REWARD_TERMS, clips))
+        Self::alone(TaskName::Tracking, config, clips)
     }
 
-    fn alone(name: String, observation: usize, max_reward: f64, terms: &[&str], clips: Vec<String>) -> Self {
-        Self {
+    fn alone(task: TaskName, parameters: &dyn TaskParameters, clips: Vec<String>) -> Result<Self, String> {
+        let name = task.name().to_string();
+        let observation = parameters.observations()?.iter().map(|(_, size)| size).sum();
+        let draws = parameters.vision().is_some_and(|(_, vision)| vision != Vision::Off);
+        let clips = if parameters.follows_clips() { clips } else { vec![name.clone()] };
+        let part = TaskPart {
+            name,
+            observation,
+            clips: clips.len(),
+            max_reward: parameters.max_reward(),
+            demonstrated: parameters.follows_clips(),
+        };
+        Ok(Self {
             proprioception: PROPRIOCEPTION_SIZE,
             task: observation,
-            image: 0,
+            image: if draws { IMAGE_SIZE * IMAGE_SIZE * 3 } else { 0 },
             action: ACTION_SIZE,
-            reward_terms: terms.iter().map(|term| (*term).to_string()).collect(),
-            tasks: vec![TaskPart {
-                demonstrated: name == TaskName::Tracking.name(),
-                name,
-                observation,
-                clips: clips.len(),
-                max_reward,
-            }],
+            reward_terms: parameters.reward_terms().iter().map(|term| (*term).to_string()).collect(),
             clips,
-        }
+            tasks: vec![part],
+        })
     }
 
-    /// One more task.
+    /// Adds a task.
     fn join(&mut self, other: Self) {
         self.task = self.task.max(other.task);
         self.image = self.image.max(other.image);
@@ -198,7 +120,7 @@ impl TaskSpec {
         self.tasks.extend(other.tasks);
     }
 
-    /// The task that a clip belongs to: its place among the tasks, the last one's for a clip there is not.
+    /// The place of a clip's task among the tasks. It is the last task's place for an unknown clip.
     pub fn task_of(&self, clip: usize) -> usize {
         let mut end = 0;
         let found = self.tasks.iter().position(|task| {
@@ -208,63 +130,8 @@ impl TaskSpec {
         found.unwrap_or(self.tasks.len().saturating_sub(1))
     }
 
-    /// The most a step of an episode of this clip can pay.
+    /// The largest reward of one step in an episode of this clip.
     pub fn max_reward(&self, clip: usize) -> f64 {
         self.tasks.get(self.task_of(clip)).map_or(1.0, |task| task.max_reward)
-    }
-}
-
-fn total(parts: &[(String, usize)]) -> usize {
-    parts.iter().map(|(_, size)| size).sum()
-}
-
-fn tracking_observations(config: &Tracking) -> Result<Vec<(String, usize)>, String> {
-    let steps = config.reference_steps.len();
-    let sized = |name: &String| tracking_observation_size(name, steps).map(|size| (name.clone(), size));
-    config.observations.iter().map(|name| sized(name).ok_or_else(|| name.clone())).collect()
-}
-
-/// Every task observation the tracking task offers, by dm_control's name without `walker/`.
-pub const TRACKING_OBSERVATIONS: [&str; 14] = [
-    "body_height",
-    "appendages_pos",
-    "sensors_accelerometer",
-    "velocimeter_control",
-    "gyro_control",
-    "joints_vel_control",
-    "time_in_clip",
-    "reference_rel_joints",
-    "reference_rel_bodies_pos_local",
-    "reference_rel_bodies_quats",
-    "reference_ego_bodies_quats",
-    "reference_rel_root_quat",
-    "reference_rel_root_pos_local",
-    "reference_appendages_pos",
-];
-
-/// Length of one of [`TRACKING_OBSERVATIONS`] with `steps` reference steps; `None` for any other name.
-pub fn tracking_observation_size(name: &str, steps: usize) -> Option<usize> {
-    Some(match name {
-        "body_height" | "time_in_clip" => 1,
-        "appendages_pos" => 15,
-        "sensors_accelerometer" | "velocimeter_control" | "gyro_control" => 3,
-        "joints_vel_control" => ACTION_SIZE,
-        "reference_rel_joints" => steps * ACTION_SIZE,
-        "reference_rel_bodies_pos_local" => steps * BODIES * 3,
-        "reference_rel_bodies_quats" | "reference_ego_bodies_quats" => steps * BODIES * 4,
-        "reference_rel_root_quat" => steps * 4,
-        "reference_rel_root_pos_local" => steps * 3,
-        "reference_appendages_pos" => steps * 15,
-        _ => return None,
-    })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn proprioception_is_as_long_as_its_parts() {
-        assert_eq!(PROPRIOCEPTION.iter().map(|(_, size)| size).sum::<usize>(), PROPRIOCEPTION_SIZE);
     }
 }

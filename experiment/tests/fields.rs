@@ -1,10 +1,10 @@
-//! Fields by their dotted names: known by their ends, compared between experiments.
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
+//! Fields by their dotted names: found by the end of the name, compared between experiments.
+#![allow(clippy::unwrap_used, reason = "a test that cannot continue fails")]
 
 use comic_experiment::{Difference, find_field, resolve};
 
 #[test]
-fn a_field_is_known_by_the_end_of_its_name_where_no_other_ends_like_it() {
+fn the_unique_end_of_a_name_finds_the_field() {
     for (name, field) in [
         ("network.latent.beta", "network.latent.beta"),
         ("latent.beta", "network.latent.beta"),
@@ -17,15 +17,15 @@ fn a_field_is_known_by_the_end_of_its_name_where_no_other_ends_like_it() {
 }
 
 #[test]
-fn the_end_of_several_names_is_refused_with_all_of_them() {
+fn an_ambiguous_end_of_a_name_is_refused_with_all_candidates() {
     assert_eq!(
         find_field("sweep.toml", "initial_std").unwrap_err().to_string(),
-        "sweep.toml: `initial_std` could be `network.initial_std` or `network.latent.initial_std`: write one of them"
+        "sweep.toml: `initial_std` could be `network.initial_std` or `network.latent.initial_std`; write one of them"
     );
 }
 
 #[test]
-fn the_end_of_no_name_is_refused_with_the_nearest() {
+fn an_unknown_end_of_a_name_is_refused_with_the_nearest_name() {
     for (name, nearest) in [("latent.bata", "network.latent.beta"), ("epsilon_etaa", "vmpo.epsilon_eta")] {
         assert_eq!(
             find_field("sweep.toml", name).unwrap_err().to_string(),
@@ -35,7 +35,7 @@ fn the_end_of_no_name_is_refused_with_the_nearest() {
 }
 
 #[test]
-fn experiments_differ_by_name_and_both_values() {
+fn a_difference_names_the_field_and_both_values() {
     let [ours, theirs] =
         ["1e-3", "0.5"].map(|beta| resolve("tracking-mlp", &[format!("network.latent.beta={beta}")]).unwrap());
     assert_eq!(ours.differences(&ours).unwrap(), []);

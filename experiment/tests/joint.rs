@@ -1,5 +1,5 @@
 //! Experiments of several tasks.
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
+#![allow(clippy::unwrap_used, reason = "a test that cannot continue fails")]
 
 use comic_experiment::{TaskName, TaskSpec, resolve};
 
@@ -11,7 +11,7 @@ fn the_joint_presets_have_the_papers_probabilities() {
 }
 
 #[test]
-fn joint_tasks_that_make_no_sense_are_refused() {
+fn meaningless_joint_tasks_are_refused() {
     let refused = |joint: &str, other: &str| {
         let overrides = [format!("joint=[{joint}]"), other.to_string()];
         resolve("quickstart", &overrides).unwrap_err().to_string()
@@ -38,7 +38,7 @@ fn joint_tasks_that_make_no_sense_are_refused() {
 }
 
 #[test]
-fn a_clip_belongs_to_the_task_it_was_listed_with() {
+fn clips_are_numbered_task_by_task() {
     let experiment = resolve("joint-ball", &[]).unwrap();
     let spec = TaskSpec::new(&experiment, vec!["walk".into(), "run".into()]).unwrap();
     assert_eq!(spec.clips, ["walk", "run", "ball-catch"]);

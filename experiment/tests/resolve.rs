@@ -1,5 +1,5 @@
-//! From a preset or a file, and overrides, to an experiment; and the words for what is wrong with one.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+//! From a preset or a file, and overrides, to an experiment; and the errors of bad documents.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
 use comic_experiment::{
     ClipSource, Error, Experiment, InitialPose, LowLevelName, Prior, TRACKING_OBSERVATIONS, TerminationError, presets,
@@ -11,12 +11,12 @@ fn set(overrides: &[&str]) -> Result<Experiment, Error> {
     resolve("tracking-mlp", &overrides.iter().map(|argument| argument.to_string()).collect::<Vec<_>>())
 }
 
-/// What one `--set` is answered with.
+/// The error of one `--set`.
 fn refused(argument: &str) -> String {
     set(&[argument]).expect_err("must be refused").to_string()
 }
 
-/// What a document is answered with.
+/// The error of a document.
 fn refused_text(text: &str) -> String {
     Experiment::from_toml("run.toml", text).expect_err("must be refused").to_string()
 }
@@ -24,7 +24,7 @@ fn refused_text(text: &str) -> String {
 // Presets and defaults
 
 #[test]
-fn every_preset_resolves_under_its_own_name_and_survives_writing_and_reading() {
+fn every_preset_has_its_files_name_and_survives_writing_and_reading() {
     for (name, _) in presets::ALL {
         let experiment = resolve(name, &[]).unwrap();
         assert_eq!(experiment.name, name);
@@ -54,7 +54,7 @@ fn defaults_are_the_papers() {
     // V-MPO: one gradient step on the whole batch, no entropy bonus, no clipping; a target network.
     assert_eq!((vmpo.gradient_steps, vmpo.minibatch_unrolls, vmpo.target_period), (1, 128, 100));
     assert_eq!((vmpo.entropy, optimiser.max_gradient_norm, vmpo.lambda), (0.0, 0.0, 1.0));
-    // What the paper does not have is off.
+    // Additions to the paper are off.
     let Experiment { warm_start, network, tracking, optimiser, .. } = Experiment::default();
     assert_eq!((warm_start.steps, network.normaliser_steps, tracking.preset_actuators), (0, 0, false));
     assert_eq!((network.initial_pose, network.latent.prior), (InitialPose::MidRange, Prior::Standard));
@@ -80,7 +80,7 @@ fn the_other_low_levels_presets_are_the_papers() {
 }
 
 #[test]
-fn fields_that_make_no_sense_beside_one_another_are_refused() {
+fn contradictory_fields_are_refused() {
     let refused = |overrides: &[&str]| {
         let overrides: Vec<String> = overrides.iter().map(ToString::to_string).collect();
         resolve("quickstart", &overrides).unwrap_err().to_string()
@@ -118,13 +118,13 @@ fn a_file_resolves_like_a_preset() {
 }
 
 #[test]
-fn neither_preset_nor_file_lists_the_presets() {
+fn the_error_of_an_unknown_document_lists_the_presets() {
     let message = resolve("trackin-mlp", &[]).unwrap_err().to_string();
     assert!(message.starts_with("no preset or file `trackin-mlp` ("), "{message}");
     assert!(
         message.ends_with(
-            "presets are quickstart, quickstart-from-zero, tracking-mlp, tracking-lstm, tracking-mixture, \
-             tracking-product, joint-get-up, joint-ball, go-to-target, gaps, walls, get-up, ball-catch"
+            "presets are ball-catch, gaps, get-up, go-to-target, joint-ball, joint-get-up, quickstart, \
+             quickstart-from-zero, tracking-lstm, tracking-mixture, tracking-mlp, tracking-product, walls"
         ),
         "{message}"
     );
@@ -186,7 +186,7 @@ fn an_unknown_field_of_a_clip_names_which_clip() {
 }
 
 #[test]
-fn a_field_in_the_wrong_section_is_found_where_it_belongs() {
+fn the_error_of_a_field_in_the_wrong_section_names_the_right_one() {
     assert_eq!(refused_text("discount = 0.9"), "run.toml:1: unknown field `discount`; did you mean `vmpo.discount`?");
     assert_eq!(
         refused_text("[vmpo]\nbeta = 0.1"),
@@ -195,7 +195,7 @@ fn a_field_in_the_wrong_section_is_found_where_it_belongs() {
 }
 
 #[test]
-fn a_field_like_no_other_lists_the_known_ones() {
+fn the_error_of_an_unsimilar_field_lists_the_known_ones() {
     assert_eq!(
         refused_text("[budget]\nzzz = 1"),
         "run.toml:2: unknown field `budget.zzz`; known here are environment_steps, minutes, updates"
@@ -235,14 +235,14 @@ fn overrides_reach_every_depth_and_are_applied_in_order() {
 }
 
 #[test]
-fn what_is_not_overridden_stays_as_the_document_has_it() {
+fn an_override_changes_no_other_field() {
     let mut expected = resolve("quickstart", &[]).unwrap();
     expected.vmpo.epsilon_eta = 0.2;
     assert_eq!(resolve("quickstart", &["vmpo.epsilon_eta=0.2".into()]).unwrap(), expected);
 }
 
 #[test]
-fn whole_numbers_do_for_real_ones_and_anything_does_for_a_string() {
+fn a_real_field_takes_whole_numbers_and_a_string_takes_any_text() {
     assert_eq!(set(&["vmpo.discount=0", "vmpo.value_weight=2"]).unwrap().vmpo.value_weight, 2.0);
     for name in ["7", "true", "a = b", "[1]", "1\nseed = 2", ""] {
         assert_eq!(set(&[&format!("name={name}")]).unwrap().name, name);
@@ -250,7 +250,7 @@ fn whole_numbers_do_for_real_ones_and_anything_does_for_a_string() {
 }
 
 #[test]
-fn clips_are_replaced_whole_or_field_by_field() {
+fn overrides_replace_all_clips_or_single_fields_of_them() {
     let experiment =
         set(&["clips=[{source=\"builtin:run\"}, {source=\"cmu.h5\", subset=\"walk_tiny\"}]", "clips.1.weight=2"])
             .unwrap();
@@ -262,7 +262,7 @@ fn clips_are_replaced_whole_or_field_by_field() {
 }
 
 #[test]
-fn an_override_that_is_none_shows_the_form() {
+fn the_error_of_a_malformed_override_shows_the_form() {
     for argument in ["vmpo.discount", "=0.9", "vmpo..discount=0.9", ".name=x", "vmpo.=1", ""] {
         assert_eq!(
             refused(argument),
@@ -272,7 +272,7 @@ fn an_override_that_is_none_shows_the_form() {
 }
 
 #[test]
-fn an_override_of_an_unknown_field_names_itself_and_the_nearest() {
+fn the_error_of_an_unknown_override_names_it_and_the_nearest_field() {
     for (argument, nearest) in [
         ("vmpo.epsilon_etta=0.2", "vmpo.epsilon_eta"),
         ("epsilon_eta=0.2", "vmpo.epsilon_eta"),
@@ -285,7 +285,7 @@ fn an_override_of_an_unknown_field_names_itself_and_the_nearest() {
 }
 
 #[test]
-fn an_override_of_the_wrong_type_names_itself_and_the_field() {
+fn the_error_of_an_override_of_the_wrong_type_names_it_and_the_field() {
     assert_eq!(
         refused("vmpo.discount=much"),
         "--set vmpo.discount=much: invalid type: string \"much\", expected f64 in `vmpo.discount`"
@@ -299,7 +299,7 @@ fn an_override_of_the_wrong_type_names_itself_and_the_field() {
 // Values
 
 #[test]
-fn values_outside_their_meaning_are_refused_by_name() {
+fn meaningless_values_are_refused_with_field_and_remedy() {
     for (argument, remedy) in [
         ("clips=[]", "name at least one clip source"),
         ("clips.0.source=\"\"", "must be a file or builtin:NAME"),
@@ -391,7 +391,7 @@ fn a_value_in_a_file_is_refused_with_its_line() {
         refused_text("[[clips]]\nsource = \"a.h5\"\n[[clips]]\nsource = \"b.h5\"\nweight = -1.0"),
         "run.toml:5: clips.1.weight = -1.0: must be 0 or more"
     );
-    // The fault is where the batch was changed, not where the field has its default.
+    // The text does not have the field, so the error has no line.
     let message = refused_text("[unroll]\nbatch = 100\n");
     assert_eq!(message, "run.toml: vmpo.minibatch_unrolls = 128: must divide unroll.batch, 100");
 }

@@ -22,7 +22,7 @@ use best::Best;
 pub use best::{Evaluated, Judgement};
 use steps::{Step, carry_out, hidden, is_damage, put, replace};
 
-use crate::error::Misuse;
+use crate::error::Error;
 
 const MANIFEST: &str = "MANIFEST.json";
 const EPOCH: &str = "epoch";
@@ -128,13 +128,13 @@ impl Store {
     /// Begins a new life of the learner: an epoch larger than every earlier one, on disk before it is returned.
     ///
     /// # Errors
-    /// [`Misuse`] when the epoch file is damaged; otherwise when it cannot be read or written.
+    /// [`Error::Configuration`] when the epoch file is damaged; otherwise when it cannot be read or written.
     pub fn begin_epoch(&self) -> Result<u64> {
         let path = self.directory.join(EPOCH);
         let last = match fs::read(&path) {
             Ok(bytes) => String::from_utf8_lossy(&bytes).trim().parse::<u64>().map_err(|_| {
                 let remedy = "write the number of earlier starts into it";
-                Misuse::new(format!("{} is damaged: {remedy}", path.display()))
+                Error::configuration(format!("{} is damaged: {remedy}", path.display()))
             })?,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => 0,
             Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),
@@ -237,7 +237,7 @@ impl Store {
     /// what an earlier life left half-done is put right.
     ///
     /// # Errors
-    /// When something cannot be listed or read; [`Misuse`] when there are, or were, checkpoints and none of them verifies:
+    /// When something cannot be listed or read; [`Error::Configuration`] when there are, or were, checkpoints and none of them verifies:
     /// beginning anew beside them would be a loss nobody asked for.
     pub fn newest(&self) -> Result<Option<(PathBuf, Snapshot)>> {
         self.put_right()?;
@@ -256,7 +256,8 @@ impl Store {
             self.directory.display(),
             "mend one and give it its name back, remove it to begin anew, or give another --run",
         );
-        Err(Misuse::new(format!("every checkpoint in {all} is damaged, as {} is: {remedy}", aside.display())).into())
+        let said = format!("every checkpoint in {all} is damaged, as {} is: {remedy}", aside.display());
+        Err(Error::Configuration(said).into())
     }
 
     fn put_aside(&self, path: &Path, error: &anyhow::Error) -> Result<()> {
@@ -275,12 +276,12 @@ impl Store {
 
 /// What to say of a run whose checkpoint verifies and cannot be gone on with: the next start would find the same, unless it
 /// was the device that failed.
-pub(crate) fn incompatible(run: &Path, error: anyhow::Error) -> anyhow::Error {
-    let what = format!("{} cannot be resumed", run.display());
-    if error.chain().any(|cause| cause.is::<tch::TchError>()) {
-        return error.context(what);
+pub(crate) fn incompatible(run: &Path, error: impl Into<Error>) -> Error {
+    let (what, error) = (format!("{} cannot be resumed", run.display()), error.into());
+    if error.is_device_failure() {
+        return Error::within(what)(error);
     }
-    Misuse::new(format!("{what}: {error:#}")).into()
+    Error::configuration(format!("{what}: {}", comic_proto::chain(&error)))
 }
 
 /// How a directory comes to be, with those above it that are missing: what is synced in one that nobody finds is lost with it.
@@ -370,9 +371,13 @@ mod tests {
     #[test]
     fn a_device_that_fails_is_no_wrong_checkpoint() {
         let failed = |error: anyhow::Error| incompatible(Path::new("runs/a"), error.context("cannot be restored"));
-        assert!(!failed(tch::TchError::Torch("out of memory".into()).into()).is::<Misuse>());
-        assert!(!failed(crate::vmpo::Error::from(tch::TchError::Torch("out of memory".into())).into()).is::<Misuse>());
-        assert!(failed(anyhow::anyhow!("the checkpoint does not fit")).is::<Misuse>());
+        assert_eq!(failed(tch::TchError::Torch("out of memory".into()).into()).exit_code(), 1);
+        assert_eq!(
+            failed(crate::algorithm::error::Error::from(tch::TchError::Torch("out of memory".into())).into())
+                .exit_code(),
+            1
+        );
+        assert_eq!(failed(anyhow::anyhow!("the checkpoint does not fit")).exit_code(), 2);
     }
 
     #[test]
@@ -382,7 +387,8 @@ mod tests {
         for (name, remedy) in [(EPOCH, "earlier starts"), ("run", "start the actors again")] {
             fs::write(store.directory.join(name), b"\xff\xfe1").unwrap();
             let refused = if name == EPOCH { store.begin_epoch() } else { store.run() }.unwrap_err();
-            assert!(refused.is::<Misuse>() && refused.to_string().contains(remedy), "{refused:#}");
+            let refused = Error::from(refused);
+            assert!(refused.exit_code() == 2 && refused.to_string().contains(remedy), "{refused:#}");
         }
     }
 }

@@ -13,7 +13,7 @@ use comic_experiment::{DeviceName, Learner};
 use tch::kind::Element;
 use tch::{Device, TchError, Tensor};
 
-use crate::error::Misuse;
+use crate::error::Error;
 
 /// A device that is there.
 #[derive(Debug)]
@@ -28,7 +28,7 @@ impl Backend {
     /// The device the experiment names, ready for tensors.
     ///
     /// # Errors
-    /// [`Misuse`] with the remedy when the device was not built in or is not there.
+    /// [`Error::Configuration`] with the remedy when the device was not built in or is not there.
     pub fn open(learner: &Learner) -> Result<Self> {
         match learner.device {
             DeviceName::Cpu => Ok(Self::cpu()),
@@ -57,7 +57,7 @@ impl Backend {
             return Ok(Self::of(DeviceName::Cuda(index), Device::Cuda(index)));
         }
         let found = if count == 0 { "no card" } else { "other cards only" };
-        Err(Misuse::new(format!(
+        Err(Error::configuration(format!(
             "learner.device = \"cuda:{index}\": libtorch finds {found} ({count}). It takes an NVIDIA driver that lists the \
              card (nvidia-smi), and a learner built with CUDA: `cargo xtask setup --cuda`, then build again"
         ))
@@ -72,7 +72,7 @@ impl Backend {
 
     #[cfg(not(feature = "xla"))]
     fn xla(index: usize, _learner: &Learner) -> Result<Self> {
-        Err(Misuse::new(format!(
+        Err(Error::configuration(format!(
             "learner.device = \"xla:{index}\": this learner was built without XLA: `cargo xtask setup --xla`, then \
              `cargo build --release --package comic-learner --features xla`"
         ))
@@ -164,20 +164,20 @@ pub(crate) fn upload<T: Element>(values: &[T], size: &[i64], device: Device) -> 
 mod tests {
     use super::*;
 
-    fn open(device: DeviceName) -> anyhow::Error {
-        Backend::open(&Learner { device, ..Learner::default() }).unwrap_err()
+    fn open(device: DeviceName) -> Error {
+        Backend::open(&Learner { device, ..Learner::default() }).unwrap_err().into()
     }
 
     #[test]
     fn a_card_that_is_not_there_is_refused_with_its_remedy() {
         let error = open(DeviceName::Cuda(255));
-        assert!(error.is::<Misuse>() && error.to_string().contains("setup --cuda"), "{error}");
+        assert!(error.exit_code() == 2 && error.to_string().contains("setup --cuda"), "{error}");
     }
 
     #[cfg(not(feature = "xla"))]
     #[test]
     fn a_learner_without_xla_says_how_it_gets_one() {
         let error = open(DeviceName::Xla(0));
-        assert!(error.is::<Misuse>() && error.to_string().contains("--features xla"), "{error}");
+        assert!(error.exit_code() == 2 && error.to_string().contains("--features xla"), "{error}");
     }
 }

@@ -1,13 +1,196 @@
-//! What can go wrong, and which of it stays wrong.
+//! What can go wrong in the learner, and with which exit code the program then ends.
 
-/// A configuration that is wrong and stays wrong, however often it is tried: exit code 2.
+use std::path::PathBuf;
+
+/// The learner's errors. A variant does not repeat in its message what its source says; `comic_proto::chain` prints both.
 #[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct Misuse(pub(crate) String);
+#[non_exhaustive]
+pub enum Error {
+    /// The configuration, the command line or the run's directory is wrong; the message names the remedy.
+    #[error("{0}")]
+    Configuration(String),
+    /// The experiment document cannot be used.
+    #[error(transparent)]
+    Experiment(#[from] comic_experiment::Error),
+    /// The reference clips cannot be used.
+    #[error(transparent)]
+    Clips(#[from] comic_clips::Error),
+    /// An address, a token or a certificate of a client cannot be used.
+    #[error(transparent)]
+    Access(#[from] comic_proto::AccessError),
+    /// Parameters or an exported file do not fit the networks.
+    #[error(transparent)]
+    Networks(#[from] comic_networks::Error),
+    /// The accounting of a checkpoint cannot be restored.
+    #[error(transparent)]
+    Accounting(#[from] comic_replay::Error),
+    /// A batch or a state does not fit the update.
+    #[error(transparent)]
+    Update(Box<dyn std::error::Error + Send + Sync>),
+    /// libtorch refused an operation.
+    #[error("libtorch failed")]
+    Torch(#[from] tch::TchError),
+    /// A device failed, or another process has it.
+    #[error("{0}")]
+    Device(String),
+    /// Losses and gradients stay not finite.
+    #[error("{0}")]
+    Diverged(String),
+    /// A checkpoint, or a part of it, is missing or damaged.
+    #[error("{0}")]
+    Checkpoint(String),
+    /// A JSON document cannot be read or written.
+    #[error("{what} is not the JSON that was expected")]
+    Json {
+        /// The document.
+        what: String,
+        /// What is wrong with it.
+        source: serde_json::Error,
+    },
+    /// A file or a directory.
+    #[error("cannot {action} {}", path.display())]
+    File {
+        /// What was tried: `read`, `write`, `list`.
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// Why it failed.
+        source: std::io::Error,
+    },
+    /// The operating system refused a thread, a socket, a signal handler or the standard output.
+    #[error("{what}")]
+    System {
+        /// What was tried.
+        what: String,
+        /// Why it failed.
+        source: std::io::Error,
+    },
+    /// The gRPC server ended by itself.
+    #[error("the server stopped accepting connections")]
+    Server(#[from] tonic::transport::Error),
+    /// A certificate cannot be made.
+    #[error("cannot make a certificate")]
+    Certificate(#[from] rcgen::Error),
+    /// A learner that was asked does not answer, or does not serve.
+    #[error("{0}")]
+    NoAnswer(String),
+    /// The process was told twice to stop.
+    #[error("stopped by a second signal, without a last checkpoint")]
+    Stopped,
+    /// A thread of the learner ended by a panic.
+    #[error("{0} panicked; the log says where")]
+    Panicked(&'static str),
+    /// Two parts of the program disagree. This is a defect of the learner.
+    #[error("{0}")]
+    Defect(String),
+    /// Another error, and what the learner did when it occurred.
+    #[error("{what}")]
+    Within {
+        /// What the learner did.
+        what: String,
+        /// The error.
+        source: Box<Error>,
+    },
+    /// An error of a module that does not use this type yet.
+    #[error(transparent)]
+    Other(#[from] anyhow::Error),
+}
 
-impl Misuse {
-    /// What is wrong, and the remedy.
-    pub fn new(message: impl Into<String>) -> Self {
-        Self(message.into())
+impl Error {
+    /// The program's exit code: 2 when starting again cannot help, because the configuration is wrong, and 1 otherwise.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Self::Configuration(_)
+            | Self::Experiment(_)
+            | Self::Clips(_)
+            | Self::Access(_)
+            | Self::Networks(comic_networks::Error::Experiment(_)) => 2,
+            Self::Within { source, .. } => source.exit_code(),
+            Self::Other(error) => error.chain().find_map(known).unwrap_or(1),
+            Self::Networks(_)
+            | Self::Accounting(_)
+            | Self::Update(_)
+            | Self::Torch(_)
+            | Self::Device(_)
+            | Self::Diverged(_)
+            | Self::Checkpoint(_)
+            | Self::Json { .. }
+            | Self::File { .. }
+            | Self::System { .. }
+            | Self::Server(_)
+            | Self::Certificate(_)
+            | Self::NoAnswer(_)
+            | Self::Stopped
+            | Self::Panicked(_)
+            | Self::Defect(_) => 1,
+        }
+    }
+
+    /// Whether the device failed, so that the same start may succeed another time.
+    pub fn is_device_failure(&self) -> bool {
+        match self {
+            Self::Torch(_) | Self::Device(_) | Self::Networks(comic_networks::Error::Torch(_)) => true,
+            Self::Within { source, .. } => source.is_device_failure(),
+            Self::Other(error) => error
+                .chain()
+                .any(|cause| cause.is::<tch::TchError>() || cause.downcast_ref().is_some_and(Self::is_device_failure)),
+            _ => false,
+        }
+    }
+
+    /// A wrong configuration; the message says what is wrong and names the remedy.
+    pub fn configuration(message: impl Into<String>) -> Self {
+        Self::Configuration(message.into())
+    }
+
+    /// Makes an error of `action` on the file at `path`.
+    pub(crate) fn file(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.into();
+        move |source| Self::File { action, path, source }
+    }
+
+    /// Makes an error of something that the operating system refused.
+    pub(crate) fn system(what: impl Into<String>) -> impl FnOnce(std::io::Error) -> Self {
+        let what = what.into();
+        move |source| Self::System { what, source }
+    }
+
+    /// Makes an error of a JSON document.
+    pub(crate) fn json(what: impl Into<String>) -> impl FnOnce(serde_json::Error) -> Self {
+        let what = what.into();
+        move |source| Self::Json { what, source }
+    }
+
+    /// Says what the learner did when an error occurred.
+    pub(crate) fn within<E: Into<Self>>(what: impl Into<String>) -> impl FnOnce(E) -> Self {
+        let what = what.into();
+        move |source| Self::Within { what, source: Box::new(source.into()) }
+    }
+}
+
+/// The exit code of a cause inside an [`Error::Other`], if the cause decides it.
+fn known(cause: &(dyn std::error::Error + 'static)) -> Option<u8> {
+    let configuration = cause.is::<comic_experiment::Error>()
+        || cause.is::<comic_clips::Error>()
+        || cause.is::<comic_proto::AccessError>();
+    if configuration { Some(2) } else { cause.downcast_ref().map(Error::exit_code) }
+}
+
+/// A result with the learner's [`Error`].
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_error_keeps_its_exit_code_inside_another() {
+        let wrong = || Error::configuration("give another --run");
+        let failed = || Error::Checkpoint("no checkpoint".into());
+        for (error, code) in [(wrong(), 2), (failed(), 1)] {
+            assert_eq!(Error::within("cannot resume")(error).exit_code(), code);
+        }
+        assert_eq!(Error::from(anyhow::Error::from(wrong()).context("cannot resume")).exit_code(), 2);
+        assert_eq!(Error::from(anyhow::Error::from(failed())).exit_code(), 1);
     }
 }

@@ -6,7 +6,7 @@
 //! - [`trainer`] is the OS thread that owns the device: batches in, gradient steps, parameters out; `minibatches` is what
 //!   it makes of a batch. [`warm_start`] is what it does before.
 //! - [`device`] is where it computes: CPU, CUDA, XLA.
-//! - [`vmpo`] is the algorithm: losses, and the gradient step. [`adam`] is its optimiser.
+//! - [`algorithm`] is what the loop needs of a learning algorithm; [`vmpo`] is V-MPO: losses, and the gradient step. [`adam`] is its optimiser.
 //! - `skipped_steps` counts gradient steps that were skipped, and leads back to the last good state.
 //! - `state` turns the trainer into a snapshot and back. [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
 //! - [`export`] makes a checkpoint's policy a file that others read.
@@ -14,18 +14,16 @@
 //! - [`quarantine`] keeps unrolls that were refused, for whoever looks into it.
 //! - [`security`] is who may talk to it; [`certs`] makes certificates for trying that out.
 //! - [`status`] and [`health`] are commands that ask another learner how it is.
-//! - [`sizes`] counts parameters, [`memory`] the bytes that buffers can take; [`bench`] times the update, [`load`] the
-//!   service.
+//! - [`sizes`] counts parameters, [`memory`] the bytes that buffers can take.
 //!
 //! There is no MuJoCo here: whatever needs a simulator is done by actors.
 
 pub mod adam;
-pub mod bench;
+pub mod algorithm;
 pub mod checkpoint;
 pub mod commands;
 pub mod device;
 pub mod error;
-pub mod load;
 mod log_limiter;
 pub mod observe;
 pub mod options;

@@ -3,16 +3,15 @@
 use std::io::{IsTerminal as _, Write as _};
 use std::process::ExitCode;
 
-use anyhow::Context as _;
 use clap::Parser as _;
-use comic_learner::bench::Subject;
-use comic_learner::error::Misuse;
+use comic_learner::commands;
+use comic_learner::error::{Error, Result};
 use comic_learner::options::{Command, LogFormat, Options};
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
 
-/// glibc's allocator keeps what thousands of connections gave back: under 4000 actors the learner grew without end, by 27 MB
-/// a minute at 1.8 GB, and with this one it stays. docs/operations.md has the figures.
+/// glibc's allocator does not reuse the memory that thousands of connections freed: under 4000 actors the learner grew by
+/// 27 MB a minute, without end. With this allocator it stays at its size. docs/operations.md has the figures.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
@@ -28,34 +27,31 @@ fn main() -> ExitCode {
         LogFormat::Text => log.init(),
         LogFormat::Json => log.json().init(),
     }
-    let ended = match &options.command {
-        Some(Command::Bench { threads, repeats, low_level, joint }) => {
-            let subject = if *joint { Subject::Joint } else { Subject::LowLevel(*low_level) };
-            let device = options.document.device.unwrap_or_default();
-            comic_learner::bench::run(*threads, *repeats, subject, device)
-        }
-        Some(Command::Export { checkpoint, part, out }) => comic_learner::commands::export::run(checkpoint, *part, out),
-        Some(Command::Sizes) => comic_learner::commands::sizes::table(&options.document)
-            .and_then(|table| std::io::stdout().write_all(table.as_bytes()).context("cannot write to stdout")),
-        Some(Command::Status(status)) => status.run(),
-        Some(Command::Health(health)) => return health.run(),
-        Some(Command::Certs(certs)) => certs.run(),
-        Some(Command::Load(load)) => load.run(),
-        Some(Command::Metrics) => comic_learner::observe::telemetry::print_reference(),
-        None => comic_learner::run::run(&options),
-    };
-    match ended {
+    // The exit code of a health check is 0 or 1, whatever the error is.
+    if let Some(Command::Health(health)) = &options.command {
+        return health.run();
+    }
+    match run(&options) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("comic-learner: {error:#}");
-            // A configuration that is wrong stays wrong: 2 tells whoever restarts processes not to try again.
-            let configuration = error.chain().any(|cause| {
-                cause.is::<comic_experiment::Error>()
-                    || cause.is::<comic_clips::Error>()
-                    || cause.is::<comic_proto::AccessError>()
-                    || cause.is::<Misuse>()
-            });
-            ExitCode::from(if configuration { 2 } else { 1 })
+            eprintln!("comic-learner: {}", comic_proto::chain(&error));
+            ExitCode::from(error.exit_code())
         }
+    }
+}
+
+fn run(options: &Options) -> Result<()> {
+    match &options.command {
+        Some(Command::Export { checkpoint, part, out }) => commands::export::run(checkpoint, *part, out),
+        Some(Command::Sizes) => {
+            let table = commands::sizes::table(&options.document)?;
+            let written = std::io::stdout().write_all(table.as_bytes());
+            written.map_err(|source| Error::System { what: "cannot write to stdout".into(), source })
+        }
+        Some(Command::Status(status)) => status.run(),
+        Some(Command::Health(_)) => Ok(()),
+        Some(Command::Certs(certs)) => certs.run(),
+        Some(Command::Metrics) => Ok(comic_learner::observe::telemetry::print_reference()?),
+        None => comic_learner::run::run(options),
     }
 }

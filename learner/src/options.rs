@@ -2,15 +2,14 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context as _, Result};
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use comic_experiment::{DeviceName, Experiment, LowLevelName};
+use comic_experiment::{DeviceName, Experiment};
 use comic_networks::export::Part;
 
 use crate::commands::certs::Certs;
 use crate::commands::health::Health;
 use crate::commands::status::Status;
-use crate::load::Load;
+use crate::error::{Error, Result};
 use crate::security::{ConnectionLimits, SecurityOptions};
 use crate::service::quarantine::QuarantineOptions;
 
@@ -99,7 +98,7 @@ impl Document {
         let device = self.device.map(|device| format!("learner.device=\"{device}\""));
         let overrides: Vec<String> = lockstep.chain(device).chain(self.overrides.iter().cloned()).collect();
         let experiment = comic_experiment::resolve(preset, &overrides)
-            .with_context(|| format!("the experiment `{preset}` is not usable"))?;
+            .map_err(Error::within(format!("the experiment `{preset}` cannot be used")))?;
         Ok(experiment.with_clips(&self.clips))
     }
 }
@@ -127,25 +126,8 @@ pub enum Command {
     Health(Health),
     /// Make a development authority, and certificates for a learner and its actors.
     Certs(Certs),
-    /// Measure what the service carries under many actors that are not real.
-    Load(Load),
     /// Print what each metric means, as docs/metrics.md has it.
     Metrics,
-    /// Time the update against its bare matrix products; one JSON line per figure.
-    Bench {
-        /// libtorch's threads.
-        #[arg(long, default_value_t = 2)]
-        threads: usize,
-        /// Interleaved repeats, of which the median is taken.
-        #[arg(long, default_value_t = 15)]
-        repeats: usize,
-        /// The low level: mlp, lstm, mixture or product.
-        #[arg(long, default_value_t = LowLevelName::Mlp)]
-        low_level: LowLevelName,
-        /// Joint training of two tasks.
-        #[arg(long, conflicts_with = "low_level")]
-        joint: bool,
-    },
 }
 
 /// The same on both sides; `docs/operations.md` says more.

@@ -47,8 +47,10 @@ impl Default for Holding {
 pub struct Published {
     /// Counts publications.
     pub version: u64,
-    /// How actors act with it.
+    /// How actors act with it; unspecified when the run is over.
     pub behaviour: Behaviour,
+    /// Whether this is the end of the run.
+    pub run_over: bool,
     /// Grows with every publication, of the same version again too.
     serial: u64,
     frames: Vec<Bytes>,
@@ -57,7 +59,9 @@ pub struct Published {
 }
 
 impl Published {
-    fn new(learner_epoch: u64, version: u64, behaviour: Behaviour, serial: u64, payload: &Bytes) -> Self {
+    /// `behaviour` is absent at the end of the run.
+    fn new(learner_epoch: u64, version: u64, behaviour: Option<Behaviour>, serial: u64, payload: &Bytes) -> Self {
+        let (behaviour, run_over) = (behaviour.unwrap_or_default(), behaviour.is_none());
         // An empty payload has a piece too: it says how to act.
         let offsets = (0..payload.len().max(1)).step_by(PIECE);
         let frames = offsets.map(|offset| {
@@ -68,9 +72,10 @@ impl Published {
                 total: payload.len() as u64,
                 offset: offset as u64,
                 data: payload.slice(offset..payload.len().min(offset + PIECE)),
+                run_over,
             })
         });
-        Self { version, behaviour, serial, frames: frames.collect(), readers: AtomicUsize::new(0) }
+        Self { version, behaviour, run_over, serial, frames: frames.collect(), readers: AtomicUsize::new(0) }
     }
 
     /// Every [`ParametersChunk`] as gRPC sends it, at least one.
@@ -121,9 +126,19 @@ impl Publisher {
         Self { inner: Arc::new(inner), newest: watch::Sender::new(None) }
     }
 
-    /// Makes this the newest version; nobody waits for anybody. Versions grow, except that the same version may come
-    /// again with another behaviour ([`Behaviour::Leave`] at the end); an older one is refused with an error in the log.
+    /// Makes this the newest version, without waiting for readers. Versions grow, but the same version may be published
+    /// again. An older one is refused with an error in the log.
     pub fn publish(&self, version: u64, behaviour: Behaviour, payload: &Bytes) {
+        self.replace(version, Some(behaviour), payload);
+    }
+
+    /// Tells every reader that the run is over, under the newest version's number and without parameters. It is the last
+    /// publication.
+    pub fn end_run(&self) {
+        self.replace(self.newest_version(), None, &Bytes::new());
+    }
+
+    fn replace(&self, version: u64, behaviour: Option<Behaviour>, payload: &Bytes) {
         let (newest, serial) = self.newest().map_or((0, 0), |published| (published.version, published.serial));
         if version < newest {
             tracing::error!(version, newest, "an older version is not published");
@@ -214,7 +229,7 @@ enum Begun {
 
 impl Subscription {
     /// The next piece: the rest of a version begun, then the newest one not seen yet, waiting for it if need be.
-    /// `None` after the last piece of a [`Behaviour::Leave`], or when there is no publisher any more. Cancel-safe.
+    /// `None` after the end of the run, or when there is no publisher any more. Cancel-safe.
     pub async fn next(&mut self) -> Option<Piece> {
         loop {
             if let Some(piece) = self.piece() {
@@ -237,11 +252,9 @@ impl Subscription {
         }
     }
 
-    /// The next piece of [`Behaviour::Leave`], if that is what was published last: what is still worth sending when
-    /// the server closes.
+    /// The message that the run is over, if that was published last. It is sent even when the server closes.
     pub fn farewell(&mut self) -> Option<Piece> {
-        let leaving = |published: &Arc<Published>| published.behaviour == Behaviour::Leave;
-        if !self.newest.borrow().as_ref().is_some_and(leaving) {
+        if !self.newest.borrow().as_ref().is_some_and(|published| published.run_over) {
             return None;
         }
         if self.newest.has_changed().unwrap_or(false) {
@@ -296,7 +309,7 @@ impl Subscription {
         if reading.index == published.frames.len() {
             self.reading = None;
             self.finished = published.serial;
-            self.left = published.behaviour == Behaviour::Leave;
+            self.left = published.run_over;
         } else if let Some(held) = self.inner.held().iter_mut().find(|held| held.published.serial == published.serial) {
             held.touched = Instant::now();
         }

@@ -6,11 +6,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::{Context as _, Result, anyhow, bail};
-use bytes::Bytes;
 use comic_clips::Catalogue;
 use comic_experiment::{Difference, Experiment, InitialPose, TaskSpec, Unroll};
-use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Phase};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -21,7 +18,7 @@ use tokio::sync::oneshot;
 
 use crate::checkpoint::{Snapshot, Store, incompatible};
 use crate::device::Backend;
-use crate::error::Misuse;
+use crate::error::{Error, Result};
 use crate::observe::probes;
 use crate::options::Options;
 use crate::publish::Publisher;
@@ -43,27 +40,32 @@ const LATE_FAREWELL: Duration = Duration::from_secs(20);
 pub fn run(options: &Options) -> Result<()> {
     let experiment = options.document.resolve()?;
     if options.print {
-        return std::io::stdout().write_all(experiment.to_toml()?.as_bytes()).context("cannot write to stdout");
+        let text = experiment.to_toml()?;
+        return std::io::stdout().write_all(text.as_bytes()).map_err(Error::system("cannot write to stdout"));
     }
     tch::set_num_threads(experiment.learner.threads as i32);
     service_runtime()?.block_on(live(options, experiment))
 }
 
 /// The threads that serve.
-pub(crate) fn service_runtime() -> Result<Runtime> {
+///
+/// # Errors
+/// When the system starts no more threads.
+pub fn service_runtime() -> Result<Runtime> {
     let workers = std::thread::available_parallelism().map_or(2, usize::from).clamp(1, 4);
     tokio::runtime::Builder::new_multi_thread()
         .worker_threads(workers)
         .enable_all()
         .build()
-        .context("cannot start tokio")
+        .map_err(Error::system("cannot start tokio"))
 }
 
 async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     // Both signals count from the first moment on.
-    let mut interrupt = signal(SignalKind::interrupt())?;
-    let mut terminate = signal(SignalKind::terminate())?;
-    let mut hangup = signal(SignalKind::hangup())?;
+    let listen_to = |kind| signal(kind).map_err(Error::system("cannot wait for signals"));
+    let mut interrupt = listen_to(SignalKind::interrupt())?;
+    let mut terminate = listen_to(SignalKind::terminate())?;
+    let mut hangup = listen_to(SignalKind::hangup())?;
     let security = Security::new(&options.security, options.address)?;
     allow_descriptors(options.limits.max_connections() as u64 + OTHER_FILES);
     let listener = listen(options, "port", options.port).await?;
@@ -79,11 +81,13 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
     let began = batcher.accounting().trained;
     let mut training = start_trainer(setup)?;
     let (stop_serving, stopped) = oneshot::channel::<()>();
-    let address = listener.local_addr()?;
+    let local_address =
+        |listener: &TcpListener| listener.local_addr().map_err(Error::system("a socket has no address"));
+    let address = local_address(&listener)?;
     let mut listening =
         serde_json::json!({ "listening": address.to_string(), "learner_epoch": epoch, "run": options.run });
     if let Some(metrics) = metrics {
-        listening["metrics"] = metrics.local_addr()?.to_string().into();
+        listening["metrics"] = local_address(&metrics)?.to_string().into();
         tokio::spawn(probes::serve(metrics, shared.clone()));
     }
     let serving = tokio::spawn(service::serve(listener, shared.clone(), async {
@@ -106,23 +110,23 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
             batcher.close();
             tokio::select! {
                 ending = &mut training => ending,
-                _ = interrupt.recv() => bail!("stopped by a second signal, without a last checkpoint"),
-                _ = terminate.recv() => bail!("stopped by a second signal, without a last checkpoint"),
+                _ = interrupt.recv() => return Err(Error::Stopped),
+                _ = terminate.recv() => return Err(Error::Stopped),
             }
         }
     };
     if let Ok(Ok(Ending::Budget)) = &ending
-        && let Some(newest) = publisher.newest()
+        && publisher.newest().is_some()
     {
-        publisher.publish(newest.version, Behaviour::Leave, &Bytes::new());
+        publisher.end_run();
         let trained = batcher.accounting().trained > began;
         tokio::time::sleep(if trained { FAREWELL } else { LATE_FAREWELL }).await;
     }
     batcher.close();
     let _ = stop_serving.send(());
     let served = serving.await;
-    let ending = ending.context("the trainer's thread is gone")??;
-    served.context("the server failed")??;
+    let ending = ending.map_err(|_| Error::Panicked("the trainer"))??;
+    served.map_err(|_| Error::Panicked("the server"))??;
     tracing::info!(accounting = ?batcher.accounting(), "{}", match ending {
         Ending::Budget => "the budget is used up",
         Ending::Stopped => "stopped; start again with the same --run to go on",
@@ -131,7 +135,7 @@ async fn live(options: &Options, experiment: Experiment) -> Result<()> {
 }
 
 /// A connection is a file descriptor, and systems give 1024 unless asked for more.
-pub(crate) fn allow_descriptors(wanted: u64) {
+pub fn allow_descriptors(wanted: u64) {
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
     if current.is_none_or(|current| current >= wanted) {
         return;
@@ -147,7 +151,7 @@ async fn listen(options: &Options, flag: &str, port: u16) -> Result<TcpListener>
     let address = SocketAddr::new(options.address, port);
     TcpListener::bind(address)
         .await
-        .with_context(|| format!("cannot listen on {address}: choose another --{flag}, or 0 for any free one"))
+        .map_err(Error::system(format!("cannot listen on {address}: choose another --{flag}, or 0 for any free one")))
 }
 
 type Training = oneshot::Receiver<Result<Ending>>;
@@ -157,10 +161,10 @@ fn start_trainer(setup: Setup) -> Result<Training> {
     std::thread::Builder::new()
         .name("trainer".into())
         .spawn(move || {
-            let ending = catch_unwind(AssertUnwindSafe(|| Trainer::new(setup)?.run()));
-            let _ = ended.send(ending.unwrap_or_else(|_| Err(anyhow!("the trainer panicked; the log says where"))));
+            let ending = catch_unwind(AssertUnwindSafe(|| Ok(Trainer::new(setup)?.run()?)));
+            let _ = ended.send(ending.unwrap_or_else(|_| Err(Error::Panicked("the trainer"))));
         })
-        .context("cannot start the trainer's thread")?;
+        .map_err(Error::system("cannot start the trainer's thread"))?;
     Ok(training)
 }
 
@@ -172,8 +176,9 @@ fn prepare(
 ) -> Result<(Setup, Arc<Shared>)> {
     let catalogue = Catalogue::open(&experiment.clips)?;
     let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
-    let spec = TaskSpec::new(&experiment, names)
-        .map_err(|name| Misuse::new(format!("tracking.observations: the tracking task has no observation `{name}`")))?;
+    let spec = TaskSpec::new(&experiment, names).map_err(|name| {
+        Error::configuration(format!("tracking.observations: the tracking task has no observation `{name}`"))
+    })?;
     let pose = match experiment.network.initial_pose {
         InitialPose::MidRange => vec![0.0; spec.action],
         InitialPose::ReferenceMean => catalogue.mean_action()?.iter().map(|action| *action as f32).collect(),
@@ -187,16 +192,16 @@ fn prepare(
     }
     let resume = resume.map(|(_, snapshot)| snapshot);
     let epoch = store.begin_epoch()?;
-    std::fs::write(options.run.join("experiment.toml"), experiment.to_toml()?)
-        .with_context(|| format!("cannot write into {}", options.run.display()))?;
+    let document = options.run.join("experiment.toml");
+    std::fs::write(&document, experiment.to_toml()?).map_err(Error::file("write", document))?;
     let ledger = match &resume {
         Some(snapshot) => accounting(snapshot).map_err(|error| incompatible(&options.run, error))?,
         None => Ledger::new(),
     };
-    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));
+    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| task.name.clone()));
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
     let config = batches(&experiment.unroll);
-    let batcher = Batcher::new(layout, config, Phase { epoch, ..Phase::default() }, ledger);
+    let batcher = Batcher::new(layout, config, Phase::begin(epoch), ledger);
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {
         run: options.run.clone(),
@@ -218,9 +223,9 @@ fn prepare(
 
 /// What a checkpoint says of every unroll so far.
 fn accounting(snapshot: &Snapshot) -> Result<Ledger> {
-    let accounting =
-        serde_json::from_slice(snapshot.part("accounting.json")?).context("accounting.json of the checkpoint")?;
-    Ledger::restore(&accounting).context("accounting.json of the checkpoint")
+    let accounting = serde_json::from_slice(snapshot.part("accounting.json")?);
+    let accounting = accounting.map_err(Error::json("accounting.json of the checkpoint"))?;
+    Ledger::restore(&accounting).map_err(Error::within("accounting.json of the checkpoint cannot be used"))
 }
 
 /// How unrolls become batches.
@@ -241,7 +246,8 @@ fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot,
     now.actor = then.actor.clone();
     let changed = |Difference { field, ours, theirs }| format!("{field} was {ours} and is {theirs}");
     let mut changes: Vec<String> = then.differences(&now)?.into_iter().map(changed).collect();
-    let task: TaskSpec = serde_json::from_slice(snapshot.part("task.json")?).context("task.json of the checkpoint")?;
+    let task = serde_json::from_slice::<TaskSpec>(snapshot.part("task.json")?);
+    let task = task.map_err(Error::json("task.json of the checkpoint"))?;
     if changes.is_empty() && task != *spec {
         changes.push("the clips, or what the task observes and pays, are others".into());
     }
@@ -253,10 +259,9 @@ fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot,
         tracing::warn!("the run goes on as another experiment: {changes}");
         return Ok(());
     }
-    Err(Misuse::new(format!(
+    Err(Error::configuration(format!(
         "it was made by another experiment ({changes}): give another --run, the old values, or --allow-changed"
-    ))
-    .into())
+    )))
 }
 
 #[cfg(test)]
@@ -268,7 +273,7 @@ mod tests {
         let spec = TaskSpec::new(&then, vec!["walk".into()]).unwrap();
         let mut snapshot = Snapshot::default();
         snapshot.parts.insert("experiment.toml".into(), then.to_toml()?.into_bytes());
-        snapshot.parts.insert("task.json".into(), serde_json::to_vec(&spec)?);
+        snapshot.parts.insert("task.json".into(), serde_json::to_vec(&spec).unwrap());
         let mut now = then;
         change(&mut now);
         check_same_experiment(&now, &spec, &snapshot, allowed)
@@ -281,7 +286,7 @@ mod tests {
             experiment.network.latent.beta = 0.25;
         };
         let refused = resumed(change, false).unwrap_err();
-        assert!(refused.is::<Misuse>());
+        assert_eq!(refused.exit_code(), 2);
         let said = refused.to_string();
         for part in ["vmpo.lambda was", "is 0.5", "network.latent.beta was", "is 0.25", "--allow-changed"] {
             assert!(said.contains(part), "no `{part}` in {said}");

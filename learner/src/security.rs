@@ -15,7 +15,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use crate::error::Misuse;
+use crate::error::{Error, Result};
 
 pub use limits::ConnectionLimits;
 pub use tls::Tls;
@@ -54,9 +54,9 @@ impl Security {
     /// Reads certificates and tokens, and refuses to be reachable without either.
     ///
     /// # Errors
-    /// [`Misuse`], or an [`AccessError`](comic_proto::AccessError): certificates or tokens that cannot be used, or an
+    /// [`Error::Configuration`] or [`Error::Access`]: certificates or tokens that cannot be used, or an
     /// address that others can reach with nothing to protect it.
-    pub fn new(options: &SecurityOptions, address: IpAddr) -> anyhow::Result<Self> {
+    pub fn new(options: &SecurityOptions, address: IpAddr) -> Result<Self> {
         let tls = match (&options.cert, &options.key) {
             (Some(cert), Some(key)) => Some(Tls::new(cert, key, options.client_ca.as_deref())?),
             _ => None,
@@ -68,12 +68,11 @@ impl Security {
         }
         let authenticates = security.tokens.is_some() || options.client_ca.is_some();
         if !authenticates && security.tls.is_none() && !options.insecure {
-            return Err(Misuse::new(format!(
+            return Err(Error::configuration(format!(
                 "--address {address} can be reached by others, and nothing keeps them out: give --token-file FILE, or \
                  --cert and --key FILE with --client-ca FILE (`comic-learner certs` makes some), or --insecure where \
                  the network itself is trusted"
-            ))
-            .into());
+            )));
         }
         if !authenticates {
             tracing::warn!(%address, "whoever reaches this address may act, report and read: there is neither --token-file nor --client-ca");
@@ -92,7 +91,7 @@ mod tests {
     fn an_address_that_others_reach_wants_protection_or_to_be_told() {
         let anywhere = IpAddr::from([0, 0, 0, 0]);
         let refused = Security::new(&SecurityOptions::default(), anywhere).unwrap_err();
-        assert!(refused.is::<Misuse>());
+        assert_eq!(refused.exit_code(), 2);
         for remedy in ["--token-file", "--cert", "--insecure"] {
             assert!(refused.to_string().contains(remedy), "{refused}");
         }

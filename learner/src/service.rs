@@ -34,10 +34,8 @@ use std::pin::pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, Result, ensure};
 use comic_clips::Asset;
 use comic_experiment::{Experiment, TaskSpec};
-use comic_proto::v1::Behaviour;
 use comic_proto::v1::learner_server::LearnerServer;
 use comic_proto::{FILE_DESCRIPTOR_SET, UnrollLayout, UnrollShape};
 use comic_replay::Batcher;
@@ -47,9 +45,9 @@ use tonic::Status;
 use tonic::transport::Server;
 use tonic_health::ServingStatus;
 
-use crate::checkpoint::Evaluated;
-use crate::error::Misuse;
+use crate::error::{Error, Result};
 use crate::log_limiter::LogLimiter;
+use crate::observe::evaluation::Evaluation;
 use crate::observe::telemetry::Telemetry;
 use crate::publish::Publisher;
 use crate::security::{ConnectionLimits, Security, Tls, Tokens};
@@ -115,30 +113,6 @@ pub struct Setup {
     pub quarantine: QuarantineOptions,
 }
 
-/// An evaluation that an actor reported.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Evaluation {
-    /// The run whose parameters were evaluated, where the actor knows.
-    pub run: Option<u64>,
-    /// The life of the learner.
-    pub epoch: u64,
-    /// Their version.
-    pub version: u64,
-    /// Updates until the checkpoint they lie in.
-    pub updates: u64,
-    /// As `comic-actor evaluate --json` prints it.
-    pub json: String,
-}
-
-impl Evaluation {
-    /// What it says of the parameters; `None` of a report without a mean.
-    pub(crate) fn evaluated(&self) -> Option<Evaluated> {
-        let report: serde_json::Value = serde_json::from_str(&self.json).ok()?;
-        let normalised_reward = report["overall"]["normalised_reward"].as_f64()?;
-        Some(Evaluated { run: self.run, epoch: self.epoch, updates: self.updates, normalised_reward })
-    }
-}
-
 /// What all calls, and the trainer, have in common.
 #[derive(Debug)]
 pub struct Shared {
@@ -173,7 +147,8 @@ pub struct Shared {
     assignments: Option<Assignments>,
     /// Of an actor whose command line says nothing else: threads, and environments of each.
     actor: (u64, u64),
-    pub(crate) telemetry: Arc<Telemetry>,
+    /// What Prometheus reads.
+    pub telemetry: Arc<Telemetry>,
     /// From the signal on: nobody else comes in.
     draining: watch::Sender<bool>,
     closing: watch::Sender<bool>,
@@ -183,26 +158,31 @@ impl Shared {
     /// Everything ready to serve.
     ///
     /// # Errors
-    /// [`Misuse`] when no unroll fits the limit of a message; otherwise when the batcher's layout or epoch are not those
+    /// [`Error::Configuration`] when no unroll fits the limit of a message; otherwise when the batcher's layout or epoch are not those
     /// of the rest, experiment or spec cannot be written as TOML, or there is no quarantine where one was asked for.
     pub fn new(setup: Setup) -> Result<Arc<Self>> {
         let Setup { run, id, security, limits, experiment, spec, assets, batcher, publisher, quarantine } = setup;
         let shape = UnrollShape::new(&spec, &experiment);
         let found = *batcher.layout().shape();
-        ensure!(shape == found, "the batcher takes unrolls of {found:?}, the experiment makes {shape:?}");
+        if shape != found {
+            let what = format!("the batcher takes unrolls of {found:?}, the experiment makes {shape:?}");
+            return Err(Error::Defect(what));
+        }
         let (epoch, found) = (publisher.epoch(), batcher.phase().epoch);
-        ensure!(epoch == found, "the batcher is in learner epoch {found}, the publisher in {epoch}");
+        if epoch != found {
+            return Err(Error::Defect(format!("the batcher is in learner epoch {found}, the publisher in {epoch}")));
+        }
         let needed = batcher.layout().message_limit();
         let message_limit = limits.max_message_bytes.unwrap_or(needed.max(MIN_MESSAGE_LIMIT));
         if message_limit < needed {
             let remedy = format!("--max-message-bytes {message_limit} lets no unroll through: it takes {needed}");
-            return Err(Misuse::new(remedy).into());
+            return Err(Error::Configuration(remedy));
         }
         if limits.max_ingest_bytes < message_limit {
             let room = limits.max_ingest_bytes;
             let remedy =
                 format!("--max-ingest-bytes {room} has no room for one message, of {message_limit} bytes at most");
-            return Err(Misuse::new(remedy).into());
+            return Err(Error::Configuration(remedy));
         }
         let telemetry = Arc::<Telemetry>::default();
         let buffers = experiment.unroll.ahead as u64 + 1;
@@ -223,7 +203,8 @@ impl Shared {
             limits,
             quarantine: Quarantine::start(&quarantine, &telemetry)?,
             telemetry,
-            task_spec: toml::to_string(&spec).context("the task's spec cannot be written as TOML")?,
+            task_spec: toml::to_string(&spec)
+                .map_err(|error| Error::Defect(format!("the task's specification is no TOML: {error}")))?,
             seed: experiment.seed,
             experiment: experiment.to_toml()?,
             clips: spec.tasks.iter().map(|task| task.clips).collect(),
@@ -277,7 +258,7 @@ impl Shared {
 
     /// What streams end with when the server closes: `None` once the run is over, which actors were told.
     fn parting(&self) -> Option<Status> {
-        let over = self.publisher.newest().is_some_and(|newest| newest.behaviour == Behaviour::Leave);
+        let over = self.publisher.newest().is_some_and(|newest| newest.run_over);
         (!over).then(calls::draining)
     }
 
@@ -320,12 +301,12 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 /// Bytes that a stream may have under way unread, unless an operator says otherwise: one unroll's message, so that it comes
 /// in one frame, as good as whole, or waits at its actor. What is cut, where a window ends, has to be copied to be joined,
 /// keeps the buffers of both its halves, and costs twice the processor time.
-pub(crate) fn window(layout: &UnrollLayout) -> u32 {
+pub fn window(layout: &UnrollLayout) -> u32 {
     u32::try_from(layout.size().saturating_add(HEADER)).unwrap_or(u32::MAX).clamp(SMALLEST_WINDOW, LARGEST_WINDOW)
 }
 
 /// HTTP/2 as actors meet it, with so many bytes unread on a stream.
-pub(crate) fn server(window: u32) -> Server {
+pub fn server(window: u32) -> Server {
     Server::builder()
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
@@ -350,7 +331,7 @@ pub async fn serve(listener: TcpListener, shared: Arc<Shared>, shutdown: impl Fu
         .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
         .build_v1()
-        .context("the protocol's descriptors are damaged")?;
+        .map_err(|error| Error::Defect(format!("the protocol's descriptors are damaged: {error}")))?;
     let telemetry = &shared.telemetry;
     let admission = Admission::new(shared.tokens.clone(), shared.limits.max_requests, telemetry.clone());
     let door = Acceptor::new(shared.tls.clone(), &shared.limits, telemetry.clone());
@@ -372,7 +353,7 @@ pub async fn serve(listener: TcpListener, shared: Arc<Shared>, shutdown: impl Fu
         std::future::pending().await
     };
     tokio::select! {
-        served = &mut server => return served.context("the server stopped accepting connections"),
+        served = &mut server => return Ok(served?),
         () = draining => {}
         () = shutdown => {}
     }
@@ -381,7 +362,7 @@ pub async fn serve(listener: TcpListener, shared: Arc<Shared>, shutdown: impl Fu
     }
     shared.closing.send_replace(true);
     match tokio::time::timeout(GRACE, server).await {
-        Ok(served) => served.context("the server did not close cleanly"),
+        Ok(served) => Ok(served?),
         Err(_) => {
             tracing::warn!("some actors did not read to the end of their streams; their connections are abandoned");
             Ok(())

@@ -8,8 +8,10 @@ mod vmpo_support;
 use std::sync::OnceLock;
 
 use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
+use comic_learner::algorithm::Algorithm as _;
+use comic_learner::algorithm::losses::{LossValues, Losses};
 use comic_learner::device::Backend;
-use comic_learner::vmpo::{LossValues, Losses, VmpoLearner};
+use comic_learner::vmpo::VmpoLearner;
 use tch::Device;
 #[cfg(feature = "xla")]
 use vmpo_support::LENGTH;
@@ -89,8 +91,8 @@ fn the_first_update_and_thirty_are_the_cpus_for_every_low_level() {
             if seed > 0 {
                 continue;
             }
-            for ((entry, expected), (_, found)) in expected.entries().into_iter().zip(found.entries()) {
-                let difference = (f64::from(expected) - f64::from(found)).abs();
+            for ((entry, expected), (_, found)) in expected.entries().iter().zip(found.entries()) {
+                let difference = (f64::from(*expected) - f64::from(*found)).abs();
                 assert!(difference <= 1e-5 * f64::from(expected.abs()).max(1.0), "{name}: {entry} {expected} {found}");
             }
             // The mean of one gradient is a tenth of that gradient.
@@ -133,8 +135,8 @@ fn whatever_the_mix_of_tasks_and_ends_nothing_is_compiled_twice() {
             }
             // What a schedule changes must be no constant of a program.
             learner.set_learning_rates(1e-3 * (1.0 - f64::from(seed) / 300.0), 1e-3);
-            let metrics = step(&mut learner, &Unrolls::recorded(&experiment, &spec, 1000 + seed as u64, COUNT));
-            assert!(metrics.is_finite(), "{name}");
+            let losses = step(&mut learner, &Unrolls::recorded(&experiment, &spec, 1000 + seed as u64, COUNT));
+            assert!(losses.is_finite(), "{name}");
         }
         assert_eq!(backend().compilations().unwrap(), after_warm_up, "{name}: compiled after the warm-up");
     }

@@ -10,12 +10,13 @@ use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec, resolve};
 use comic_learner::checkpoint::{Snapshot, Store, find, read};
 use comic_learner::device::Backend;
+use comic_learner::observe::evaluation::Evaluation;
 use comic_learner::publish::{Published, Publisher};
 use comic_learner::security::{ConnectionLimits, Security};
 use comic_learner::service::quarantine::QuarantineOptions;
-use comic_learner::service::{self, Evaluation, Shared};
+use comic_learner::service::{self, Shared};
 use comic_learner::train::trainer::{Ending, Setup, Trainer};
-use comic_proto::v1::UnrollHeader;
+use comic_proto::v1::{Behaviour, UnrollHeader};
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Outcome, Phase};
 use rand::{Rng as _, SeedableRng as _};
@@ -132,10 +133,10 @@ fn live_evaluated(
     let ledger = resume.as_ref().map_or_else(Ledger::new, |snapshot| {
         Ledger::restore(&serde_json::from_slice(snapshot.part("accounting.json").unwrap()).unwrap()).unwrap()
     });
-    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)));
+    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| task.name.clone()));
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
     let config = Config { unrolls: experiment.unroll.batch, max_staleness: 1000, ahead: 1, order: BatchOrder::Arrival };
-    let batcher = Batcher::new(layout.clone(), config, Phase { epoch, ..Phase::default() }, ledger);
+    let batcher = Batcher::new(layout.clone(), config, Phase::begin(epoch), ledger);
     let publisher = Publisher::new(epoch);
     let shared = Shared::new(service::Setup {
         run: run.to_path_buf(),
@@ -161,7 +162,13 @@ fn live_evaluated(
             for sequence in joined.next_sequence..unrolls {
                 let (actor, incarnation) = (joined.actor, INCARNATION);
                 let header = UnrollHeader { actor, incarnation, sequence, learner_epoch: epoch, ..Default::default() };
-                let header = UnrollHeader { version: batcher.phase().version, ..header };
+                let task = (sequence % spec.tasks.len() as u64) as u32;
+                let header = UnrollHeader {
+                    version: batcher.phase().version,
+                    behaviour: Behaviour::Policy.into(),
+                    task,
+                    ..header
+                };
                 let mut unroll = recorded(&layout, &spec, sequence);
                 alter(sequence, &mut unroll);
                 match futures::executor::block_on(batcher.insert(&header, unroll.into_bytes())) {

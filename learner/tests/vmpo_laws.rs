@@ -5,7 +5,11 @@
 mod vmpo_support;
 
 use comic_experiment::Prior;
-use comic_learner::vmpo::{Error, Losses, MULTIPLIER_FLOOR, MinibatchTensors};
+use comic_learner::algorithm::Algorithm as _;
+use comic_learner::algorithm::error::Error;
+use comic_learner::algorithm::losses::Losses;
+use comic_learner::algorithm::minibatch::MinibatchTensors;
+use comic_learner::vmpo::MULTIPLIER_FLOOR;
 use proptest::prelude::*;
 use tch::Device;
 use vmpo_support::{LENGTH, UNROLLS, Unrolls, difference, experiment, learner, state, values};
@@ -20,9 +24,9 @@ fn kl_to_an_unchanged_policy_is_exactly_zero_with_equal_batch_shapes() {
     let mut learner = learner(&experiment(), 1);
     let mut unrolls = unrolls(2);
     unrolls.behave(&learner, UNROLLS * LENGTH);
-    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_values();
+    let losses = learner.step(&unrolls.minibatch()).unwrap().to_values();
     // Rows that are no transition are blanked to another distribution, and still do not count.
-    assert_eq!((metrics.kl_mean, metrics.kl_std), (0.0, 0.0));
+    assert_eq!((losses.get("kl_mean"), losses.get("kl_std")), (0.0, 0.0));
 }
 
 #[test]
@@ -30,8 +34,8 @@ fn kl_to_an_unchanged_policy_is_zero_to_1e_6_with_other_batch_shapes() {
     let mut learner = learner(&experiment(), 1);
     let mut unrolls = unrolls(2);
     unrolls.behave(&learner, 5);
-    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_values();
-    assert!(metrics.kl_mean.abs() < 1e-6 && metrics.kl_std.abs() < 1e-6, "{metrics:?}");
+    let losses = learner.step(&unrolls.minibatch()).unwrap().to_values();
+    assert!(losses.get("kl_mean").abs() < 1e-6 && losses.get("kl_std").abs() < 1e-6, "{losses:?}");
 }
 
 #[test]
@@ -41,8 +45,8 @@ fn a_changed_policy_has_a_kl() {
     unrolls.behave(&learner, UNROLLS * LENGTH);
     let minibatch = unrolls.minibatch();
     learner.step(&minibatch).unwrap();
-    let metrics = learner.step(&minibatch).unwrap().to_values();
-    assert!(metrics.kl_mean > 0.0 && metrics.kl_std > 0.0, "{metrics:?}");
+    let losses = learner.step(&minibatch).unwrap().to_values();
+    assert!(losses.get("kl_mean") > 0.0 && losses.get("kl_std") > 0.0, "{losses:?}");
 }
 
 /// Steps two learners, one on each minibatch, and gives the difference of everything they hold.
@@ -123,8 +127,8 @@ fn a_batch_without_a_transition_is_survived() {
     let mut learner = learner(&experiment(), 1);
     let mut unrolls = unrolls(6);
     unrolls.valid.fill(0.0);
-    let metrics = learner.step(&unrolls.minibatch()).unwrap().to_values();
-    assert!(metrics.is_finite(), "{metrics:?}");
+    let losses = learner.step(&unrolls.minibatch()).unwrap().to_values();
+    assert!(losses.is_finite(), "{losses:?}");
     assert!(state(&learner).iter().all(|(_, values)| values.iter().all(|value| value.is_finite())));
 }
 
@@ -135,7 +139,7 @@ fn a_clipped_action_would_be_scored_differently() {
     let loss = |size: f32| {
         let mut unrolls = base.clone();
         unrolls.action.fill(size);
-        learner(&experiment(), 1).step(&unrolls.minibatch()).unwrap().to_values().policy_loss
+        learner(&experiment(), 1).step(&unrolls.minibatch()).unwrap().to_values().get("policy_loss")
     };
     assert!(loss(3.0) > loss(1.0) + 1.0);
 }
@@ -173,9 +177,9 @@ fn the_report_of_several_steps_is_their_mean() {
     let minibatch = unrolls(10).minibatch();
     let mut learner = learner(&experiment(), 1);
     let steps: Vec<Losses> = (0..3).map(|_| learner.step(&minibatch).unwrap()).collect();
-    let mean = Losses::mean(&steps).unwrap().to_values().entries();
-    for (index, (name, value)) in mean.into_iter().enumerate() {
-        let expected = steps.iter().map(|step| step.to_values().entries()[index].1).sum::<f32>() / 3.0;
+    let mean = Losses::mean(&steps).unwrap().to_values();
+    for (name, value) in mean.entries() {
+        let expected = steps.iter().map(|step| step.to_values().get(name)).sum::<f32>() / 3.0;
         assert!((value - expected).abs() <= 1e-5 * expected.abs().max(1.0), "{name}");
     }
     assert!(Losses::mean(&[]).is_none());
@@ -189,7 +193,7 @@ fn gradients_are_clipped_only_when_asked() {
         experiment.optimiser.max_gradient_norm = limit;
         let mut learner = learner(&experiment, 1);
         let before = values(&learner.policy_store().variables()["encoder.tracking.head.weight"].detach().copy());
-        let norm = f64::from(learner.step(&minibatch).unwrap().to_values().gradient_norm);
+        let norm = f64::from(learner.step(&minibatch).unwrap().to_values().get("gradient_norm"));
         let after = values(&learner.policy_store().variables()["encoder.tracking.head.weight"].detach());
         (norm, before.iter().zip(after).map(|(before, after)| (before - after).abs()).fold(0.0, f32::max))
     };

@@ -2,7 +2,7 @@
 
 use tch::{Kind, Tensor};
 
-use crate::DiagonalGaussian;
+use crate::gaussian::DiagonalGaussian;
 
 /// π(a|s) over N rows: one diagonal Gaussian, or a mixture of K of them.
 ///

@@ -3,7 +3,7 @@
 use comic_experiment::{Network, TaskSpec};
 use tch::{Kind, Tensor, nn};
 
-use crate::DiagonalGaussian;
+use crate::gaussian::DiagonalGaussian;
 use crate::layers::{GaussianHeadConfig, Mlp, Torso, gaussian, linear};
 use crate::routing::{PerTask, Routing};
 
@@ -36,11 +36,11 @@ pub(crate) struct Encoded {
 
 impl Encoder {
     /// `seen` is how wide the task observation grows by what is seen.
-    pub(crate) fn new(path: &nn::Path, spec: &TaskSpec, seen: i64, config: &Network) -> Self {
+    pub(crate) fn new(path: &nn::Path, spec: &TaskSpec, image_features: i64, config: &Network) -> Self {
         let latent = &config.latent;
         let networks = spec.tasks.iter().map(|task| {
             let path = path / task.name.as_str();
-            let input = (spec.proprioception + latent.size + task.observation) as i64 + seen;
+            let input = (spec.proprioception + latent.size + task.observation) as i64 + image_features;
             let torso = Torso::new(&path, input, &config.encoder);
             if latent.size == 0 {
                 let head = linear(&(&path / "head"), torso.output(), config.primitives.count as i64, 1.0);

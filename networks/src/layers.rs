@@ -3,7 +3,7 @@
 use comic_experiment::Network;
 use tch::{Tensor, nn};
 
-use crate::DiagonalGaussian;
+use crate::gaussian::DiagonalGaussian;
 
 /// A linear layer with weights uniform in ±`scale`/√fan_in and bias 0.
 pub(crate) fn linear(path: &nn::Path, input: i64, output: i64, scale: f64) -> nn::Linear {

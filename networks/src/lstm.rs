@@ -12,7 +12,7 @@ pub(crate) struct LstmStack {
 
 /// What was before, of whatever remembers.
 #[derive(Clone, Copy, Debug)]
-pub struct Memory<'a> {
+pub struct RecurrentState<'a> {
     /// What is remembered when the first row of each unroll is met, `[B, S]`; S is 0 for what remembers nothing.
     pub state: &'a Tensor,
     /// 1 where an episode begins, and all is forgotten, `[B, T]`; none where whoever acts has emptied the state itself.
@@ -46,9 +46,9 @@ impl LstmStack {
     }
 
     /// `[B, T, I]` to `[B, T, H]`, and the state after the last step, `[B, S]`.
-    pub(crate) fn forward(&self, input: &Tensor, memory: Memory<'_>) -> (Tensor, Tensor) {
+    pub(crate) fn forward(&self, input: &Tensor, recurrent: RecurrentState<'_>) -> (Tensor, Tensor) {
         // 0 where an episode begins: [T, B, 1].
-        let kept = memory.first.map(|first| {
+        let kept = recurrent.first.map(|first| {
             let kept: Tensor = 1.0 - first.tr();
             kept.unsqueeze(-1)
         });
@@ -56,7 +56,7 @@ impl LstmStack {
         let mut place = 0;
         let mut states = Vec::with_capacity(2 * self.layers.len());
         for layer in &self.layers {
-            let part = |offset: i64| memory.state.narrow(1, place + offset, layer.units);
+            let part = |offset: i64| recurrent.state.narrow(1, place + offset, layer.units);
             let (h, c) = (part(0), part(layer.units));
             place += 2 * layer.units;
             let (output, h, c) = layer.forward(&hidden, h, c, kept.as_ref());

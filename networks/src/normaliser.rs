@@ -3,7 +3,8 @@
 use comic_experiment::TaskSpec;
 use tch::{Tensor, nn};
 
-use crate::{Error, Routing};
+use crate::error::Error;
+use crate::routing::Routing;
 
 /// Normalised observations are clamped to ± this many standard deviations (D).
 pub const NORMALISED_LIMIT: f64 = 10.0;

@@ -6,7 +6,7 @@ use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use tch::{Device, Kind, Tensor, nn};
 
-use crate::Error;
+use crate::error::Error;
 
 /// Every parameter of `store`, the untrained ones included. The same parameters give the same bytes.
 ///

@@ -3,14 +3,16 @@
 use comic_experiment::{Network, TaskSpec};
 use tch::{Tensor, nn};
 
+use crate::action::ActionDistribution;
 use crate::encoder::Encoder;
+use crate::error::Error;
+use crate::gaussian::DiagonalGaussian;
+use crate::image_encoder::ImageEncoder;
 use crate::layers::rows;
 use crate::low_level::{self, LowLevel};
-use crate::lstm::Memory;
-use crate::normaliser::Normaliser;
+use crate::lstm::RecurrentState;
+use crate::normaliser::{NormalisedObservation, Normaliser, NormaliserStatistics};
 use crate::routing::Routing;
-use crate::sight::Sight;
-use crate::{ActionDistribution, DiagonalGaussian, Error, NormalisedObservation, NormaliserStatistics};
 
 /// What one pass of the policy gives, for N rows.
 #[derive(Debug)]
@@ -30,7 +32,7 @@ pub struct Acting {
 #[derive(Debug)]
 pub struct Policy {
     normaliser: Normaliser,
-    sight: Option<Sight>,
+    image_encoder: Option<ImageEncoder>,
     encoder: Encoder,
     low_level: Box<dyn LowLevel>,
 }
@@ -46,14 +48,15 @@ impl Policy {
             return Err(Error::Length { name: "initial pose", expected: spec.action, found: pose.len() });
         }
         let proprioception = spec.proprioception as i64;
-        let sight = (spec.image > 0).then(|| Sight::new(&(store / "sight"), config.image_features as i64));
-        let seen = sight.as_ref().map_or(0, Sight::output);
+        let image_encoder =
+            (spec.image > 0).then(|| ImageEncoder::new(&(store / "image_encoder"), config.image_features as i64));
+        let image_features = image_encoder.as_ref().map_or(0, ImageEncoder::output);
         let latent = config.latent.size as i64;
-        let encoder = Encoder::new(&(store / "encoder"), spec, seen, config);
+        let encoder = Encoder::new(&(store / "encoder"), spec, image_features, config);
         let low_level = low_level::Config { latent, proprioception, pose, network: config };
         let low_level = low_level::build(&(store / "low_level"), &low_level);
         let normaliser = Normaliser::new(&(store / "normaliser"), spec, config.normaliser_steps > 0);
-        Ok(Self { normaliser, sight, encoder, low_level })
+        Ok(Self { normaliser, image_encoder, encoder, low_level })
     }
 
     /// Normalises observations: proprioception `[.., P]`, task observation `[.., X]`, image `[.., I]` uint8, where the
@@ -67,8 +70,8 @@ impl Policy {
         routing: &Routing,
     ) -> NormalisedObservation {
         let mut observation = self.normaliser.forward(proprioception, task, routing);
-        if let (Some(sight), Some(image)) = (&self.sight, image) {
-            observation.task = Tensor::cat(&[&observation.task, &sight.forward(image)], -1);
+        if let (Some(encoder), Some(image)) = (&self.image_encoder, image) {
+            observation.task = Tensor::cat(&[&observation.task, &encoder.forward(image)], -1);
         }
         observation
     }
@@ -82,12 +85,12 @@ impl Policy {
         observation: &NormalisedObservation,
         previous_latent: &Tensor,
         latent_noise: &Tensor,
-        memory: Memory<'_>,
+        recurrent: RecurrentState<'_>,
     ) -> Acting {
         let NormalisedObservation { proprioception, task, routing } = observation;
         let input = rows(&Tensor::cat(&[task, proprioception, previous_latent], -1));
         let encoded = self.encoder.forward(&input, &rows(latent_noise), routing);
-        let input = low_level::Input { intent: &encoded.intent, proprioception: &rows(proprioception), memory };
+        let input = low_level::Input { intent: &encoded.intent, proprioception: &rows(proprioception), recurrent };
         let low_level::Output { action, state } = self.low_level.act(&input);
         Acting { latent: encoded.latent, action, latent_posterior: encoded.posterior, state }
     }

@@ -21,11 +21,11 @@ pub struct Routing(Option<Routed>);
 struct Routed {
     /// The task of each unroll, `[B]` int64.
     tasks: Tensor,
-    way: Way,
+    plan: Plan,
 }
 
 #[derive(Debug)]
-enum Way {
+enum Plan {
     /// Task by task, the places of its unrolls, int64.
     Groups(Vec<Tensor>),
     Blocks(Blocks),
@@ -68,7 +68,7 @@ impl Routing {
             return Self::single();
         }
         let groups = (0..count).map(|task| indices(places_of(tasks, task), Device::Cpu)).collect();
-        Self(Some(Routed { tasks: indices(tasks.iter().copied(), Device::Cpu), way: Way::Groups(groups) }))
+        Self(Some(Routed { tasks: indices(tasks.iter().copied(), Device::Cpu), plan: Plan::Groups(groups) }))
     }
 
     /// For a learner: `tasks` holds each unroll's task, below `count`. Every shape is decided by how many unrolls and how
@@ -100,15 +100,15 @@ impl Routing {
             },
             size: size as i64,
         };
-        Self(Some(Routed { tasks: indices(tasks.iter().copied(), device), way: Way::Blocks(blocks) }))
+        Self(Some(Routed { tasks: indices(tasks.iter().copied(), device), plan: Plan::Blocks(blocks) }))
     }
 
     /// The same one again; its tensors are shared.
     pub fn shallow_clone(&self) -> Self {
-        Self(self.0.as_ref().map(|Routed { tasks, way }| {
-            let way = match way {
-                Way::Groups(groups) => Way::Groups(groups.iter().map(Tensor::shallow_clone).collect()),
-                Way::Blocks(Blocks { slots, places, tasks, size }) => Way::Blocks(Blocks {
+        Self(self.0.as_ref().map(|Routed { tasks, plan }| {
+            let plan = match plan {
+                Plan::Groups(groups) => Plan::Groups(groups.iter().map(Tensor::shallow_clone).collect()),
+                Plan::Blocks(Blocks { slots, places, tasks, size }) => Plan::Blocks(Blocks {
                     slots: slots.shallow_clone(),
                     places: places.shallow_clone(),
                     tasks: match tasks {
@@ -118,7 +118,7 @@ impl Routing {
                     size: *size,
                 }),
             };
-            Routed { tasks: tasks.shallow_clone(), way }
+            Routed { tasks: tasks.shallow_clone(), plan }
         }))
     }
 
@@ -155,9 +155,9 @@ impl PerTask {
         match (&self.networks[..], &routing.0) {
             ([network], _) => network.forward(input),
             (networks, None) => networks[0].forward(&own(&networks[0], input)),
-            (networks, Some(routed)) => match &routed.way {
-                Way::Groups(groups) => by_group(networks, groups, input),
-                Way::Blocks(blocks) => by_block(networks, blocks, input),
+            (networks, Some(routed)) => match &routed.plan {
+                Plan::Groups(groups) => by_group(networks, groups, input),
+                Plan::Blocks(blocks) => by_block(networks, blocks, input),
             },
         }
     }
@@ -209,7 +209,7 @@ mod tests {
 
     fn blocks(tasks: &[usize], count: usize) -> Blocks {
         match Routing::blocked(tasks, count, Device::Cpu).0 {
-            Some(Routed { way: Way::Blocks(blocks), .. }) => blocks,
+            Some(Routed { plan: Plan::Blocks(blocks), .. }) => blocks,
             other => panic!("{other:?}"),
         }
     }

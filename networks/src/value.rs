@@ -3,9 +3,9 @@
 use comic_experiment::{Network, TaskSpec};
 use tch::{Kind, Tensor, nn};
 
-use crate::NormalisedObservation;
 use crate::layers::{Mlp, Torso, linear, rows};
-use crate::lstm::{LstmStack, Memory};
+use crate::lstm::{LstmStack, RecurrentState};
+use crate::normaliser::NormalisedObservation;
 use crate::routing::PerTask;
 
 /// V(x_t, s_t, clip), one for each task: `[x, s, clip embedding]` → torso → one output per reward term (CoMic supplement).
@@ -31,7 +31,7 @@ impl Value {
     pub fn new(store: &nn::Path, spec: &TaskSpec, config: &Network) -> Self {
         let width = config.clip_embedding as i64;
         let stdev = 1.0 / (config.clip_embedding.max(1) as f64).sqrt();
-        let seen = if spec.image > 0 { config.image_features } else { 0 };
+        let image_features = if spec.image > 0 { config.image_features } else { 0 };
         let terms = spec.reward_terms.len() as i64;
         let (mut embeddings, mut networks) = (Vec::new(), Vec::new());
         for task in &spec.tasks {
@@ -40,7 +40,7 @@ impl Value {
                 let size = [task.clips.max(1) as i64, width];
                 embeddings.push(path.var("clip_embedding", &size, nn::Init::Randn { mean: 0.0, stdev }));
             };
-            let input = (spec.proprioception + task.observation + seen) as i64 + width;
+            let input = (spec.proprioception + task.observation + image_features) as i64 + width;
             let torso = Torso::new(&path, input, &config.value);
             if !config.value_lstm.is_empty() {
                 let lstm = LstmStack::new(&path, torso.output(), &config.value_lstm);
@@ -67,9 +67,9 @@ impl Value {
             Body::FeedForward(networks) => networks.forward(&input, routing),
             Body::Recurrent { torso, lstm, head } => {
                 let state = Tensor::zeros([unrolls, lstm.state_size()], (Kind::Float, input.device()));
-                let memory = Memory { state: &state, first: Some(first) };
+                let recurrent = RecurrentState { state: &state, first: Some(first) };
                 let hidden = torso.forward(&input).reshape([unrolls, steps, -1]);
-                lstm.forward(&hidden, memory).0.flatten(0, 1).apply(head)
+                lstm.forward(&hidden, recurrent).0.flatten(0, 1).apply(head)
             }
         };
         values.reshape([unrolls, steps, -1])

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use comic_experiment::{Experiment, LowLevelName, TaskSpec, resolve};
 use comic_networks::export::{Exported, KEY, Part, Source};
-use comic_networks::{Error, Memory, Policy, Routing, from_safetensors, to_safetensors};
+use comic_networks::{Error, Policy, RecurrentState, Routing, from_safetensors, to_safetensors};
 use proptest::prelude::*;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
@@ -74,8 +74,8 @@ fn random(width: usize) -> Tensor {
 fn every_part_comes_back_as_it_went_out_and_says_what_it_is() {
     let joint = small("joint-get-up", &[]);
     for (part, inputs, outputs) in [
-        ("policy", "proprioception observation:tracking observation:get-up memory", "action memory"),
-        ("policy:get-up", "proprioception observation:get-up memory", "action memory"),
+        ("policy", "proprioception observation:tracking observation:get-up recurrent_state", "action recurrent_state"),
+        ("policy:get-up", "proprioception observation:get-up recurrent_state", "action recurrent_state"),
         ("encoder:get-up", "observation:get-up proprioception previous_latent", "latent_mean latent_std"),
         ("low-level", "latent proprioception state", "mean std state"),
     ] {
@@ -128,7 +128,7 @@ fn a_policy_of_one_task_acts_as_the_joint_policy_does_in_that_task() {
     let task = random(spec.task);
     let act = |policy: &Policy, task: &Tensor, routing: Routing| {
         let observation = policy.normalise(&proprioception, task, None, &routing);
-        let memory = Memory { state: &state, first: None };
+        let memory = RecurrentState { state: &state, first: None };
         policy.act(&observation, &latent, &latent.zeros_like(), memory).action.mode()
     };
     let expected = act(&both, &task, Routing::grouped(&[1], 2));
@@ -180,7 +180,7 @@ fn torch_script_acts_as_the_policy_does_whatever_its_low_level() {
             let (proprioception, task) = (random(spec.proprioception), random(spec.task));
             let output = module.forward_ts(&[&proprioception, &task, &remembered]).unwrap();
             let observation = policy.normalise(&proprioception, &task, None, &Routing::single());
-            let before = Memory { state: &memory.1, first: None };
+            let before = RecurrentState { state: &memory.1, first: None };
             let acting = tch::no_grad(|| policy.act(&observation, &memory.0, &memory.0.zeros_like(), before));
             let action = acting.action.mode().clamp(-1.0, 1.0);
             let expected = Tensor::cat(&[&action, &acting.latent, &acting.state], 1);

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
 use comic_experiment::{LowLevelName, Lstm, Network, Primitives, TaskPart, TaskSpec, resolve};
-use comic_networks::{ActionDistribution, DiagonalGaussian, Memory, Policy, Routing};
+use comic_networks::{ActionDistribution, DiagonalGaussian, Policy, RecurrentState, Routing};
 use tch::{Device, Kind, Tensor, nn};
 
 /// libtorch's generator is the process's: tests that seed it take turns.
@@ -73,7 +73,7 @@ fn an_lstm_is_libtorchs_own() {
     let (previous, noise) = (random(&[unrolls, steps, latent]), random(&[unrolls, steps, latent]));
     let state = random(&[unrolls, 12]);
     let observation = policy.normalise(&proprioception, &task, None, &Routing::single());
-    let acting = policy.act(&observation, &previous, &noise, Memory { state: &state, first: None });
+    let acting = policy.act(&observation, &previous, &noise, RecurrentState { state: &state, first: None });
 
     let mut variables = store.variables();
     let mut take = |name: &str| variables.remove(&format!("low_level.{name}")).unwrap();
@@ -103,7 +103,7 @@ fn fixed_biases_set_primitives_apart_and_are_not_trained() {
         let zeros = |width: i64| Tensor::zeros([1, width], (Kind::Float, Device::Cpu));
         let latent = network.latent.size as i64;
         let observation = policy.normalise(&zeros(7), &zeros(11), None, &Routing::single());
-        let memory = Memory { state: &zeros(0), first: None };
+        let memory = RecurrentState { state: &zeros(0), first: None };
         let (mean, ..) = policy.act(&observation, &zeros(latent), &zeros(latent), memory).action.to_rows();
         let parameters: usize = store.trainable_variables().iter().map(Tensor::numel).sum();
         (Vec::<f32>::try_from(mean.view(-1)).unwrap(), parameters)
@@ -134,7 +134,7 @@ fn a_product_starts_as_wide_as_it_is_told() {
     let _ = tch::no_grad(|| gate.zero_());
     let zeros = |width: i64| Tensor::zeros([1, width], (Kind::Float, Device::Cpu));
     let observation = policy.normalise(&zeros(7), &zeros(11), None, &Routing::single());
-    let memory = Memory { state: &zeros(0), first: None };
+    let memory = RecurrentState { state: &zeros(0), first: None };
     let acting = policy.act(&observation, &zeros(60), &zeros(60), memory);
     // The least exponent shifts a half by a two-thousandth.
     assert!((acting.action.std() - 0.2).abs().max().double_value(&[]) < 2e-4);
@@ -154,7 +154,7 @@ fn a_product_of_next_to_nothing_is_finite_and_one_of_many_is_no_narrower_than_th
         let heads = variables.get_mut("low_level.primitives.head_biases").unwrap();
         let _ = tch::no_grad(|| heads.narrow(2, 3, 3).fill_(raw));
         let observation = policy.normalise(&zeros(7), &zeros(11), None, &Routing::single());
-        let memory = Memory { state: &zeros(0), first: None };
+        let memory = RecurrentState { state: &zeros(0), first: None };
         policy.act(&observation, &zeros(60), &zeros(60), memory).action
     };
     let wide = act(-200.0, 1.0);

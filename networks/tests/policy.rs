@@ -4,8 +4,8 @@
 
 use comic_experiment::{Mlp, Network, TaskPart, TaskSpec};
 use comic_networks::{
-    DiagonalGaussian, Error, Memory, NORMALISED_LIMIT, NormalisedObservation, NormaliserStatistics, Policy, Routing,
-    Value,
+    DiagonalGaussian, Error, NORMALISED_LIMIT, NormalisedObservation, NormaliserStatistics, Policy, RecurrentState,
+    Routing, Value,
 };
 use tch::{Device, Kind, Tensor, nn};
 
@@ -57,7 +57,7 @@ fn inputs() -> [Tensor; 4] {
 /// Acts without memory; `B` rows, or unrolls of rows.
 fn pass(policy: &Policy, observation: &NormalisedObservation, previous: &Tensor, noise: &Tensor) -> Pass {
     let state = Tensor::zeros([previous.size()[0], 0], (Kind::Float, Device::Cpu));
-    let acting = policy.act(observation, previous, noise, Memory { state: &state, first: None });
+    let acting = policy.act(observation, previous, noise, RecurrentState { state: &state, first: None });
     let (mean, std, log_weights) = acting.action.to_rows();
     assert!(log_weights.is_none());
     Pass { latent: acting.latent, posterior: acting.latent_posterior.unwrap(), action: DiagonalGaussian { mean, std } }
@@ -255,7 +255,7 @@ fn what_is_seen_changes_what_is_done_and_is_learnt_from() {
     let (dark, bright) = (latent(0), latent(255));
     assert!((&dark - &bright).abs().max().double_value(&[]) > 1e-3);
     bright.sum(Kind::Float).backward();
-    let sight: Vec<_> = store.variables().into_iter().filter(|(name, _)| name.starts_with("sight.")).collect();
+    let sight: Vec<_> = store.variables().into_iter().filter(|(name, _)| name.starts_with("image_encoder.")).collect();
     assert_eq!(sight.len(), 8, "two convolutions, a linear layer and a norm, each with weight and bias");
     for (name, parameter) in sight {
         assert!(parameter.grad().abs().sum(Kind::Float).double_value(&[]) > 0.0, "{name} gets no gradient");

@@ -6,6 +6,8 @@ use std::ops::Range;
 use comic_experiment::{Experiment, TaskSpec};
 use sha2::{Digest, Sha256};
 
+use crate::PerField;
+
 /// Bytes of an element of every field but the image, whose elements are bytes.
 const ELEMENT: usize = 4;
 /// Room in a message for everything of fixed size around payload and episode statistics.
@@ -130,7 +132,8 @@ impl Field {
         }
     }
 
-    fn rows(self, length: usize) -> usize {
+    /// Rows in an unroll of `length` transitions: T, T + 1 or 1.
+    pub fn rows(self, length: usize) -> usize {
         match self {
             Self::Proprioception | Self::Task | Self::First | Self::Clip | Self::Image => length.saturating_add(1),
             Self::State => 1,
@@ -138,7 +141,8 @@ impl Field {
         }
     }
 
-    fn width(self, shape: &UnrollShape) -> usize {
+    /// Elements of a row.
+    pub fn width(self, shape: &UnrollShape) -> usize {
         match self {
             Self::Proprioception => shape.proprioception,
             Self::Task => shape.task,
@@ -151,6 +155,24 @@ impl Field {
             Self::Reward => shape.reward_terms,
             Self::Discount | Self::Valid | Self::First | Self::Clip => 1,
             Self::Image => shape.image,
+        }
+    }
+
+    /// What stands in a row that holds no transition, where nothing was decided: numbers that no formula can fail on.
+    /// `None` where such a row has a meaning of its own, as its observation has.
+    pub fn blank(self, shape: &UnrollShape) -> Option<f64> {
+        match self {
+            Self::PreviousLatent | Self::LatentNoise | Self::Action | Self::Mean | Self::Reward => Some(0.0),
+            Self::Std => Some(1.0),
+            Self::LogWeights => Some(-(shape.components as f64).ln()),
+            Self::Proprioception
+            | Self::Task
+            | Self::Discount
+            | Self::Valid
+            | Self::First
+            | Self::State
+            | Self::Clip
+            | Self::Image => None,
         }
     }
 
@@ -178,17 +200,17 @@ impl fmt::Display for Field {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UnrollLayout {
     shape: UnrollShape,
-    ranges: [(usize, usize); Field::ALL.len()],
+    ranges: PerField<(usize, usize)>,
     hash: [u8; 32],
 }
 
 impl UnrollLayout {
     /// The layout of unrolls of this shape.
     pub fn new(shape: UnrollShape) -> Self {
-        let mut ranges = [(0, 0); Field::ALL.len()];
+        let mut ranges = PerField::default();
         let mut description = format!("comic unroll layout 3, little-endian, T={}\n", shape.length);
         let mut start = 0usize;
-        for (range, field) in ranges.iter_mut().zip(Field::ALL) {
+        for (field, range) in ranges.iter_mut() {
             let (rows, width) = (field.rows(shape.length), field.width(&shape));
             let end = start.saturating_add(rows.saturating_mul(width).saturating_mul(field.element_bytes()));
             *range = (start, end);
@@ -216,7 +238,7 @@ impl UnrollLayout {
 
     /// The bytes of a payload in which this field lies.
     pub fn range(&self, field: Field) -> Range<usize> {
-        let (start, end) = self.ranges[field as usize];
+        let (start, end) = self.ranges[field];
         start..end
     }
 

@@ -4,6 +4,7 @@
 //! - [`v1`] is generated from `comic/v1/learner.proto`: messages, client and server.
 //! - [`UnrollLayout`] says where each [`Field`] of an unroll lies in the payload, and hashes that into what both sides
 //!   compare. It follows from an [`UnrollShape`], and that from the experiment and the task's spec alone.
+//! - [`PerField`] is an array with one value for each field.
 //! - [`UnrollBuffer`] is an unroll that an actor writes.
 //! - [`ReceivedUnroll`] is one that a learner receives, in the [`Pieces`] in which it came.
 //! - [`Access`] is a client's way to a learner: URL, TLS, and the [`Token`] it shows.
@@ -22,6 +23,7 @@ mod access;
 mod buffer;
 mod frame;
 mod layout;
+mod per_field;
 mod pieces;
 mod token;
 mod validate;
@@ -36,6 +38,7 @@ pub use access::{Access, AccessError, Authorised, Bearer, Client, FRAME_BYTES, c
 pub use buffer::UnrollBuffer;
 pub use frame::frame;
 pub use layout::{Field, UnrollLayout, UnrollShape};
+pub use per_field::PerField;
 pub use pieces::{Malformed, Pieces, ReceivedUnroll};
 pub use token::{TOKEN_VARIABLE, Token};
 pub use validate::{Expected, Invalid, MAX_SEQUENCE, validate};
@@ -44,4 +47,4 @@ pub use validate::{Expected, Invalid, MAX_SEQUENCE, validate};
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
 /// Version of the protocol, which `Join` compares; it changes whenever an old peer would misunderstand a new one.
-pub const PROTOCOL_VERSION: u32 = 2;
+pub const PROTOCOL_VERSION: u32 = 3;

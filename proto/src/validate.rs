@@ -1,8 +1,10 @@
 //! What comes off the wire is checked here, before it touches a batch.
 
+use std::ops::Range;
+
 use thiserror::Error;
 
-use crate::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
+use crate::v1::{Behaviour, EpisodeEnd, EpisodeStatistics, UnrollHeader};
 use crate::{Field, Pieces, UnrollLayout};
 
 /// Sequence numbers lie below this. At a thousand unrolls a second an actor reaches it after thirty years; a larger
@@ -12,12 +14,21 @@ pub const MAX_SEQUENCE: u64 = 1 << 40;
 /// What the learner knows at this moment and a header has to agree with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Expected<'a> {
-    /// Number of clips of each task; an unroll is of one task.
+    /// Number of clips of each task. Clips are numbered through all tasks.
     pub clips: &'a [usize],
     /// The learner's epoch. An unroll of an earlier one is not invalid but superseded, which is the batcher's to say.
     pub epoch: u64,
     /// The newest version of the parameters that was published in this epoch.
     pub newest_version: u64,
+}
+
+impl Expected<'_> {
+    /// The clips of a task; none for a task that the experiment does not have.
+    fn clips_of(&self, task: u32) -> Option<Range<usize>> {
+        let task = task as usize;
+        let first: usize = self.clips.get(..task)?.iter().sum();
+        Some(first..first + self.clips.get(task)?)
+    }
 }
 
 /// Why an unroll is refused as invalid.
@@ -94,23 +105,29 @@ pub enum Invalid {
         /// The row of `valid`.
         row: usize,
     },
-    /// A clip the task does not have.
-    #[error("clip {clip} in row {row}, but the task has {clips} clips")]
+    /// No behaviour, or one that this learner does not know.
+    #[error("the header names no known behaviour: {behaviour}")]
+    Behaviour {
+        /// As received.
+        behaviour: i32,
+    },
+    /// A task that the experiment does not have.
+    #[error("the header names task {task}, but the experiment has {tasks} tasks, counted from 0")]
+    Task {
+        /// As received.
+        task: u32,
+        /// Number of tasks.
+        tasks: usize,
+    },
+    /// A clip that does not belong to the header's task.
+    #[error("clip {clip} in row {row} does not belong to task {task} of the header")]
     Clip {
         /// As received.
         clip: u32,
         /// The row.
         row: usize,
-        /// Number of clips.
-        clips: usize,
-    },
-    /// Clips of two tasks in one unroll.
-    #[error("clip {clip} in row {row} is of another task than row 0: an unroll belongs to one task")]
-    Task {
-        /// As received.
-        clip: u32,
-        /// The row.
-        row: usize,
+        /// The header's task.
+        task: u32,
     },
     /// More episodes than an unroll has room for.
     #[error("{found} episodes ended in one unroll, at most {limit} can")]
@@ -147,7 +164,7 @@ pub fn validate(
     payload: &Pieces,
     expected: &Expected<'_>,
 ) -> Result<(), Invalid> {
-    check_header(layout, header, expected)?;
+    let clips = check_header(layout, header, expected)?;
     if payload.len() != layout.size() {
         return Err(Invalid::Length { found: payload.len(), expected: layout.size() });
     }
@@ -170,15 +187,23 @@ pub fn validate(
     check_range(layout, payload, Field::First, "0 or 1", |value| value == 0.0 || value == 1.0)?;
     check_weights(layout, payload)?;
     check_boundaries(layout, payload)?;
-    check_clips(layout, header, payload, expected.clips)
+    check_clips(layout, header, payload, &clips)
 }
 
-fn check_header(layout: &UnrollLayout, header: &UnrollHeader, expected: &Expected<'_>) -> Result<(), Invalid> {
+/// Checks the header and returns the clips of its task.
+fn check_header(
+    layout: &UnrollLayout,
+    header: &UnrollHeader,
+    expected: &Expected<'_>,
+) -> Result<Range<usize>, Invalid> {
     if header.sequence >= MAX_SEQUENCE {
         return Err(Invalid::Sequence { sequence: header.sequence });
     }
     if header.layout_hash != layout.hash() {
         return Err(Invalid::LayoutHash);
+    }
+    if header.behaviour() == Behaviour::Unspecified {
+        return Err(Invalid::Behaviour { behaviour: header.behaviour });
     }
     if header.learner_epoch > expected.epoch {
         return Err(Invalid::Epoch { found: header.learner_epoch, newest: expected.epoch });
@@ -190,13 +215,16 @@ fn check_header(layout: &UnrollLayout, header: &UnrollHeader, expected: &Expecte
     if header.episodes.len() > layout.max_episodes() {
         return Err(Invalid::Episodes { found: header.episodes.len(), limit: layout.max_episodes() });
     }
-    header.episodes.iter().try_for_each(|episode| check_episode(layout, episode, expected.clips.iter().sum()))
+    let clips =
+        expected.clips_of(header.task).ok_or(Invalid::Task { task: header.task, tasks: expected.clips.len() })?;
+    header.episodes.iter().try_for_each(|episode| check_episode(layout, episode, &clips))?;
+    Ok(clips)
 }
 
-fn check_episode(layout: &UnrollLayout, episode: &EpisodeStatistics, clips: usize) -> Result<(), Invalid> {
+fn check_episode(layout: &UnrollLayout, episode: &EpisodeStatistics, clips: &Range<usize>) -> Result<(), Invalid> {
     let end = EpisodeEnd::try_from(episode.end).unwrap_or(EpisodeEnd::Unspecified);
-    let problem = if episode.clip as usize >= clips {
-        "the task has no such clip"
+    let problem = if !clips.contains(&(episode.clip as usize)) {
+        "its clip does not belong to the header's task"
     } else if episode.steps == 0 || episode.steps_left_at_start == 0 {
         "an episode has at least one step and at least one step left at its start"
     } else if episode.returns.len() != layout.shape().reward_terms {
@@ -269,25 +297,15 @@ fn check_boundaries(layout: &UnrollLayout, payload: &Pieces) -> Result<(), Inval
     }
 }
 
-fn check_clips(layout: &UnrollLayout, header: &UnrollHeader, payload: &Pieces, clips: &[usize]) -> Result<(), Invalid> {
+fn check_clips(
+    layout: &UnrollLayout,
+    header: &UnrollHeader,
+    payload: &Pieces,
+    clips: &Range<usize>,
+) -> Result<(), Invalid> {
     let found = words(layout, payload, Field::Clip);
-    let rows = || found.iter().copied().enumerate();
-    let total: usize = clips.iter().sum();
-    if let Some((row, clip)) = rows().find(|(_, clip)| *clip as usize >= total) {
-        return Err(Invalid::Clip { clip, row, clips: total });
+    match found.iter().position(|clip| !clips.contains(&(*clip as usize))) {
+        Some(row) => Err(Invalid::Clip { clip: found[row], row, task: header.task }),
+        None => Ok(()),
     }
-    // The clips of the task that the first row's clip is one of.
-    let first = rows().next().map_or(0, |(_, clip)| clip as usize);
-    let ranges = clips.iter().scan(0, |end, clips| {
-        *end += clips;
-        Some(*end - clips..*end)
-    });
-    let own = ranges.into_iter().find(|own| own.contains(&first)).unwrap_or(0..total);
-    if let Some((row, clip)) = rows().find(|(_, clip)| !own.contains(&(*clip as usize))) {
-        return Err(Invalid::Task { clip, row });
-    }
-    if header.episodes.iter().any(|episode| !own.contains(&(episode.clip as usize))) {
-        return Err(Invalid::Episode { problem: "its clip is of another task than the unroll" });
-    }
-    Ok(())
 }

@@ -52,7 +52,7 @@ fn the_hash_is_the_same_on_every_machine_and_in_every_build() {
         components: 3,
         state: 9,
     };
-    let hash: String = UnrollLayout::new(shape).hash().iter().map(|byte| format!("{byte:02x}")).collect();
+    let hash = hex::encode(UnrollLayout::new(shape).hash());
     assert_eq!(hash, "f75490a1d054879dc7fd0d707c74c54b18eb452a9e839e0c4c36c5f3e07090b0");
 }
 

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use bytes::Bytes;
-use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader, UnrollMessage};
+use comic_proto::v1::{Behaviour, EpisodeEnd, EpisodeStatistics, UnrollHeader, UnrollMessage};
 use comic_proto::{Expected, Field, Invalid, MAX_SEQUENCE, Pieces, UnrollBuffer, UnrollLayout, UnrollShape, validate};
 use proptest::prelude::*;
 use prost::Message as _;
@@ -40,9 +40,10 @@ fn header() -> UnrollHeader {
         learner_epoch: 2,
         version: 9,
         layout_hash: layout().hash().to_vec(),
-        demonstration: false,
+        behaviour: Behaviour::Policy.into(),
         episodes: vec![episode],
         environment: 0,
+        task: 0,
     }
 }
 
@@ -91,14 +92,31 @@ fn an_unroll_is_of_one_task() {
     let second = |episode: u32| {
         let (mut header, mut unroll) = (header(), unroll());
         (0..5).for_each(|t| unroll.set_clip(t, 3));
+        header.task = 1;
         header.episodes[0].clip = episode;
         refusal(&header, &unroll)
     };
     assert_eq!(second(3), None, "the second task's one clip");
     assert!(matches!(second(1), Some(Invalid::Episode { .. })), "an episode of the first task's");
-    assert_eq!(payload_refusal(|unroll| unroll.set_clip(4, 3)), Some(Invalid::Task { clip: 3, row: 4 }));
-    assert_eq!(payload_refusal(|unroll| unroll.set_clip(0, 3)), Some(Invalid::Task { clip: 1, row: 1 }));
-    assert_eq!(payload_refusal(|unroll| unroll.set_clip(4, 4)), Some(Invalid::Clip { clip: 4, row: 4, clips: 4 }));
+    assert_eq!(payload_refusal(|unroll| unroll.set_clip(4, 3)), Some(Invalid::Clip { clip: 3, row: 4, task: 0 }));
+    assert_eq!(payload_refusal(|unroll| unroll.set_clip(0, 3)), Some(Invalid::Clip { clip: 3, row: 0, task: 0 }));
+    assert_eq!(payload_refusal(|unroll| unroll.set_clip(4, 4)), Some(Invalid::Clip { clip: 4, row: 4, task: 0 }));
+}
+
+#[test]
+fn a_wrong_task_in_the_header_is_refused() {
+    let wrong = |task| {
+        header_refusal(|header| {
+            header.task = task;
+            header.episodes.clear();
+        })
+    };
+    assert_eq!(wrong(1), Some(Invalid::Clip { clip: 0, row: 0, task: 1 }), "the clips belong to task 0");
+    for task in [2, u32::MAX] {
+        let refusal = wrong(task);
+        assert_eq!(refusal, Some(Invalid::Task { task, tasks: 2 }));
+        assert!(refusal.unwrap().to_string().contains(&format!("task {task}, but the experiment has 2 tasks")));
+    }
 }
 
 #[test]
@@ -113,6 +131,14 @@ fn padding_up_to_the_end_passes_and_repeats_the_observation_before_it() {
     }
     unroll.row_mut(Field::Valid, 3)[0] = 0.0;
     assert_eq!(refusal(&header(), &unroll), None);
+}
+
+#[test]
+fn an_unknown_behaviour_in_the_header_is_refused() {
+    assert_eq!(header_refusal(|header| header.behaviour = Behaviour::Demonstration.into()), None);
+    for behaviour in [0, 3, -1] {
+        assert_eq!(header_refusal(|header| header.behaviour = behaviour), Some(Invalid::Behaviour { behaviour }));
+    }
 }
 
 #[test]
@@ -212,8 +238,8 @@ fn an_episode_begins_exactly_after_a_row_without_a_transition() {
 #[test]
 fn a_clip_the_task_does_not_have_is_refused_even_if_its_bits_were_no_number() {
     let refused = |clip| payload_refusal(|unroll| unroll.set_clip(4, clip));
-    assert_eq!(refused(4), Some(Invalid::Clip { clip: 4, row: 4, clips: 4 }));
-    assert_eq!(refused(u32::MAX), Some(Invalid::Clip { clip: u32::MAX, row: 4, clips: 4 }));
+    assert_eq!(refused(4), Some(Invalid::Clip { clip: 4, row: 4, task: 0 }));
+    assert_eq!(refused(u32::MAX), Some(Invalid::Clip { clip: u32::MAX, row: 4, task: 0 }));
 }
 
 proptest! {

@@ -5,7 +5,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use comic_proto::v1::UnrollHeader;
-use comic_proto::{Field, Invalid, Pieces, UnrollLayout};
+use comic_proto::{Field, Invalid, PerField, Pieces, UnrollLayout};
 
 use crate::ledger::Reason;
 use crate::{Batcher, streaming};
@@ -13,8 +13,8 @@ use crate::{Batcher, streaming};
 /// The arrays of a batch: `[B, rows, width]` for each field. Made once and used again and again.
 #[derive(Debug)]
 pub(crate) struct Buffer {
-    /// In the order of [`Field::ALL`]; the clips and the images stay empty here.
-    floats: [Vec<f32>; Field::ALL.len()],
+    /// Empty for the clips and the images.
+    floats: PerField<Vec<f32>>,
     clips: Vec<u32>,
     images: Vec<u8>,
     /// By slot; in a free one stands what was there before.
@@ -28,7 +28,7 @@ impl Buffer {
     pub(crate) fn new(layout: &UnrollLayout, unrolls: usize) -> Self {
         let elements = |field: Field| layout.elements(field) * unrolls;
         Self {
-            floats: Field::ALL.map(|field| match field {
+            floats: PerField::from_fn(|field| match field {
                 Field::Clip | Field::Image => Vec::new(),
                 _ => vec![0.0; elements(field)],
             }),
@@ -60,11 +60,9 @@ impl Buffer {
         self.filled.get(slot) == Some(&false)
     }
 
-    /// The first row's clip of every unroll in it.
-    pub(crate) fn first_clips(&self) -> impl Iterator<Item = u32> {
-        let rows = self.clips.len() / self.filled.len().max(1);
-        let filled = self.filled.iter().enumerate().filter(|(_, filled)| **filled);
-        filled.map(move |(slot, _)| self.clips[slot * rows])
+    /// The task of every unroll in it.
+    pub(crate) fn tasks(&self) -> impl Iterator<Item = u32> {
+        self.filled.iter().zip(&self.headers).filter(|(filled, _)| **filled).map(|(_, header)| header.task)
     }
 
     /// Frees every slot.
@@ -81,7 +79,7 @@ impl Buffer {
             let bytes: &mut [u8] = match field {
                 Field::Clip => bytemuck::cast_slice_mut(&mut self.clips[place]),
                 Field::Image => &mut self.images[place],
-                _ => bytemuck::cast_slice_mut(&mut self.floats[field as usize][place]),
+                _ => bytemuck::cast_slice_mut(&mut self.floats[field][place]),
             };
             payload.copy_by(layout.range(field).start, bytes, streaming::copy);
         }
@@ -90,18 +88,17 @@ impl Buffer {
         self.unrolls += 1;
     }
 
-    /// Lets go of the unrolls that are not `kept`; their slots are free. Gives the first clips of those that went.
+    /// Frees the slots of the unrolls that are not `kept`, and returns the tasks of those unrolls.
     pub(crate) fn retain(&mut self, kept: impl Fn(&UnrollHeader) -> bool) -> Vec<u32> {
-        let rows = self.clips.len() / self.filled.len().max(1);
-        let mut went = Vec::new();
-        for (slot, (filled, header)) in self.filled.iter_mut().zip(&self.headers).enumerate() {
+        let mut removed = Vec::new();
+        for (filled, header) in self.filled.iter_mut().zip(&self.headers) {
             if *filled && !kept(header) {
                 *filled = false;
                 self.unrolls -= 1;
-                went.push(self.clips[slot * rows]);
+                removed.push(header.task);
             }
         }
-        went
+        removed
     }
 
     /// Moves unrolls of `other` here, as far as there are free slots.
@@ -120,7 +117,7 @@ impl Buffer {
                 match field {
                     Field::Clip => self.clips[to].copy_from_slice(&other.clips[from]),
                     Field::Image => self.images[to].copy_from_slice(&other.images[from]),
-                    _ => self.floats[field as usize][to].copy_from_slice(&other.floats[field as usize][from]),
+                    _ => self.floats[field][to].copy_from_slice(&other.floats[field][from]),
                 }
             }
             self.headers[free] = std::mem::take(&mut other.headers[slot]);
@@ -177,7 +174,7 @@ impl Batch {
     /// A field of `f32`, `[B, rows, width]`; empty for [`Field::Clip`] and [`Field::Image`], which are
     /// [`clip`](Self::clip) and [`image`](Self::image).
     pub fn f32(&self, field: Field) -> &[f32] {
-        self.buffer.as_ref().map_or(&[], |buffer| &buffer.floats[field as usize])
+        self.buffer.as_ref().map_or(&[], |buffer| &buffer.floats[field])
     }
 
     /// The clips' indices, `[B, T+1]`.
@@ -193,6 +190,11 @@ impl Batch {
     /// The headers, `[B]`, without the layout hash, which all of them share.
     pub fn headers(&self) -> &[UnrollHeader] {
         self.buffer.as_ref().map_or(&[], |buffer| &buffer.headers)
+    }
+
+    /// The task of each unroll, `[B]`: its index among the tasks of the experiment.
+    pub fn tasks(&self) -> Vec<usize> {
+        self.headers().iter().map(|header| header.task as usize).collect()
     }
 
     /// Ends its life in the accounting: trained on, or dropped for a reason.

@@ -4,8 +4,8 @@ use std::fmt;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use comic_proto::v1::UnrollHeader;
-use comic_proto::{Field, Pieces, UnrollLayout};
+use comic_proto::v1::{Behaviour, UnrollHeader};
+use comic_proto::{Pieces, UnrollLayout};
 use tokio::sync::Semaphore;
 
 use crate::batch::{Batch, Buffer};
@@ -38,16 +38,23 @@ pub enum BatchOrder {
 }
 
 /// What the trainer wants at this moment.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Phase {
-    /// This life of the learner.
+    /// The learner's epoch.
     pub epoch: u64,
     /// The newest published version; versions count publications.
     pub version: u64,
-    /// Versions before this one acted on other terms and are superseded.
+    /// Unrolls of versions before this one are superseded: they were made under other conditions.
     pub oldest: u64,
-    /// Demonstrations instead of the policy's own unrolls.
-    pub demonstration: bool,
+    /// Unrolls of the other behaviour are superseded.
+    pub behaviour: Behaviour,
+}
+
+impl Phase {
+    /// The phase in which an epoch of the learner begins: nothing is published yet, and the policy acts.
+    pub fn begin(epoch: u64) -> Self {
+        Self { epoch, version: 0, oldest: 0, behaviour: Behaviour::Policy }
+    }
 }
 
 /// What became of an unroll.
@@ -155,7 +162,7 @@ impl Batcher {
             BatchOrder::Arrival => batch.first_free(),
             BatchOrder::Environment => header.environment as usize,
         };
-        if !ledger.record(header.actor, header.sequence, first_clip(&self.inner.layout, &payload)) {
+        if !ledger.record(header.actor, header.sequence, Some(header.task)) {
             ledger.refuse();
             return Outcome::Invalid;
         }
@@ -186,7 +193,7 @@ impl Batcher {
     /// Says what is wanted from now on. What waits in the batcher for another epoch or phase is superseded.
     pub fn set_phase(&self, phase: Phase) {
         let mut state = self.lock();
-        let terms = |phase: Phase| (phase.epoch, phase.oldest, phase.demonstration);
+        let terms = |phase: Phase| (phase.epoch, phase.oldest, phase.behaviour);
         let over = terms(state.phase) != terms(phase);
         state.phase = phase;
         if !over {
@@ -221,7 +228,7 @@ impl Batcher {
                 return Next::Closed;
             }
             if let Some(buffer) = self.take_next(&mut state) {
-                state.ledger.hand_out(buffer.first_clips());
+                state.ledger.hand_out(buffer.tasks());
                 self.settle(&mut state);
                 drop(state);
                 return Next::Batch(Batch::new(self.inner.layout.clone(), buffer, self.clone()));
@@ -281,7 +288,7 @@ impl Batcher {
     /// Takes a buffer back from a [`Batch`] whose unrolls were trained on, or dropped for a reason.
     pub(crate) fn take_back(&self, mut buffer: Buffer, end: Option<Reason>) {
         let mut state = self.lock();
-        buffer.first_clips().for_each(|clip| state.ledger.take_back(clip, end));
+        buffer.tasks().for_each(|task| state.ledger.take_back(task, end));
         buffer.clear();
         state.free.push(buffer);
         self.settle(&mut state);
@@ -300,8 +307,8 @@ impl Batcher {
         if let Some(outcome) = refuse_unaccountable(&mut state.ledger, header) {
             return Some(outcome);
         }
-        let Phase { epoch, version, oldest, demonstration } = state.phase;
-        let other = header.learner_epoch != epoch || header.demonstration != demonstration || header.version < oldest;
+        let Phase { epoch, version, oldest, behaviour } = state.phase;
+        let other = header.learner_epoch != epoch || header.behaviour() != behaviour || header.version < oldest;
         let reason = if other {
             Reason::Superseded
         } else if payload.len() != self.inner.layout.size() {
@@ -313,10 +320,10 @@ impl Batcher {
         } else {
             return None;
         };
-        // What is invalid tells nothing, and what another epoch calls a clip is another task's perhaps.
-        let tells = header.learner_epoch == epoch && reason != Reason::Invalid;
-        let clip = first_clip(&self.inner.layout, payload).filter(|_| tells);
-        Some(drop_unroll(&mut state.ledger, header, clip, reason))
+        // An invalid header says nothing. The tasks of another epoch may have had other numbers.
+        let has_task = header.learner_epoch == epoch && reason != Reason::Invalid;
+        let task = has_task.then_some(header.task);
+        Some(drop_unroll(&mut state.ledger, header, task, reason))
     }
 
     /// Drops unrolls that wait in the batcher. Their slots are free again; those promised to waiting inserts stay
@@ -324,12 +331,12 @@ impl Batcher {
     fn drop_waiting(&self, state: &mut State, reason: Reason, dropped: impl Fn(&UnrollHeader) -> bool) {
         let (layout, State { ledger, next, open, .. }) = (&self.inner.layout, state);
         let waiting = [&mut *next, &mut *open].into_iter().flatten();
-        let went: Vec<u32> = waiting.flat_map(|batch| batch.retain(|header| !dropped(header))).collect();
+        let removed: Vec<u32> = waiting.flat_map(|batch| batch.retain(|header| !dropped(header))).collect();
         if let (Some(next), Some(open)) = (next, open) {
             next.fill_from(layout, open);
         }
-        self.inner.slots.add_permits(went.len());
-        went.into_iter().for_each(|clip| ledger.end(Some(clip), Some(reason)));
+        self.inner.slots.add_permits(removed.len());
+        removed.into_iter().for_each(|task| ledger.end(Some(task), Some(reason)));
     }
 
     /// The next batch, if it is full without what grew too old while it waited.
@@ -371,9 +378,9 @@ impl Batcher {
 }
 
 impl State {
-    /// First clips of the unrolls that wait for the trainer.
+    /// Tasks of the unrolls that wait for the trainer.
     fn waiting(&self) -> impl Iterator<Item = u32> {
-        [&self.next, &self.open].into_iter().flatten().flat_map(Buffer::first_clips)
+        [&self.next, &self.open].into_iter().flatten().flat_map(Buffer::tasks)
     }
 }
 
@@ -395,21 +402,12 @@ fn refuse_unaccountable(ledger: &mut Ledger, header: &UnrollHeader) -> Option<Ou
     }
 }
 
-/// The clip of an unroll's first row, which says of which task it is; none in what is no unroll of this layout.
-fn first_clip(layout: &UnrollLayout, payload: &Pieces) -> Option<u32> {
-    (payload.len() == layout.size()).then(|| {
-        let mut clip = [0];
-        payload.copy_to(layout.range(Field::Clip).start, bytemuck::cast_slice_mut(&mut clip));
-        clip[0]
-    })
-}
-
-fn drop_unroll(ledger: &mut Ledger, header: &UnrollHeader, clip: Option<u32>, reason: Reason) -> Outcome {
-    if !ledger.record(header.actor, header.sequence, clip) {
+fn drop_unroll(ledger: &mut Ledger, header: &UnrollHeader, task: Option<u32>, reason: Reason) -> Outcome {
+    if !ledger.record(header.actor, header.sequence, task) {
         ledger.refuse();
         return Outcome::Invalid;
     }
-    ledger.end(clip, Some(reason));
+    ledger.end(task, Some(reason));
     match reason {
         Reason::Stale => Outcome::Stale,
         Reason::Invalid => Outcome::Invalid,

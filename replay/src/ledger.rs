@@ -173,10 +173,10 @@ impl Ledger {
         }
     }
 
-    /// Keeps accounting of each of these tasks too: name, and number of clips, which are counted through all tasks. A restored
-    /// ledger goes on with those of the same name.
+    /// Keeps the accounting of each of these tasks too, in the order of the indices in the unrolls' headers. A restored
+    /// ledger continues the accounting of tasks of the same name.
     #[must_use]
-    pub fn with_tasks(mut self, tasks: impl IntoIterator<Item = (String, usize)>) -> Self {
+    pub fn with_tasks(mut self, tasks: impl IntoIterator<Item = String>) -> Self {
         let mut known = std::mem::take(&mut self.others);
         known.extend(std::mem::take(&mut self.tasks).by_name());
         self.tasks = Tasks::new(tasks, &mut known);
@@ -249,7 +249,7 @@ impl Ledger {
 
     /// Accounts for a number that [`sight`](Self::sight) called new. False, and nothing changed, if it is not, or if
     /// the sum of all numbers would leave its range (then no other sum can). `clip` is the unroll's first, if it is known.
-    pub(crate) fn record(&mut self, actor: u64, sequence: u64, clip: Option<u32>) -> bool {
+    pub(crate) fn record(&mut self, actor: u64, sequence: u64, task: Option<u32>) -> bool {
         let Some(entry) = self.entries.get_mut(&actor) else { return false };
         let Some(skipped) = sequence.checked_sub(entry.next_sequence) else { return false };
         let Some(produced) = self.sums.produced.checked_add(skipped).and_then(|sum| sum.checked_add(1)) else {
@@ -260,7 +260,7 @@ impl Ledger {
         entry.next_sequence = sequence + 1;
         self.sums.produced = produced;
         self.sums.dropped.count(Reason::LostAtRestart, skipped);
-        if let Some(accounting) = clip.and_then(|clip| self.tasks.of(clip)) {
+        if let Some(accounting) = task.and_then(|task| self.tasks.of(task)) {
             accounting.produced += 1;
         }
         true
@@ -276,24 +276,24 @@ impl Ledger {
         self.sums.duplicates = self.sums.duplicates.saturating_add(1);
     }
 
-    /// Counts unrolls of these first clips as being with the trainer.
-    pub(crate) fn hand_out(&mut self, clips: impl Iterator<Item = u32>) {
-        for clip in clips {
+    /// Counts unrolls of these tasks as being with the trainer.
+    pub(crate) fn hand_out(&mut self, tasks: impl Iterator<Item = u32>) {
+        for task in tasks {
             self.sums.in_flight += 1;
-            self.tasks.of(clip).into_iter().for_each(|accounting| accounting.in_flight += 1);
+            self.tasks.of(task).into_iter().for_each(|accounting| accounting.in_flight += 1);
         }
     }
 
     /// Accounting one that was handed out as trained on, or as dropped for a reason.
-    pub(crate) fn take_back(&mut self, clip: u32, end: Option<Reason>) {
+    pub(crate) fn take_back(&mut self, task: u32, end: Option<Reason>) {
         self.sums.in_flight -= 1;
-        self.tasks.of(clip).into_iter().for_each(|accounting| accounting.in_flight -= 1);
-        self.end(Some(clip), end);
+        self.tasks.of(task).into_iter().for_each(|accounting| accounting.in_flight -= 1);
+        self.end(Some(task), end);
     }
 
-    /// Accounting one unroll, of this first clip, as trained on, or as dropped for a reason.
-    pub(crate) fn end(&mut self, clip: Option<u32>, end: Option<Reason>) {
-        let accounting = clip.and_then(|clip| self.tasks.of(clip));
+    /// Accounting one unroll, of this task, as trained on, or as dropped for a reason.
+    pub(crate) fn end(&mut self, task: Option<u32>, end: Option<Reason>) {
+        let accounting = task.and_then(|task| self.tasks.of(task));
         match end {
             None => {
                 self.sums.trained += 1;
@@ -306,12 +306,12 @@ impl Ledger {
         }
     }
 
-    /// The accounting, with unrolls of these first clips waiting for the trainer.
+    /// The accounting, with unrolls of these tasks waiting for the trainer.
     pub(crate) fn accounting(&self, waiting: impl Iterator<Item = u32>) -> AccountingByTask {
         let (mut all, mut tasks) = (self.sums, self.tasks.clone());
-        for clip in waiting {
+        for task in waiting {
             all.in_flight += 1;
-            tasks.of(clip).into_iter().for_each(|accounting| accounting.in_flight += 1);
+            tasks.of(task).into_iter().for_each(|accounting| accounting.in_flight += 1);
         }
         AccountingByTask { all, tasks: tasks.by_name() }
     }

@@ -16,7 +16,7 @@
 //!    dropped as **lost at restart**.
 //!    An actor that joins says how far it was acknowledged, and the account moves there in the same way.
 //! 3. The unroll itself is either dropped for a reason — **invalid**; **superseded**, made in another epoch or in
-//!    another phase (demonstrations and policy are phases); **stale**, made with parameters more than `max_staleness`
+//!    another phase (each behaviour is a phase); **stale**, made with parameters more than `max_staleness`
 //!    published versions old — or it is copied into a slot of the open batch and is then *in flight*. Where slots are
 //!    the environments' ([`BatchOrder::Environment`]), one whose environment has no slot, or has filled it, is invalid.
 //! 4. An unroll in flight ends in one way: its batch is trained on, or it is dropped. A change of phase drops what waits
@@ -33,8 +33,8 @@
 //!
 //! # Invariants
 //! - `produced = trained + dropped + in flight` whenever anyone looks; *in flight* is counted in the buffers, not
-//!   computed from the others. The same holds of every task's own accounting. An unroll is of the task that has its first
-//!   row's clip; one that is invalid, or of another epoch, is of no task.
+//!   computed from the others. The same holds of every task's own accounting. An unroll belongs to the task that its
+//!   header names; an unroll that is invalid, or of another epoch, counts for no task.
 //! - Memory is [`Config::ahead`] batches and the one at the trainer, whatever the number of actors.
 //! - No unroll is in two batches, or twice in one.
 

@@ -39,46 +39,29 @@ pub struct AccountingByTask {
     pub tasks: BTreeMap<String, TaskAccounting>,
 }
 
-/// A task of the run, with clips of its own.
-#[derive(Clone, Debug)]
-struct Part {
-    name: String,
-    /// Their number. Clips are counted through all tasks.
-    clips: usize,
-    accounting: TaskAccounting,
-}
-
-/// The tasks of a run, in their order.
+/// The tasks of a run with their accounting, in the order of the indices in the unrolls' headers.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Tasks {
-    parts: Vec<Part>,
+    tasks: Vec<(String, TaskAccounting)>,
 }
 
 impl Tasks {
-    /// These tasks, with the accounting that are `known` of them, which are taken out.
-    pub(crate) fn new(
-        tasks: impl IntoIterator<Item = (String, usize)>,
-        known: &mut BTreeMap<String, TaskAccounting>,
-    ) -> Self {
-        let part = |(name, clips)| Part { accounting: known.remove(&name).unwrap_or_default(), name, clips };
-        Self { parts: tasks.into_iter().map(part).collect() }
+    /// These tasks. Each takes its accounting out of `known`, or begins a new one.
+    pub(crate) fn new(tasks: impl IntoIterator<Item = String>, known: &mut BTreeMap<String, TaskAccounting>) -> Self {
+        let with_accounting = |name: String| {
+            let accounting = known.remove(&name).unwrap_or_default();
+            (name, accounting)
+        };
+        Self { tasks: tasks.into_iter().map(with_accounting).collect() }
     }
 
-    /// The accounting of the task that has this clip.
-    pub(crate) fn of(&mut self, clip: u32) -> Option<&mut TaskAccounting> {
-        let mut clip = clip as usize;
-        let found = self.parts.iter_mut().find(|part| match clip.checked_sub(part.clips) {
-            Some(rest) => {
-                clip = rest;
-                false
-            }
-            None => true,
-        });
-        found.map(|part| &mut part.accounting)
+    /// The accounting of the task with this index.
+    pub(crate) fn of(&mut self, task: u32) -> Option<&mut TaskAccounting> {
+        self.tasks.get_mut(task as usize).map(|(_, accounting)| accounting)
     }
 
     /// Every task's accounting by its name.
     pub(crate) fn by_name(self) -> BTreeMap<String, TaskAccounting> {
-        self.parts.into_iter().map(|part| (part.name, part.accounting)).collect()
+        self.tasks.into_iter().collect()
     }
 }

@@ -7,15 +7,16 @@ mod common;
 
 use std::collections::{HashMap, HashSet};
 
+use comic_proto::v1::Behaviour;
 use comic_replay::{Batch, Batcher, Ledger, Outcome, Phase, Reason, Snapshot, TaskAccounting};
-use common::{Actor, CONFIG, PHASE, TASKS, batch_now, insert_now, layout, with_tasks};
+use common::{Actor, CONFIG, PHASE, TASKS, batch_now, insert_now, layout, task_of, with_tasks};
 use proptest::prelude::*;
 
 const ACTORS: u64 = 3;
 
 #[derive(Clone, Debug)]
 enum Event {
-    Send { actor: u64, skip: u64, version: u64, demonstration: bool },
+    Send { actor: u64, skip: u64, version: u64, other_behaviour: bool },
     SendAgain { actor: u64, back: u64 },
     SendInvalid { actor: u64 },
     SendUnknown,
@@ -35,7 +36,7 @@ fn event() -> impl Strategy<Value = Event> {
     let reason = prop_oneof![Just(Reason::Stale), Just(Reason::Superseded)];
     prop_oneof![
         20 => (0..ACTORS, prop_oneof![9 => Just(0u64), 1 => 1u64..5], 0u64..7, prop::bool::weighted(0.1))
-            .prop_map(|(actor, skip, version, demonstration)| Event::Send { actor, skip, version, demonstration }),
+            .prop_map(|(actor, skip, version, other_behaviour)| Event::Send { actor, skip, version, other_behaviour }),
         3 => (0..ACTORS, 1u64..5).prop_map(|(actor, back)| Event::SendAgain { actor, back }),
         1 => (0..ACTORS).prop_map(|actor| Event::SendInvalid { actor }),
         1 => Just(Event::SendUnknown),
@@ -63,9 +64,8 @@ struct Known {
     refused: u64,
 }
 
-/// The task of an actor's unroll.
-fn task_of(sequence: u64) -> usize {
-    (sequence as usize / TASKS[0].1).min(TASKS.len())
+fn other(behaviour: Behaviour) -> Behaviour {
+    if behaviour == Behaviour::Policy { Behaviour::Demonstration } else { Behaviour::Policy }
 }
 
 struct World {
@@ -96,12 +96,13 @@ impl World {
         }
     }
 
-    fn send(&mut self, actor: u64, sequence: u64, version: u64, demonstration: bool) {
+    fn send(&mut self, actor: u64, sequence: u64, version: u64, other_behaviour: bool) {
         let actor = self.actors[actor as usize];
         let mut header = actor.header(sequence);
         header.learner_epoch = self.phase.epoch;
         header.version = self.phase.version.saturating_sub(version);
-        header.demonstration = demonstration != self.phase.demonstration;
+        let behaviour = if other_behaviour { other(self.phase.behaviour) } else { self.phase.behaviour };
+        header.behaviour = behaviour.into();
         let outcome = insert_now(&self.batcher, &header);
         let cursor = self.known.cursors.entry(actor.incarnation).or_default();
         match outcome {
@@ -146,8 +147,8 @@ impl World {
 
     fn happen(&mut self, event: Event) {
         match event {
-            Event::Send { actor, skip, version, demonstration } => {
-                self.send(actor, self.next_sequence(actor) + skip, version, demonstration);
+            Event::Send { actor, skip, version, other_behaviour } => {
+                self.send(actor, self.next_sequence(actor) + skip, version, other_behaviour);
             }
             Event::SendAgain { actor, back } => {
                 if let Some(sequence) = self.next_sequence(actor).checked_sub(back) {
@@ -184,7 +185,7 @@ impl World {
                 self.batcher.set_phase(self.phase);
             }
             Event::SwitchPhase => {
-                self.phase.demonstration = !self.phase.demonstration;
+                self.phase.behaviour = other(self.phase.behaviour);
                 self.batcher.set_phase(self.phase);
             }
             Event::Reconnect { actor } => {
@@ -220,7 +221,7 @@ impl World {
         let accounting = self.batcher.accounting_by_task();
         assert_eq!(accounting.all, self.batcher.accounting());
         assert_eq!(accounting.tasks, self.batcher.snapshot().tasks);
-        for (index, (task, _)) in TASKS.iter().enumerate() {
+        for (index, task) in TASKS.iter().enumerate() {
             let own = accounting.tasks[*task];
             assert!(own.balance(), "{task}: {own:?}");
             assert_eq!(own.produced, self.known.decided[index], "{task}");

@@ -6,6 +6,7 @@ mod common;
 
 use std::time::Duration;
 
+use comic_proto::v1::Behaviour;
 use comic_replay::{Next, Outcome, Phase};
 use common::{Actor, CONFIG, PHASE, SLOTS, batch_now, batcher, now, payload};
 
@@ -79,7 +80,7 @@ fn a_change_of_phase_wakes_those_who_wait_for_the_old_one() {
     let header = actor.header(SLOTS as u64);
     let mut waiting = Box::pin(batcher.insert(&header, payload(&header)));
     assert_eq!(now(&mut waiting), None);
-    batcher.set_phase(Phase { demonstration: true, ..PHASE });
+    batcher.set_phase(Phase { behaviour: Behaviour::Demonstration, ..PHASE });
     assert_eq!(now(&mut waiting), Some(Outcome::Superseded));
 }
 

@@ -5,6 +5,7 @@
 mod common;
 
 use comic_proto::MAX_SEQUENCE;
+use comic_proto::v1::Behaviour;
 use comic_replay::{Dropped, Outcome, Phase, Reason};
 use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, payload};
 
@@ -93,10 +94,10 @@ fn unrolls_of_another_epoch_or_phase_are_superseded() {
     let actor = Actor::join(&batcher, 5);
     let (mut earlier, mut demonstration) = (actor.header(0), actor.header(1));
     earlier.learner_epoch = 0;
-    demonstration.demonstration = true;
+    demonstration.behaviour = Behaviour::Demonstration.into();
     assert_eq!(insert_now(&batcher, &earlier), Some(Outcome::Superseded));
     assert_eq!(insert_now(&batcher, &demonstration), Some(Outcome::Superseded));
-    batcher.set_phase(Phase { demonstration: true, ..PHASE });
+    batcher.set_phase(Phase { behaviour: Behaviour::Demonstration, ..PHASE });
     demonstration.sequence = 2;
     assert_eq!(insert_now(&batcher, &demonstration), Some(Outcome::Taken));
     assert_eq!(batcher.accounting().dropped.superseded, 2);
@@ -120,13 +121,13 @@ fn a_change_of_phase_drops_what_waits_for_the_old_one() {
         assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
     }
     assert_eq!(actor.send(&batcher, 6), None);
-    batcher.set_phase(Phase { demonstration: true, ..PHASE });
+    batcher.set_phase(Phase { behaviour: Behaviour::Demonstration, ..PHASE });
     let accounting = batcher.accounting();
     assert_eq!((accounting.dropped.superseded, accounting.in_flight), (6, 0));
     assert!(batch_now(&batcher).is_none());
     for sequence in 6..12 {
         let mut header = actor.header(sequence);
-        header.demonstration = true;
+        header.behaviour = Behaviour::Demonstration.into();
         assert_eq!(insert_now(&batcher, &header), Some(Outcome::Taken), "all slots are free again");
     }
     assert!(batcher.accounting().balance());

@@ -44,7 +44,7 @@ fn every_task_goes_on_with_its_own_accounting_and_a_new_one_begins_with_none() {
     let stored = serde_json::to_string(&before.snapshot()).unwrap();
 
     let ledger = Ledger::restore(&serde_json::from_str(&stored).unwrap()).unwrap();
-    let tasks = [("ball-catch", 1), ("get-up", 10)].map(|(name, clips)| (name.to_string(), clips));
+    let tasks = ["ball-catch", "get-up"].map(String::from);
     let away = Batcher::new(layout(), CONFIG, PHASE, ledger.with_tasks(tasks));
     let after = away.accounting_by_task().tasks;
     let lost = Dropped { lost_at_restart: 2, ..Dropped::default() };

@@ -290,8 +290,8 @@ impl System {
     /// # Errors
     /// When the program cannot be started.
     pub fn start_crowd(&mut self, actors: usize) -> Result<Process> {
-        let mut command = Command::new(program("comic-learner")?);
-        command.args(["load", "crowd", "--host", &self.address(), "--actors", &actors.to_string()]);
+        let mut command = Command::new(program("comic-bench-learner")?);
+        command.args(["crowd", "--host", &self.address(), "--actors", &actors.to_string()]);
         command.args(["--window", "1", "--watch"]);
         self.spawn("crowd", command)
     }

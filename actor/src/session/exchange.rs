@@ -116,9 +116,9 @@ async fn watch(mut client: Client, request: WatchRequest, mut assembler: Assembl
         };
         match assembler.push(&chunk) {
             Ok(None) => {}
-            Ok(Some(Assembled::Leave)) => return Ended::Over,
+            Ok(Some(Assembled::RunOver)) => return Ended::Over,
             Ok(Some(Assembled::Act(directive))) => {
-                tracing::debug!(version = directive.version, conduct = ?directive.conduct, "new parameters");
+                tracing::debug!(version = directive.version, behaviour = ?directive.behaviour, "new parameters");
                 mailbox.publish(directive);
             }
             Err(error) => return Ended::Lost(error.to_string()),

@@ -112,9 +112,10 @@ impl Outbox {
             learner_epoch: unroll.learner_epoch,
             version: unroll.version,
             layout_hash: self.layout_hash.clone(),
-            demonstration: unroll.demonstration,
+            behaviour: unroll.behaviour.into(),
             episodes: unroll.episodes.clone(),
             environment: unroll.environment,
+            task: unroll.task,
         };
         span.in_scope(|| tracing::debug!(actor, "sent"));
         Some(UnrollMessage { header: Some(header), payload: unroll.payload.clone() })
@@ -157,6 +158,7 @@ impl Outbox {
 #[cfg(test)]
 mod tests {
     use bytes::Bytes;
+    use comic_proto::v1::Behaviour;
 
     use super::*;
 
@@ -165,9 +167,10 @@ mod tests {
             payload: Bytes::new(),
             learner_epoch: 1,
             version: 1,
-            demonstration: false,
+            behaviour: Behaviour::Policy,
             episodes: Vec::new(),
             environment: 0,
+            task: 0,
             ticket: None,
         }
     }

@@ -4,7 +4,7 @@ use bytes::{Bytes, BytesMut};
 use comic_proto::v1::{Behaviour, ParametersChunk};
 
 use crate::Error;
-use crate::mailbox::{Conduct, Directive};
+use crate::mailbox::Directive;
 
 /// What a whole version says.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -12,7 +12,7 @@ pub enum Assembled {
     /// How to act from now on.
     Act(Directive),
     /// The run is over.
-    Leave,
+    RunOver,
 }
 
 /// Assembles versions; trusts nothing it is sent.
@@ -28,7 +28,8 @@ pub struct Assembler {
 struct Announced {
     learner_epoch: u64,
     version: u64,
-    behaviour: Behaviour,
+    /// Absent when the run is over.
+    behaviour: Option<Behaviour>,
     total: u64,
 }
 
@@ -83,22 +84,23 @@ impl Assembler {
     }
 }
 
-fn known_behaviour(chunk: &ParametersChunk) -> Result<Behaviour, Error> {
+fn known_behaviour(chunk: &ParametersChunk) -> Result<Option<Behaviour>, Error> {
+    if chunk.run_over {
+        return Ok(None);
+    }
     match Behaviour::try_from(chunk.behaviour) {
         Ok(Behaviour::Unspecified) | Err(_) => Err(malformed(format!("no such behaviour: {}", chunk.behaviour))),
-        Ok(behaviour) => Ok(behaviour),
+        Ok(behaviour) => Ok(Some(behaviour)),
     }
 }
 
 fn complete(announced: Announced, parameters: Bytes) -> Result<Assembled, Error> {
-    let conduct = match announced.behaviour {
-        Behaviour::Leave => return Ok(Assembled::Leave),
-        Behaviour::Demonstrate => Conduct::Demonstrate,
-        _ if parameters.is_empty() => return Err(malformed("a policy without parameters".into())),
-        _ => Conduct::Policy,
-    };
-    let Announced { learner_epoch, version, .. } = announced;
-    Ok(Assembled::Act(Directive { learner_epoch, version, conduct, parameters }))
+    let Announced { learner_epoch, version, behaviour, .. } = announced;
+    let Some(behaviour) = behaviour else { return Ok(Assembled::RunOver) };
+    if behaviour == Behaviour::Policy && parameters.is_empty() {
+        return Err(malformed("a policy without parameters".into()));
+    }
+    Ok(Assembled::Act(Directive { learner_epoch, version, behaviour, parameters }))
 }
 
 fn malformed(reason: String) -> Error {
@@ -119,6 +121,7 @@ mod tests {
             total,
             offset,
             data: data.to_vec().into(),
+            run_over: false,
         }
     }
 
@@ -135,7 +138,7 @@ mod tests {
                 complete = assembler.push(&chunk(8, payload.len() as u64, (index * piece) as u64, data)).unwrap();
             }
             let expected =
-                Directive { learner_epoch: 3, version: 8, conduct: Conduct::Policy, parameters: payload.into() };
+                Directive { learner_epoch: 3, version: 8, behaviour: Behaviour::Policy, parameters: payload.into() };
             prop_assert_eq!(complete, Some(Assembled::Act(expected)));
         }
 
@@ -184,13 +187,15 @@ mod tests {
     }
 
     #[test]
-    fn leaving_and_demonstrating_need_no_parameters() {
-        let empty = |behaviour: Behaviour| ParametersChunk { behaviour: behaviour.into(), ..chunk(1, 0, 0, b"") };
+    fn the_end_of_the_run_and_a_demonstration_need_no_parameters() {
+        let empty = chunk(1, 0, 0, b"");
         let mut assembler = Assembler::new(10);
-        assert_eq!(assembler.push(&empty(Behaviour::Leave)).unwrap(), Some(Assembled::Leave));
+        let run_over = ParametersChunk { run_over: true, behaviour: Behaviour::Unspecified.into(), ..empty.clone() };
+        assert_eq!(assembler.push(&run_over).unwrap(), Some(Assembled::RunOver));
+        let demonstration = ParametersChunk { behaviour: Behaviour::Demonstration.into(), ..empty };
         assert!(matches!(
-            assembler.push(&empty(Behaviour::Demonstrate)).unwrap(),
-            Some(Assembled::Act(directive)) if directive.conduct == Conduct::Demonstrate
+            assembler.push(&demonstration).unwrap(),
+            Some(Assembled::Act(directive)) if directive.behaviour == Behaviour::Demonstration
         ));
     }
 }

@@ -6,7 +6,7 @@ use bytes::Bytes;
 use comic_proto::v1::{Behaviour, Environments};
 
 use super::*;
-use crate::mailbox::{Conduct, Directive};
+use crate::mailbox::Directive;
 use learner::{FakeLearner, Script};
 
 const LIMITS: Limits = Limits { window: 4, parameters: 1000, flush: Duration::from_secs(60) };
@@ -28,9 +28,10 @@ fn unroll(number: u64) -> FinishedUnroll {
         payload: Bytes::from(vec![7; 100]),
         learner_epoch: 1,
         version: number,
-        demonstration: false,
+        behaviour: Behaviour::Policy,
         episodes: Vec::new(),
         environment: 0,
+        task: 0,
         ticket: None,
     }
 }
@@ -128,11 +129,11 @@ async fn parameters_reach_the_mailbox_and_leaving_ends_the_session() {
     let expected = Directive {
         learner_epoch: 1,
         version: 5,
-        conduct: Conduct::Policy,
+        behaviour: Behaviour::Policy,
         parameters: Bytes::from_static(b"parameters in pieces"),
     };
     assert_eq!(*first_directive(&running.mailbox).await, expected);
-    learner.publish(Behaviour::Leave, 6, b"");
+    learner.end_run(6);
     assert!(running.session.await.unwrap().unwrap().over);
 }
 

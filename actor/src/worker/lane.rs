@@ -71,6 +71,11 @@ impl<E: Environment> Lane<E> {
         self.number
     }
 
+    /// Index of the task of the current unroll.
+    pub(super) fn task(&self) -> u32 {
+        self.task as u32
+    }
+
     /// Draws the latent's noise of the coming step.
     pub(super) fn draw_latent_noise(&mut self, row: &mut ActingRow<'_>) {
         row.draw_latent_noise(&mut self.rng);

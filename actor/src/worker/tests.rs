@@ -110,8 +110,8 @@ fn layout(length: usize) -> Arc<UnrollLayout> {
     }))
 }
 
-fn directive(version: u64, conduct: Conduct) -> Arc<Directive> {
-    Arc::new(Directive { learner_epoch: 7, version, conduct, parameters: Bytes::from(vec![version as u8]) })
+fn directive(version: u64, behaviour: Behaviour) -> Arc<Directive> {
+    Arc::new(Directive { learner_epoch: 7, version, behaviour, parameters: Bytes::from(vec![version as u8]) })
 }
 
 /// Reads an unroll as the learner would: by the layout alone.
@@ -159,7 +159,7 @@ fn record_from(
     let layout = layout(length);
     let environments = lanes.iter().map(|lengths| Counter::new(lengths)).collect();
     let mut worker = Worker::new(environments, Plain::default(), Arc::clone(&layout), 0.1, first, 3);
-    worker.adopt(&directive(0, Conduct::Policy)).unwrap();
+    worker.adopt(&directive(0, Behaviour::Policy)).unwrap();
     let mut recorded = vec![Vec::new(); lanes.len()];
     for _ in 0..unrolls {
         let finished = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap();
@@ -175,7 +175,7 @@ fn record_tasks(length: usize, lengths: &[usize], tasks: &[usize]) -> (Arc<Unrol
     let layout = layout(length);
     let environment = Counter { tasks: tasks.to_vec(), ..Counter::new(lengths) };
     let mut worker = Worker::new(vec![environment], Plain::default(), Arc::clone(&layout), 0.1, 0, 3);
-    worker.adopt(&directive(0, Conduct::Policy)).unwrap();
+    worker.adopt(&directive(0, Behaviour::Policy)).unwrap();
     let unrolls = (0..12).flat_map(|_| worker.unroll(&|| false, &Progress::default()).unwrap().unwrap()).collect();
     (layout, unrolls)
 }
@@ -294,6 +294,7 @@ proptest! {
         for unroll in &unrolls {
             let rows = Rows { layout: &layout, payload: &unroll.payload };
             let task = rows.clip(0);
+            prop_assert_eq!(unroll.task, task, "each task has one clip");
             prop_assert_eq!(rows.place(0), expected, "no step is lost and none comes twice");
             prop_assert!(!padded || rows.one(Field::First, 0) == 1.0, "an episode that has waited begins the unroll");
             prop_assert_eq!(rows.row(Field::State, 0), vec![expected.1 as f32; 3], "and has nothing to remember");
@@ -319,6 +320,8 @@ proptest! {
             let header = comic_proto::v1::UnrollHeader {
                 layout_hash: layout.hash().to_vec(),
                 episodes: unroll.episodes.clone(),
+                task: unroll.task,
+                behaviour: unroll.behaviour.into(),
                 ..Default::default()
             };
             let checked = comic_proto::Expected { clips: &[1, 1, 1], epoch: 0, newest_version: 0 };
@@ -370,7 +373,7 @@ proptest! {
 fn the_unroll_records_the_unclipped_action_and_the_simulator_sees_the_clipped_one() {
     let layout = layout(32);
     let mut worker = Worker::new(vec![Counter::new(&[1000])], Plain::default(), Arc::clone(&layout), 0.1, 0, 3);
-    worker.adopt(&directive(1, Conduct::Policy)).unwrap();
+    worker.adopt(&directive(1, Behaviour::Policy)).unwrap();
     let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
     let rows = Rows { layout: &layout, payload: &unroll.payload };
     let beyond = (0..32).filter(|t| rows.one(Field::Action, *t) > 1.0).count();
@@ -387,10 +390,10 @@ fn parameters_change_at_unroll_boundaries_only_and_the_header_names_them() {
     let layout = layout(5);
     let mut worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), Arc::clone(&layout), 0.1, 0, 3);
     for version in 1..4 {
-        worker.adopt(&directive(version, Conduct::Policy)).unwrap();
+        worker.adopt(&directive(version, Behaviour::Policy)).unwrap();
         let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
         let rows = Rows { layout: &layout, payload: &unroll.payload };
-        assert_eq!((unroll.learner_epoch, unroll.version, unroll.demonstration), (7, version, false));
+        assert_eq!((unroll.learner_epoch, unroll.version, unroll.behaviour), (7, version, Behaviour::Policy));
         assert!((0..5).all(|t| rows.one(Field::Mean, t) == version as f32));
     }
 }
@@ -399,10 +402,10 @@ fn parameters_change_at_unroll_boundaries_only_and_the_header_names_them() {
 fn a_demonstration_is_the_servo_action_with_noise_and_no_latent() {
     let layout = layout(8);
     let mut worker = Worker::new(vec![Counter::new(&[5])], Plain::default(), Arc::clone(&layout), 0.25, 0, 3);
-    worker.adopt(&directive(9, Conduct::Demonstrate)).unwrap();
+    worker.adopt(&directive(9, Behaviour::Demonstration)).unwrap();
     let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
     let rows = Rows { layout: &layout, payload: &unroll.payload };
-    assert!(unroll.demonstration);
+    assert_eq!(unroll.behaviour, Behaviour::Demonstration);
     for t in (0..8).filter(|t| rows.one(Field::Valid, *t) == 1.0) {
         assert_eq!(rows.one(Field::Mean, t), rows.place(t).1 as f32 / 1000.0);
         assert_eq!(rows.one(Field::Std, t), 0.25);

@@ -2,7 +2,7 @@
 //! `CMUHumanoidPositionControlledV2020` in MuJoCo 3.17.0.
 #![allow(clippy::approx_constant, clippy::excessive_precision, reason = "the compiled model's own digits")]
 
-use super::{Body, Geom, Shape};
+use super::parts::{Body, Geom, Shape};
 
 /// Parents come before their children; the first is the free, massless frame, the second the root.
 #[rustfmt::skip]

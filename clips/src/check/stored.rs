@@ -1,15 +1,15 @@
-//! The search through what a file has of a clip.
+//! The checks of the datasets of one clip.
 
-use super::tally::Tally;
-use super::{
+use super::defect::{
     AIRBORNE, Defect, JOINT_EXCESS, JOINT_SPEED, Kind, LONGEST_FLIGHT, PENETRATION, ROOT_SPEED, ROOT_TURN, unreadable,
 };
+use super::tally::Tally;
 use crate::body::Frames;
 use crate::file::{NORM_TOLERANCE, Stored};
+use crate::humanoid::{JOINT_RANGES, JOINTS};
 use crate::spatial::{norm, normalize, rotation_between, subtract};
-use crate::{JOINT_RANGES, JOINTS};
 
-/// The pose, as far as it is there; frame by frame, where all its numbers are finite.
+/// The pose in each frame. An entry is `None` if the dataset is unreadable or a number of the frame is not finite.
 pub(super) struct Columns {
     position: Vec<Option<[f64; 3]>>,
     quaternion: Vec<Option<[f64; 4]>>,
@@ -17,7 +17,7 @@ pub(super) struct Columns {
 }
 
 impl Columns {
-    /// Takes the pose out of the datasets, and what is wrong with any of them by itself.
+    /// Extracts the pose from the datasets, and the defects of each dataset on its own.
     pub(super) fn search(datasets: Vec<Stored>, steps: usize) -> (Self, Vec<Defect>) {
         let mut columns =
             Self { position: vec![None; steps], quaternion: vec![None; steps], joints: vec![None; steps] };
@@ -44,6 +44,7 @@ impl Columns {
         (columns, defects)
     }
 
+    /// Adds the joints that leave their range.
     pub(super) fn joint_limits(&self, defects: &mut Vec<Defect>) {
         for (joint, (name, [low, high])) in JOINTS.iter().zip(JOINT_RANGES).enumerate() {
             let mut tally = Tally::default();
@@ -59,7 +60,7 @@ impl Columns {
         }
     }
 
-    /// Penetration and floating; returns the bounds of the lowest point's height.
+    /// Adds penetration and floating. Returns minimum and maximum of the height of the body's lowest point, m.
     pub(super) fn floor(&self, dt: f64, defects: &mut Vec<Defect>) -> Option<[f64; 2]> {
         let mut bounds: Option<[f64; 2]> = None;
         let (mut depth, mut deepest) = (Tally::default(), "");
@@ -98,6 +99,7 @@ impl Columns {
         bounds
     }
 
+    /// Adds the jumps of root and joints. `dt` is the time step, s.
     pub(super) fn jumps(&self, dt: f64, defects: &mut Vec<Defect>) {
         let speed = |a: [f64; 3], b: [f64; 3]| norm(&subtract(b, a)) / dt;
         let turn = |a, b| norm(&rotation_between(normalize(a), normalize(b))) / dt;
@@ -112,7 +114,7 @@ impl Columns {
     }
 }
 
-/// Frames at which the change from the one before is faster than `limit`.
+/// The frames whose change from the previous frame is faster than `limit`.
 fn faster<const N: usize>(frames: &[Option<[f64; N]>], limit: f64, speed: impl Fn([f64; N], [f64; N]) -> f64) -> Tally {
     let mut tally = Tally::default();
     for (frame, pair) in frames.windows(2).enumerate() {
@@ -146,7 +148,7 @@ fn norms(field: &str, rows: &[f64], width: usize, steps: usize) -> Option<Defect
             let parts: [f64; 4] = std::array::from_fn(|part| rows[(first + part) * steps + frame]);
             (norm(&parts) - 1.0).abs()
         };
-        // NaN is another defect; `max` passes over it.
+        // NaN is a defect of another kind; `max` ignores it.
         let worst = (0..width).step_by(4).map(off).fold(0.0, f64::max);
         if worst >= NORM_TOLERANCE {
             tally.add(frame, worst);
@@ -155,7 +157,7 @@ fn norms(field: &str, rows: &[f64], width: usize, steps: usize) -> Option<Defect
     tally.defect(Kind::QuaternionNorm, field, |worst| format!("norm off by {worst:.3}; it must be 1"))
 }
 
-/// Rows `(N, T)` as frames.
+/// Turns rows `(N, T)` into frames.
 fn frames<const N: usize>(rows: &[f64], steps: usize) -> Vec<Option<[f64; N]>> {
     (0..steps)
         .map(|frame| {

@@ -1,8 +1,8 @@
-//! How often and how badly.
+//! A counter of the frames that have one defect.
 
-use super::{Defect, Kind};
+use super::defect::{Defect, Kind};
 
-/// Frames in which something is wrong.
+/// Number of frames with a defect, the first one, and the worst value.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Tally {
     frames: usize,
@@ -11,7 +11,7 @@ pub(super) struct Tally {
 }
 
 impl Tally {
-    /// Adds a frame, which comes after those added before.
+    /// Adds a frame. Frames are added in increasing order.
     pub(super) fn add(&mut self, frame: usize, amount: f64) {
         if self.frames == 0 {
             self.first = frame;
@@ -20,7 +20,7 @@ impl Tally {
         self.worst = self.worst.max(amount);
     }
 
-    /// The defect, if there is any.
+    /// The defect, or `None` if no frame was added.
     pub(super) fn defect(self, kind: Kind, item: &str, detail: impl FnOnce(f64) -> String) -> Option<Defect> {
         let Self { frames, first: first_frame, worst } = self;
         (frames > 0).then(|| Defect { kind, item: item.into(), frames, first_frame, worst, detail: detail(worst) })

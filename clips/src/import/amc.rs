@@ -1,35 +1,36 @@
-//! AMC: a recording of a skeleton, its angles frame by frame.
+//! AMC files: the angles of a skeleton, frame by frame.
 
 use std::path::Path;
 
 use super::lines::Lines;
 use super::skeleton::{BONES, Bone};
-use crate::Error;
+use crate::error::Error;
 
-/// Longest recording taken: 100,000 frames of 0.03 s, the longest clip that is read back.
+/// Greatest number of recorded frames: they give 100,000 frames of 0.03 s, the longest clip that can be read.
 const FRAMES: usize = 360_000;
 
-/// The root's bit, beyond those of the 56 joints.
+/// The bit of the root. Bits 0 to 55 are the joints.
 const ROOT: u64 = 1 << 63;
 
-/// A recording, as its file has it.
+/// The content of an AMC file.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Recording {
-    /// Position in the file's units, then angles about x, y, z, degrees; per frame.
+    /// For each frame: position in the file's units, then angles about x, y, z in degrees.
     pub(super) root: Vec<[f64; 6]>,
-    /// Degrees, in the order of [`JOINTS`](crate::JOINTS); 0 where the file says nothing; per frame.
+    /// For each frame: angles in degrees, in the order of [`JOINTS`](crate::JOINTS); 0 for joints that the file does
+    /// not have.
     pub(super) angles: Vec<[f64; 56]>,
-    /// The first frame whose number is not one more than the last one's.
+    /// The first frame whose number is not the previous number plus one.
     pub(super) gap: Option<u64>,
-    /// The joints that the first frame tells of, a bit each: every other frame tells of the same.
-    told: Option<u64>,
+    /// The joints of the first frame, one bit each. Every other frame must have the same joints.
+    present: Option<u64>,
 }
 
 impl Recording {
     pub(super) fn read(path: &Path) -> Result<Self, Error> {
         let mut lines = Lines::open(path)?;
         let mut recording = Self::default();
-        // None before the first frame.
+        // `None` before the first frame.
         let (mut number, mut seen) = (None, None);
         while let Some(words) = lines.next_words()? {
             let word = words[0].as_str();
@@ -60,34 +61,34 @@ impl Recording {
     fn begin(&mut self, lines: &Lines, seen: Option<u64>) -> Result<(), Error> {
         self.complete(lines, seen)?;
         if self.root.len() == FRAMES {
-            return Err(lines.error(format!("over {FRAMES} frames: cut the recording")));
+            return Err(lines.error(format!("more than {FRAMES} frames: shorten the recording")));
         }
         self.root.push([0.0; 6]);
         self.angles.push([0.0; 56]);
         Ok(())
     }
 
-    /// Whether the frame before is whole: a file that was cut off lacks its last bones.
+    /// Checks that the previous frame is complete. A truncated file does not have the last bones.
     fn complete(&mut self, lines: &Lines, seen: Option<u64>) -> Result<(), Error> {
         let Some(seen) = seen else { return Ok(()) };
         let frame = self.root.len();
         if seen & ROOT == 0 {
             return Err(lines.error(format!("frame {frame} has no `root`")));
         }
-        let told = *self.told.get_or_insert(seen);
-        if seen == told {
+        let present = *self.present.get_or_insert(seen);
+        if seen == present {
             return Ok(());
         }
-        let differ = |bone: &&Bone| bone.joints().any(|joint| (seen ^ told) & (1 << joint) != 0);
+        let differ = |bone: &&Bone| bone.joints().any(|joint| (seen ^ present) & (1 << joint) != 0);
         let bones: Vec<&str> = BONES.iter().filter(differ).map(|bone| bone.name).collect();
-        let reason = "has other bones than the first (they differ in";
-        Err(lines.error(format!("frame {frame} {reason} {}): is the file whole?", bones.join(", "))))
+        let reason = "has other bones than the first frame (they differ in";
+        Err(lines.error(format!("frame {frame} {reason} {}): is the file complete?", bones.join(", "))))
     }
 
-    /// Takes a bone's line; a bit for each joint it tells of, or the root's.
+    /// Reads the line of a bone into the last frame. Returns the bits of its joints, or the bit of the root.
     fn take(&mut self, lines: &Lines, name: &str, words: &[String]) -> Result<u64, Error> {
         let (Some(root), Some(angles)) = (self.root.last_mut(), self.angles.last_mut()) else {
-            return Err(lines.error("expected a frame's number: is this an AMC file?"));
+            return Err(lines.error("expected the number of a frame: is this an AMC file?"));
         };
         let count = |wanted: usize| {
             if words.len() == wanted {
@@ -97,8 +98,8 @@ impl Recording {
         };
         if name == "root" {
             count(root.len())?;
-            for (place, word) in root.iter_mut().zip(words) {
-                *place = lines.number(word)?;
+            for (entry, word) in root.iter_mut().zip(words) {
+                *entry = lines.number(word)?;
             }
             return Ok(ROOT);
         }

@@ -1,27 +1,31 @@
-//! Recorded angles as joint angles within the body's ranges.
+//! Moves recorded angles into the ranges of the body's joints.
 
 use std::f64::consts::{PI, TAU};
 use std::ops::Range;
 
-use super::skeleton::BONES;
-use crate::JOINT_RANGES;
-use crate::body::joint;
+use comic_experiment::statistics::median;
 
-/// Thumbs are noise in CMU's recordings; these angles (rad) are a resting hand's.
+use super::skeleton::BONES;
+use crate::body::joint;
+use crate::humanoid::JOINT_RANGES;
+
+/// Thumb angles of a resting hand, rad. Thumbs are noise in CMU's recordings.
 const THUMBS: [(usize, f64); 4] =
     [(joint("lthumbrz"), 0.0), (joint("lthumbrx"), 0.3), (joint("rthumbrz"), 0.0), (joint("rthumbrx"), 0.3)];
 
-/// Angles of every recorded frame, rad.
+/// Angles of every recorded frame, rad, in the order of [`JOINTS`](crate::JOINTS).
 pub(super) struct Fitted {
-    /// Each moved by whole turns to where the ranges are, and still free to leave them.
+    /// Moved by whole turns towards the ranges; may be outside them.
     pub(super) free: Vec<[f64; 56]>,
-    /// Within the ranges.
+    /// Clamped to the ranges.
     pub(super) joints: Vec<[f64; 56]>,
 }
 
-/// `recorded` (rad) in the turn that suits the ranges best, then clamped to them. Bones with one or two angles are
-/// unwrapped in time, so that nothing jumps, and moved as a whole by the median over `clip`; bones with three have two
-/// equal triples of angles, of which each frame takes the one that leaves the ranges less.
+/// Moves `recorded` angles (rad) by whole turns to fit the ranges best, then clamps them.
+///
+/// The angles of a bone with one or two hinges are unwrapped in time, so they do not jump. Then all frames are moved by
+/// the same whole turns, found from the median over the frames `clip`. For a bone with three hinges two triples of
+/// angles give the same rotation; each frame uses the triple that is less outside the ranges.
 pub(super) fn fit(recorded: &[[f64; 56]], clip: &Range<usize>) -> Fitted {
     let mut free = recorded.to_vec();
     for bone in &BONES {
@@ -44,23 +48,24 @@ pub(super) fn fit(recorded: &[[f64; 56]], clip: &Range<usize>) -> Fitted {
     Fitted { free, joints }
 }
 
-/// The angle, moved by whole turns to within half a turn of the middle of the joint's range.
+/// The angle, moved by whole turns to within half a turn of the middle of the joint's range, rad.
 pub(super) fn wrap(angle: f64, joint: usize) -> f64 {
     angle - turns(angle, joint)
 }
 
-/// How far outside the joint's range, rad.
+/// Distance of the angle to the joint's range, rad; 0 inside the range.
 pub(super) fn excess(angle: f64, joint: usize) -> f64 {
     let [low, high] = JOINT_RANGES[joint];
     (low - angle).max(angle - high).max(0.0)
 }
 
-/// The whole turns, rad, between an angle and the middle of the joint's range.
+/// The whole turns between an angle and the middle of the joint's range, rad.
 fn turns(angle: f64, joint: usize) -> f64 {
     let [low, high] = JOINT_RANGES[joint];
     TAU * ((angle - (low + high) / 2.0) / TAU + 0.5).floor()
 }
 
+/// Sets the angles of a bone to the equivalent triple with the least squared distance to the ranges.
 fn nearer_triple(angles: &mut [f64; 56], [x, y, z]: [usize; 3]) {
     let joints = [x, y, z];
     let same = [angles[x], angles[y], angles[z]];
@@ -75,7 +80,7 @@ fn nearer_triple(angles: &mut [f64; 56], [x, y, z]: [usize; 3]) {
     }
 }
 
-/// Takes out jumps of more than half a turn, then moves all frames by the same turns.
+/// Removes jumps of half a turn or more, then moves all frames by the same whole turns.
 fn unwrap(frames: &mut [[f64; 56]], joint: usize, clip: &Range<usize>) {
     let mut offset = 0.0;
     let mut last = frames.first().map_or(0.0, |angles| angles[joint]);
@@ -84,28 +89,14 @@ fn unwrap(frames: &mut [[f64; 56]], joint: usize, clip: &Range<usize>) {
         last = angles[joint];
         if step.abs() >= PI {
             let short = (step + PI).rem_euclid(TAU) - PI;
-            // Half a turn keeps its sign.
+            // A jump of exactly half a turn keeps its sign.
             offset += if short == -PI && step > 0.0 { TAU } else { 0.0 } + short - step;
         }
         angles[joint] += offset;
     }
-    let turns = turns(median(frames[clip.clone()].iter().map(|angles| angles[joint]).collect()), joint);
+    let turns =
+        turns(median(frames[clip.clone()].iter().map(|angles| angles[joint]).collect()).unwrap_or_default(), joint);
     frames.iter_mut().for_each(|angles| angles[joint] -= turns);
-}
-
-/// The mean of the two middle values of an even count; 0 of nothing.
-pub(super) fn median(values: Vec<f64>) -> f64 {
-    percentile(values, 50.0)
-}
-
-/// Linear between neighbours, as numpy's default; 0 of nothing.
-pub(super) fn percentile(mut values: Vec<f64>, percent: f64) -> f64 {
-    values.sort_unstable_by(f64::total_cmp);
-    let Some(last) = values.len().checked_sub(1) else { return 0.0 };
-    let place = percent / 100.0 * last as f64;
-    let below = (place.floor() as usize).min(last);
-    let above = (below + 1).min(last);
-    values[below] + (place - below as f64) * (values[above] - values[below])
 }
 
 #[cfg(test)]
@@ -113,13 +104,13 @@ mod tests {
     use super::*;
 
     fn recorded(name: &'static str, angles: &[f64]) -> (usize, Vec<[f64; 56]>) {
-        let place = crate::JOINTS.iter().position(|joint| *joint == name).unwrap();
+        let place = crate::humanoid::JOINTS.iter().position(|joint| *joint == name).unwrap();
         let frame = |angle: &f64| std::array::from_fn(|joint| if joint == place { *angle } else { 0.0 });
         (place, angles.iter().map(frame).collect())
     }
 
     #[test]
-    fn an_angle_that_spins_is_unwrapped_and_brought_back_by_whole_turns() {
+    fn unwraps_a_spinning_angle_and_moves_it_by_whole_turns() {
         let (knee, frames) = recorded("ltibiarx", &[0.5 + TAU, 1.0 + TAU, 1.5, 2.0 - TAU]);
         let fitted = fit(&frames, &(0..4));
         let expected = [0.5, 1.0, 1.5, 2.0];
@@ -129,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn three_angles_may_become_their_twins_which_turn_the_same() {
+    fn a_replaced_triple_of_angles_gives_the_same_rotation() {
         use crate::spatial::{about, matrix, multiply};
         let places = ["lfemurrx", "lfemurry", "lfemurrz"].map(|name| recorded(name, &[0.0]).0);
         let mut frame = [0.0; 56];
@@ -148,15 +139,8 @@ mod tests {
     }
 
     #[test]
-    fn thumbs_rest() {
+    fn thumbs_get_the_angles_of_a_resting_hand() {
         let (thumb, frames) = recorded("rthumbrx", &[9.0]);
         assert_eq!(fit(&frames, &(0..1)).joints[0][thumb], 0.3);
-    }
-
-    #[test]
-    fn percentiles_are_linear_between_neighbours() {
-        assert_eq!(percentile(vec![4.0, 1.0, 2.0], 50.0), 2.0);
-        assert_eq!(percentile(vec![4.0, 1.0], 25.0), 1.75);
-        assert_eq!(percentile(vec![], 50.0), 0.0);
     }
 }

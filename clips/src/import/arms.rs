@@ -1,22 +1,22 @@
-//! Arms whose angles the ranges do not allow: the nearest allowed ones, by where elbow and wrist are.
+//! Fits arms whose angles are outside the ranges: finds the allowed angles with the nearest elbow and wrist positions.
 //!
-//! `rhumerusrz` has the left arm's range instead of its mirror image, so a hanging right arm cannot be copied, and
-//! clamped angles alone leave the wrist some 18 cm off.
+//! In the V2020 body `rhumerusrz` has the range of the left arm instead of its mirror image. A hanging right arm is
+//! outside this range. With clamped angles the wrist is about 18 cm away from its recorded position.
 
 use super::angles::{excess, wrap};
-use crate::JOINT_RANGES;
 use crate::body::{Frames, body, joint};
+use crate::humanoid::JOINT_RANGES;
 use crate::spatial::{IDENTITY, Vector, cross, dot, subtract};
 
-/// m/rad: how much an angle's distance from the recorded one weighs against a point's.
+/// Weight of the distance between an angle and the recorded angle, relative to the distance of a point, m/rad.
 pub(super) const REGULARISATION: f64 = 0.2;
-/// Below this smallest eigenvalue the Hessian gives way to the Gauss-Newton matrix.
+/// If the smallest eigenvalue of the Hessian is not above this, the Gauss-Newton matrix replaces the Hessian.
 const CONVEX: f64 = 1e-3;
 const NEWTON_STEPS: usize = 200;
 const BOX_STEPS: usize = 2000;
-/// rad: a step this small ends the search.
+/// The search ends with a step smaller than this, rad.
 const CONVERGED: f64 = 1e-12;
-/// rad: near enough to the optimum to take full steps.
+/// Steps smaller than this are taken fully, rad: they are near the optimum.
 const NEAR: f64 = 1e-6;
 
 type Six = [f64; 6];
@@ -25,10 +25,11 @@ type Square = [[f64; 6]; 6];
 /// One arm's hinges, from the trunk outwards, and the bodies at elbow and wrist.
 struct Arm {
     joints: [usize; 6],
-    /// The body each hinge turns.
+    /// The body that each hinge turns.
     turns: [usize; 6],
     elbow: usize,
     wrist: usize,
+    /// The hinge that rolls the forearm.
     roll: usize,
 }
 
@@ -77,8 +78,9 @@ const ARMS: [Arm; 2] = [
     },
 ];
 
-/// Both arms of one frame: where a `free` angle leaves its range, `joints` (a clamped copy) gets the arm that brings
-/// elbow and wrist nearest to where the free one has them, and the forearm's roll that suits the hand best.
+/// Fits both arms of one frame. `joints` is the clamped copy of `free` (both rad). If an angle of an arm in `free` is
+/// outside its range, `joints` gets the angles whose elbow and wrist are nearest to those of `free`, and the roll of
+/// the forearm whose hand is nearest.
 pub(super) fn fit(free: &[f64; 56], joints: &mut [f64; 56], regularisation: f64) {
     for arm in &ARMS {
         let wanted = arm.joints.map(|joint| free[joint]);
@@ -103,7 +105,8 @@ impl Arm {
         Frames::of(&[0.0; 3], &IDENTITY, &joints)
     }
 
-    /// The angle about the forearm (the wrist's y axis) that turns the hand of the `solved` arm nearest to the wanted.
+    /// The roll of the forearm (about the wrist's y axis, rad) for which the hand of the `solved` arm has the
+    /// orientation nearest to the wanted hand.
     fn roll(&self, wanted: &Six, wanted_roll: f64, solved: &Six) -> f64 {
         let wanted = self.frames(wanted, wanted_roll).rotation[self.wrist];
         let solved = self.frames(solved, 0.0).rotation[self.wrist];
@@ -114,22 +117,22 @@ impl Arm {
     }
 }
 
-/// Least squares within the ranges: elbow and wrist, and the angles themselves.
+/// A least-squares problem within the ranges. The residuals are the positions of elbow and wrist, and the angles.
 struct Problem<'a> {
     arm: &'a Arm,
     wanted: Six,
     targets: [Vector; 2],
-    /// The regularisation, squared.
+    /// The square of the regularisation.
     weight: f64,
 }
 
-/// The objective, half a sum of squares, around a point.
+/// The objective (half a sum of squares) and its derivatives at a point.
 struct Local {
     value: f64,
     gradient: Six,
-    /// Jᵀ J and the regularisation.
+    /// Jᵀ J plus the regularisation.
     gauss_newton: Square,
-    /// The same with the residuals' second derivatives.
+    /// The Gauss-Newton matrix plus the second derivatives of the residuals.
     hessian: Square,
 }
 
@@ -144,7 +147,7 @@ impl<'a> Problem<'a> {
         JOINT_RANGES[self.arm.joints[index]]
     }
 
-    /// The minimum reached from the clamped angles.
+    /// The minimum that Newton's method reaches from the clamped angles.
     fn solve(&self) -> Six {
         let clamp =
             |angles: Six| -> Six { std::array::from_fn(|i| angles[i].clamp(self.range(i)[0], self.range(i)[1])) };
@@ -192,7 +195,7 @@ impl<'a> Problem<'a> {
         local
     }
 
-    /// Adds what one point, moved by the first `hinges` angles, is off.
+    /// Adds the residual of one point. The first `hinges` angles move the point.
     fn add_point(&self, local: &mut Local, frames: &Frames, point: Vector, target: Vector, hinges: usize) {
         let residual = subtract(point, target);
         let axis = |i: usize| frames.axis[self.arm.joints[i]];
@@ -212,7 +215,7 @@ impl<'a> Problem<'a> {
         }
     }
 
-    /// The minimum of the quadratic model within the ranges, by Gauss-Seidel with clipping.
+    /// The step to the minimum of the quadratic model within the ranges, by Gauss-Seidel with clipping.
     fn box_step(&self, angles: &Six, gradient: &Six, matrix: &Square) -> Six {
         let mut step = [0.0; 6];
         for _ in 0..BOX_STEPS {
@@ -232,7 +235,8 @@ impl<'a> Problem<'a> {
     }
 }
 
-/// Whether every eigenvalue of a symmetric matrix is above `least`: whether it has a Cholesky factor less that much.
+/// Whether every eigenvalue of a symmetric matrix is above `least`: the matrix minus `least`·I then has a Cholesky
+/// factor.
 fn has_eigenvalues_above(least: f64, matrix: &Square) -> bool {
     let mut factor = [[0.0; 6]; 6];
     for row in 0..6 {
@@ -257,7 +261,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_arm_within_its_ranges_is_left_alone() {
+    fn an_arm_within_its_ranges_is_not_changed() {
         let free = [0.0; 56];
         let mut joints = [0.1; 56];
         fit(&free, &mut joints, REGULARISATION);
@@ -265,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hanging_right_arm_keeps_elbow_and_wrist_better_than_clamping_does() {
+    fn fitting_a_hanging_right_arm_is_better_than_clamping() {
         let [_, arm] = &ARMS;
         let wanted = [0.0, 0.0, -1.45, 0.1, 0.2, 0.3];
         let problem = Problem::new(arm, wanted, REGULARISATION);
@@ -276,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn derivatives_are_those_of_the_value() {
+    fn derivatives_equal_finite_differences_of_the_value() {
         let [arm, _] = &ARMS;
         let problem = Problem::new(arm, [0.3, -0.2, 1.9, 0.4, -0.3, 0.6], 0.2);
         let at = [0.1, 0.05, 1.2, 0.3, 0.2, 0.9];

@@ -1,32 +1,32 @@
-//! ASF: a subject's skeleton.
+//! ASF files: the skeleton of a subject.
 
 use std::path::Path;
 
 use super::lines::Lines;
 use super::skeleton::Bone;
-use crate::Error;
 use crate::body::{self, Frames};
+use crate::error::Error;
 use crate::spatial::{about, matrix, multiply};
 
-/// Metres in an inch: files count lengths in units of an inch over the `length` under `:units`.
+/// One inch, m. The unit of length in a file is one inch divided by the `length` under `:units`.
 const INCH: f64 = 0.0254;
-/// Thigh and shank of the V2020 body, m: 1.2 times the XML's numbers (`humanoid_CMU_V2020.xml`).
+/// Length of thigh plus shank of the V2020 body, m: 1.2 times the numbers of `humanoid_CMU_V2020.xml`.
 const LEG: f64 = 1.2 * (0.404945 + 0.415693);
-/// How far an element of a bone's rotation may be from the body's; files round to six digits.
+/// Greatest difference between an element of a bone's rotation matrix and the body's. Files round to six digits.
 const SAME_AXIS: f64 = 1e-3;
-/// The bones whose lengths make the scale.
+/// The bones whose lengths determine the scale.
 const LEG_BONES: [&str; 4] = ["lfemur", "ltibia", "rfemur", "rtibia"];
 
-/// What the import needs of a skeleton.
+/// The data of a skeleton that the import needs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Skeleton {
-    /// Metres in one of the file's units.
+    /// One unit of length in the file, m.
     pub(super) meters: f64,
-    /// The body's leg over the subject's: how much larger the motion becomes.
+    /// Factor by which lengths of the motion grow: the body's leg divided by the subject's leg.
     pub(super) scale: f64,
 }
 
-/// A bone while its lines are read.
+/// A bone whose lines are being read.
 #[derive(Default)]
 struct Reading {
     name: String,
@@ -36,7 +36,7 @@ struct Reading {
 }
 
 impl Skeleton {
-    /// Reads a file and checks that its bones turn as the body's do.
+    /// Reads a file, and checks that its bones have the same axes as the body.
     pub(super) fn read(path: &Path) -> Result<Self, Error> {
         let mut lines = Lines::open(path)?;
         let (mut section, mut unit) = (String::new(), None);
@@ -76,7 +76,7 @@ impl Skeleton {
         }
         let meters = INCH / unit;
         if leg <= 0.0 {
-            return Err(whole("the legs have no length".into()));
+            return Err(whole("the legs have length 0".into()));
         }
         Ok(Self { meters, scale: LEG / (meters * leg / 2.0) })
     }
@@ -90,17 +90,17 @@ impl Reading {
             ("dof", dofs) => self.dofs = dofs.to_vec(),
             ("axis", [x, y, z, order]) => {
                 if order != "XYZ" {
-                    return Err(lines.error(format!("axis order {order}: only XYZ is known")));
+                    return Err(lines.error(format!("axis order {order}: expected XYZ")));
                 }
                 self.axis = Some([lines.number(x)?, lines.number(y)?, lines.number(z)?]);
             }
-            // Direction, limits and what else a file may say are not needed.
+            // The import does not need the direction, the limits and other entries.
             _ => {}
         }
         Ok(())
     }
 
-    /// That this bone is one of CMU's, or one that does not move.
+    /// Checks that this bone is one of CMU's, or does not move.
     fn check(&self, lines: &Lines) -> Result<(), Error> {
         let name = &self.name;
         let refuse = |what: String| {
@@ -108,20 +108,22 @@ impl Reading {
         };
         match Bone::find(name) {
             None if self.dofs.is_empty() => Ok(()),
-            None => refuse(format!("moves ({}), and the body has no joint for it", self.dofs.join(" "))),
+            None => refuse(format!("moves ({}), but the body has no joint for it", self.dofs.join(" "))),
             Some(bone) if self.dofs != bone.dofs => {
                 refuse(format!("has dof `{}`, expected `{}`", self.dofs.join(" "), bone.dofs.join(" ")))
             }
             Some(bone) => match self.axis {
                 None => refuse("has no axis".into()),
-                Some(axis) if !same_as_body(bone, axis) => refuse(format!("has axis {axis:?}, not the body's")),
+                Some(axis) if !same_as_body(bone, axis) => {
+                    refuse(format!("has axis {axis:?}, which differs from the body's"))
+                }
                 Some(_) => Ok(()),
             },
         }
     }
 }
 
-/// Whether the body's frame at zero angles is turned by these degrees, x first.
+/// Whether the body's frame at zero angles has this orientation: degrees about x, y, z, x first.
 fn same_as_body(bone: &Bone, axis: [f64; 3]) -> bool {
     let [x, y, z] = axis.map(f64::to_radians);
     let bones = matrix(multiply(about(2, z), multiply(about(1, y), about(0, x))));
@@ -133,7 +135,7 @@ fn positive(lines: &Lines, words: &[String]) -> Result<f64, Error> {
     match words {
         [word] => match lines.number(word)? {
             number if number > 1e-6 => Ok(number),
-            number => Err(lines.error(format!("{number} is no length"))),
+            number => Err(lines.error(format!("{number} is not a valid length"))),
         },
         _ => Err(lines.error("expected one number")),
     }
@@ -144,13 +146,13 @@ fn expect(lines: &Lines, words: &[String], wanted: &str) -> Result<(), Error> {
     if found.eq_ignore_ascii_case(wanted) {
         return Ok(());
     }
-    Err(lines.error(format!("the root's order is `{found}`; only `{wanted}` is known")))
+    Err(lines.error(format!("the root's order is `{found}`; expected `{wanted}`")))
 }
 
 fn expect_zero(lines: &Lines, words: &[String]) -> Result<(), Error> {
     for word in words {
         if lines.number(word)?.abs() > 1e-6 {
-            return Err(lines.error("the root is turned; only skeletons of the CMU database can be imported"));
+            return Err(lines.error("the root is rotated; only skeletons of the CMU database can be imported"));
         }
     }
     Ok(())

@@ -1,50 +1,65 @@
-//! What an import may be told, and what it took.
+//! The inputs of an import, and the constants that it used.
 
 use std::fmt;
 use std::ops::Range;
+use std::path::PathBuf;
 use std::str::FromStr;
 
-use crate::Error;
+use crate::error::Error;
 
-/// The constants of an import; what is `None` is found from the recording.
+/// A recording ("take" in motion capture) and the constants of its import.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Take {
+    /// The clip's name.
+    pub name: String,
+    /// The skeleton of the subject.
+    pub asf: PathBuf,
+    /// The recorded angles.
+    pub amc: PathBuf,
+    /// Its constants, as far as they are known.
+    pub constants: Constants,
+}
+
+/// The constants of an import. A constant that is `None` is found from the recording.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Constants {
-    /// The motion's size: V2020's leg over the subject's unless given.
+    /// Factor for all lengths. Default: V2020's leg divided by the subject's leg.
     pub scale: Option<f64>,
-    /// Degrees to take off the left and the right ankle (positive: toes up), because the body's soles are inclined in
-    /// their feet; the median pitch of soles that stand unless given.
+    /// Degrees to subtract from the left and the right ankle (positive: toes up), because the body's soles are inclined
+    /// relative to their feet. Default: the median pitch of the soles of standing feet.
     pub sole_degrees: Option<[f64; 2]>,
-    /// Where the floor is; found unless given.
+    /// The model of the floor. Default: found from the heights of the body.
     pub floor: Option<Floor>,
-    /// m/rad: how much arms keep their recorded angles rather than elbow and wrist where their range is left; 0.2
-    /// unless given.
+    /// For arms outside their ranges: weight of the recorded angles against the positions of elbow and wrist, m/rad.
+    /// Default: 0.2.
     pub arm_regularisation: Option<f64>,
-    /// The recorded frames to take, from 0, the end not included; all unless given.
+    /// The recorded frames to import, counted from 0, without the end. Default: all.
     pub frames: Option<Range<usize>>,
 }
 
-/// How a recording's floor is told from the body's lowest points.
+/// How the height of a recording's floor follows from the body's lowest points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Floor {
-    /// It drifts: this percentile over `half` steps (0.03 s each) to either side, then the mean over `smooth`.
+    /// The floor drifts: the percentile over `half` steps (0.03 s each) to either side, then the mean over `smooth`
+    /// steps to either side.
     Sliding {
-        /// 0 to 100.
+        /// The percentile, 0 to 100.
         percent: f64,
         /// Steps.
         half: usize,
         /// Steps.
         smooth: usize,
     },
-    /// It is level: this percentile of all steps.
+    /// The floor is level: the percentile over all steps.
     Constant {
-        /// 0 to 100.
+        /// The percentile, 0 to 100.
         percent: f64,
     },
 }
 
-/// What an import took, given or found.
+/// The constants that an import used, given or found.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Taken {
+pub struct UsedConstants {
     /// See [`Constants::scale`].
     pub scale: f64,
     /// See [`Constants::sole_degrees`].
@@ -55,17 +70,17 @@ pub struct Taken {
     pub arm_regularisation: f64,
     /// See [`Constants::frames`].
     pub frames: Range<usize>,
-    /// What a person should look at.
+    /// Remarks about the recording that a person should check.
     pub notes: Vec<String>,
 }
 
 impl Floor {
-    /// For walks and runs; CMU's early subjects walk on a floor that drifts by up to 8 cm.
+    /// For walks and runs. In the recordings of CMU's early subjects the floor drifts by up to 8 cm.
     pub const DRIFTING: Self = Self::Sliding { percent: 50.0, half: 12, smooth: 8 };
     /// For jumps.
     pub const LEVEL: Self = Self::Constant { percent: 30.0 };
 
-    /// That the percentile is one, and the windows are no longer than any clip.
+    /// Checks the percentile, and that no window is longer than 10,000 steps.
     fn check(self) -> Option<Self> {
         let (percent, longest) = match self {
             Self::Sliding { percent, half, smooth } => (percent, half.max(smooth)),
@@ -89,7 +104,7 @@ impl FromStr for Floor {
             _ => None,
         };
         floor.and_then(Self::check).ok_or_else(|| {
-            format!("`{text}` is no floor: give sliding:PERCENTILE:HALF:SMOOTH, like sliding:50:12:8, or const:PERCENTILE, like const:30")
+            format!("`{text}` is not a floor: give sliding:PERCENTILE:HALF:SMOOTH, for example sliding:50:12:8, or const:PERCENTILE, for example const:30")
         })
     }
 }
@@ -104,7 +119,7 @@ impl fmt::Display for Floor {
 }
 
 impl Constants {
-    /// That every number makes sense.
+    /// Checks that every number is within its bounds.
     pub(super) fn check(&self) -> Result<(), Error> {
         let refuse = |what: &'static str, value: f64, expected: &'static str| {
             Err(Error::Constant { what, value: value.to_string(), expected })
@@ -137,8 +152,8 @@ impl Constants {
     }
 }
 
-impl fmt::Display for Taken {
-    /// As options of the command line.
+impl fmt::Display for UsedConstants {
+    /// Writes the constants as options of the command line.
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { scale, sole_degrees: [left, right], floor, arm_regularisation, frames, .. } = self;
         write!(
@@ -154,7 +169,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_floor_is_written_as_it_is_read() {
+    fn a_floor_is_written_in_the_form_that_is_read() {
         for text in ["sliding:50:12:8", "const:30", "const:12.5"] {
             assert_eq!(text.parse::<Floor>().unwrap().to_string(), text);
         }

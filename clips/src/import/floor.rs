@@ -1,28 +1,30 @@
-//! The floor under a recording, and feet that stand on it.
+//! Finds the floor of a recording and puts the feet on it.
 
-use super::angles::percentile;
+use comic_experiment::statistics::percentile;
+
 use super::constants::Floor;
 use super::sole;
-use crate::JOINT_RANGES;
 use crate::body::{Frames, Geom, body, geoms, joint};
+use crate::humanoid::JOINT_RANGES;
 use crate::spatial::{Quaternion, Vector};
 
-/// m: how deep a sole may sink into the floor.
+/// Greatest depth of a sole in the floor, m.
 const TOLERANCE: f64 = 0.002;
-/// Halvings of an ankle's turn: to a part in 10¹².
+/// Bisections of an ankle's angle: the precision is one part in 10¹².
 const BISECTIONS: usize = 40;
-/// Steps to either side over which the body is lifted for the deepest point, and the lift smoothed.
+/// Steps to either side over which the lift takes the deepest point and is smoothed.
 const LIFT: usize = 3;
-/// m: how far CMU's floors drift in a take; a baseline that varies more follows jumps instead.
+/// Greatest drift of CMU's floors in one take, m. A baseline that varies more follows jumps of the body.
 const DRIFT: f64 = 0.08;
 
-/// Poses on their way to a clip, one per step.
+/// The poses of a clip during its import, one per step: root position (m) and orientation, joint angles (rad).
 pub(super) struct Poses {
     pub(super) position: Vec<Vector>,
     pub(super) quaternion: Vec<Quaternion>,
     pub(super) joints: Vec<[f64; 56]>,
 }
 
+/// The ankle's index in [`JOINTS`](crate::JOINTS), and the indices of the two bodies of a foot.
 struct Foot {
     ankle: usize,
     body: usize,
@@ -39,12 +41,14 @@ impl Poses {
         Frames::of(&self.position[step], &self.quaternion[step], &self.joints[step])
     }
 
+    /// Height of the body's lowest point at each step, m.
     fn lowest(&self) -> Vec<f64> {
         (0..self.position.len()).map(|step| self.frames(step).lowest().0).collect()
     }
 
-    /// Sets the poses on the floor: takes off the recording's own floor, turns ankles whose feet go below, and lifts
-    /// what that does not mend. The floor is found where none is given; it is returned.
+    /// Puts the poses on the floor. Subtracts the height of the recording's floor, turns the ankles of feet that are
+    /// below the floor, and lifts the body where a foot is still below. Returns the floor; if none is given, it is
+    /// found.
     pub(super) fn set_on_floor(&mut self, floor: Option<Floor>) -> Floor {
         let heights = self.lowest();
         let floor = floor.unwrap_or_else(|| find(&heights));
@@ -65,8 +69,8 @@ impl Poses {
         floor
     }
 
-    /// The angle of a foot's ankle that keeps the foot out of the floor: as it is, or turned towards a level sole just
-    /// as far as it takes.
+    /// The angle of a foot's ankle with which the foot is not below the floor, rad. It is the recorded angle, or the
+    /// angle nearest to it on the way to a level sole.
     fn ankle(&self, step: usize, foot: &Foot) -> f64 {
         let frames = self.frames(step);
         let recorded = self.joints[step][foot.ankle];
@@ -94,14 +98,14 @@ impl Poses {
 }
 
 impl Foot {
+    /// Height of the foot's lowest point, m.
     fn height(&self, frames: &Frames) -> f64 {
         let own = |geom: &&Geom| geom.body == self.body || geom.body == self.toes;
         geoms().iter().filter(own).map(|geom| frames.bottom(geom)).fold(f64::INFINITY, f64::min)
     }
 }
 
-/// The floor of a recording nobody knows: one that drifts, or, where that would follow the body into the air, a
-/// constant one.
+/// Finds the floor of a recording. It is a drifting floor; if that would follow the body into the air, a level floor.
 fn find(heights: &[f64]) -> Floor {
     let base = baseline(heights, Floor::DRIFTING);
     let lowest = base.iter().copied().fold(f64::INFINITY, f64::min);
@@ -109,17 +113,18 @@ fn find(heights: &[f64]) -> Floor {
     if highest - lowest > DRIFT { Floor::LEVEL } else { Floor::DRIFTING }
 }
 
-/// The floor's height at each step, from the body's lowest points.
+/// Height of the floor at each step, m, from the `heights` of the body's lowest points.
 fn baseline(heights: &[f64], floor: Floor) -> Vec<f64> {
+    let height = |heights: &[f64], percent| percentile(heights.to_vec(), percent).unwrap_or_default();
     match floor {
         Floor::Sliding { percent, half, smooth } => {
-            sliding(&sliding(heights, half, |window| percentile(window.to_vec(), percent)), smooth, mean)
+            sliding(&sliding(heights, half, |window| height(window, percent)), smooth, mean)
         }
-        Floor::Constant { percent } => vec![percentile(heights.to_vec(), percent); heights.len()],
+        Floor::Constant { percent } => vec![height(heights, percent); heights.len()],
     }
 }
 
-/// `of` each step's window, `half` steps to either side, cut at the ends.
+/// Applies `of` to the window of each step: `half` steps to either side, shorter at the ends.
 fn sliding(values: &[f64], half: usize, of: impl Fn(&[f64]) -> f64) -> Vec<f64> {
     (0..values.len())
         .map(|step| of(&values[step.saturating_sub(half)..step.saturating_add(half + 1).min(values.len())]))
@@ -135,7 +140,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_drifting_floor_is_followed_and_a_jump_is_not() {
+    fn the_floor_follows_a_drift_and_not_a_jump() {
         let drift: Vec<f64> = (0..100).map(|step| 0.0005 * f64::from(step)).collect();
         assert_eq!(find(&drift), Floor::DRIFTING);
         let long_flight: Vec<f64> = (0..100).map(|step| if (40..70).contains(&step) { 0.5 } else { 0.0 }).collect();
@@ -144,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn feet_that_sink_turn_level_and_the_rest_is_lifted() {
+    fn feet_below_the_floor_are_levelled_and_the_body_is_lifted() {
         let upright = [0.5; 4];
         let mut poses =
             Poses { position: vec![[0.0, 0.0, 1.0]; 9], quaternion: vec![upright; 9], joints: vec![[0.0; 56]; 9] };

@@ -1,15 +1,15 @@
-//! A text file, line by line, whatever it holds.
+//! Reads a text file line by line, in bounded memory for any content.
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 
-use crate::Error;
+use crate::error::Error;
 
-/// Longest line taken, bytes; CMU's are below 200.
+/// Greatest length of a line, bytes. CMU's lines are shorter than 200.
 const LONGEST: u64 = 4096;
 
-/// Reads lines with bounded memory and knows where it is.
+/// The lines of a file, with the number of the current line for errors.
 pub(super) struct Lines {
     path: PathBuf,
     reader: BufReader<File>,
@@ -22,7 +22,7 @@ impl Lines {
         Ok(Self { path: path.into(), reader: BufReader::new(file), number: 0 })
     }
 
-    /// The words of the next line that has any and does not begin with `#`, or `None` at the end.
+    /// The words of the next line that is not empty and does not begin with `#`; `None` at the end.
     pub(super) fn next_words(&mut self) -> Result<Option<Vec<String>>, Error> {
         loop {
             let mut line = Vec::new();
@@ -33,9 +33,9 @@ impl Lines {
             }
             self.number += 1;
             if read as u64 == LONGEST {
-                return Err(self.error(format!("over {LONGEST} bytes in a line: is this a text file?")));
+                return Err(self.error(format!("a line of {LONGEST} bytes or more: is this a text file?")));
             }
-            // Only comments hold anything beside ASCII.
+            // Only comments have characters that are not ASCII.
             let line = String::from_utf8_lossy(&line);
             let words: Vec<String> = line.split_whitespace().map(String::from).collect();
             if words.first().is_some_and(|word| !word.starts_with('#')) {
@@ -44,17 +44,17 @@ impl Lines {
         }
     }
 
-    /// What is wrong with the line read last.
+    /// An error about the line that was read last.
     pub(super) fn error(&self, reason: impl Into<String>) -> Error {
         Error::Line { path: self.path.clone(), line: self.number, reason: reason.into() }
     }
 
-    /// A number of at most a million, which is beyond any length or angle of a recording.
+    /// Parses a number. Its absolute value is at most a million; lengths and angles of recordings are far smaller.
     pub(super) fn number(&self, word: &str) -> Result<f64, Error> {
         match word.parse::<f64>() {
             Ok(number) if number.abs() <= 1e6 => Ok(number),
-            Ok(number) => Err(self.error(format!("{number} is no length or angle of a recording"))),
-            Err(_) => Err(self.error(format!("`{word}` is no number"))),
+            Ok(number) => Err(self.error(format!("{number} is too large for a length or angle of a recording"))),
+            Err(_) => Err(self.error(format!("`{word}` is not a number"))),
         }
     }
 }

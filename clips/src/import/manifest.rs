@@ -1,17 +1,17 @@
-//! A list of takes and the constants of each, as JSON.
+//! Manifests: a JSON list of takes with the constants of each.
 
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::{Constants, Floor, Take};
-use crate::Error;
+use super::constants::{Constants, Floor, Take};
+use crate::error::Error;
 
-/// A manifest is short; what is longer is something else.
+/// Greatest length of a manifest, bytes.
 const LONGEST: u64 = 16 << 20;
 
-/// One take. Whatever else an object says (its description, where the files came from) is for people.
+/// One take. Other fields of the object, like a description, are ignored.
 #[derive(Deserialize)]
 struct Listed {
     key: String,
@@ -38,24 +38,25 @@ enum ListedFloor {
 /// "smooth"}` or `{"mode": "const", "pct"}`), `arm_reg` and `scale`.
 ///
 /// # Errors
-/// [`Error::Unreadable`]; [`Error::Recording`] when it is no such list.
+/// [`Error::Unreadable`]; [`Error::Recording`] if the file is not such a list.
 pub fn read_manifest(path: &Path) -> Result<Vec<Take>, Error> {
     let unreadable = |reason| Error::Unreadable { path: path.into(), reason };
     let wrong = |reason: String| Error::Recording { path: path.into(), reason };
     let mut text = String::new();
-    // A device tells no length: what is read is what counts.
+    // A device has no length in its metadata, so the limit applies to the bytes that are read.
     let file = std::fs::File::open(path).map_err(unreadable)?;
     let length = file.take(LONGEST + 1).read_to_string(&mut text).map_err(unreadable)?;
     if length as u64 > LONGEST {
         return Err(wrong("too long for a manifest".into()));
     }
-    // Line and column are in serde's words.
-    let listed: Vec<Listed> = serde_json::from_str(&text).map_err(|error| wrong(format!("no manifest: {error}")))?;
+    // The message of serde has line and column.
+    let listed: Vec<Listed> = serde_json::from_str(&text).map_err(|error| wrong(format!("not a manifest: {error}")))?;
     let directory = path.parent().unwrap_or(Path::new(""));
     Ok(listed.into_iter().map(|take| take.within(directory)).collect())
 }
 
 impl Listed {
+    /// The take, with paths relative to `directory`.
     fn within(self, directory: &Path) -> Take {
         let constants = Constants {
             scale: self.scale,

@@ -1,4 +1,4 @@
-//! From recorded frames to steps: smoothing, then every 3.6th frame.
+//! From recorded frames to steps: smoothing, then one step per 3.6 frames.
 
 use std::ops::Range;
 
@@ -6,15 +6,15 @@ use crate::spatial::{Quaternion, aligned, normalize};
 
 /// Weights of a frame and its two neighbours on either side.
 const BINOMIAL: [f64; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
-/// Recorded frames in a step, as a fraction: 120 Hz × 0.03 s.
+/// Recorded frames per step, as a fraction: 120 Hz × 0.03 s.
 const FRAMES_PER_STEP: (usize, usize) = (18, 5);
 
-/// How many poses a window of recorded frames has, first and last included.
+/// The number of poses in a window of recorded frames, with the first and the last.
 pub(super) fn poses(window: &Range<usize>) -> usize {
     window.len().checked_sub(1).map_or(0, |last| FRAMES_PER_STEP.1 * last / FRAMES_PER_STEP.0 + 1)
 }
 
-/// Smoothed over recorded frames, the edges repeated, and resampled linearly: one per step.
+/// Smooths the recorded frames, with the edges repeated, and interpolates linearly: one value per step.
 pub(super) fn resample<const N: usize>(frames: &[[f64; N]], window: &Range<usize>) -> Vec<[f64; N]> {
     let smooth = |frame: usize| {
         let mut sum = [0.0; N];
@@ -31,8 +31,8 @@ pub(super) fn resample<const N: usize>(frames: &[[f64; N]], window: &Range<usize
         .collect()
 }
 
-/// The same for rotations: neighbours on the side of the middle one, normalised, and without flips of sign, beginning
-/// with w ≥ 0.
+/// The same for rotations. Before they are added, quaternions get the sign of the middle one; sums are normalised. The
+/// result has no change of sign between steps, and begins with w ≥ 0.
 pub(super) fn resample_rotations(frames: &[Quaternion], window: &Range<usize>) -> Vec<Quaternion> {
     let smooth = |frame: usize| {
         let mut sum = [0.0; 4];
@@ -53,11 +53,12 @@ pub(super) fn resample_rotations(frames: &[Quaternion], window: &Range<usize>) -
         .collect()
 }
 
+/// The frames that smooth `frame`, each with its weight.
 fn neighbours(frame: usize, frames: usize) -> impl Iterator<Item = (f64, usize)> {
     BINOMIAL.into_iter().enumerate().map(move |(tap, weight)| (weight, (frame + tap).saturating_sub(2).min(frames - 1)))
 }
 
-/// For each step the recorded frame before it, the one after it, and how far it is between them.
+/// For each step: the recorded frame before it, the frame after it, and its position between the two, 0 to 1.
 fn steps(window: &Range<usize>, frames: usize) -> impl Iterator<Item = (usize, usize, f64)> {
     let ((numerator, denominator), start) = (FRAMES_PER_STEP, window.start);
     (0..poses(window)).map(move |step| {
@@ -72,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_straight_line_stays_one() {
+    fn a_straight_line_stays_straight() {
         let frames: Vec<[f64; 1]> = (0..40).map(|frame| [f64::from(frame)]).collect();
         let window = 5..35;
         let steps = resample(&frames, &window);
@@ -83,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn signs_of_rotations_do_not_matter() {
+    fn the_signs_of_recorded_quaternions_do_not_matter() {
         let turn = |frame: u8| crate::spatial::about(1, f64::from(frame) / 10.0);
         let plain: Vec<_> = (0..40).map(turn).collect();
         let flipped: Vec<_> =

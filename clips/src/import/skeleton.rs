@@ -1,11 +1,12 @@
-//! The bones of CMU's skeletons that move, and what the V2020 body makes of them.
+//! The moving bones of CMU's skeletons, and their joints in the V2020 body.
 
-use crate::JOINTS;
+use crate::humanoid::JOINTS;
 
-/// A bone and the angles an AMC file has of it, in the order of its `dof` line.
+/// A bone and its angles in an AMC file, in the order of its `dof` line.
 ///
-/// The V2020 body was modelled on this skeleton: at zero angles its frames are the bones' axes, and its hinges turn
-/// z, y, x like the AMC's angles, so an angle is a joint's angle, sign and all.
+/// The V2020 body was modelled on this skeleton. At zero angles its frames are the axes of the bones, and its hinges
+/// turn in the order z, y, x, like the angles of an AMC file. So an angle of the file is the angle of a joint, with the
+/// same sign.
 pub(super) struct Bone {
     pub(super) name: &'static str,
     pub(super) dofs: &'static [&'static str],
@@ -15,7 +16,7 @@ const XYZ: &[&str] = &["rx", "ry", "rz"];
 const X: &[&str] = &["rx"];
 const XZ: &[&str] = &["rx", "rz"];
 
-/// The same in every ASF file of the database.
+/// The moving bones, the same in every ASF file of the database.
 #[rustfmt::skip]
 pub(super) const BONES: [Bone; 28] = [
     bone("lowerback", XYZ), bone("upperback", XYZ), bone("thorax", XYZ), bone("lowerneck", XYZ),
@@ -37,9 +38,9 @@ impl Bone {
         BONES.iter().find(|bone| bone.name == name)
     }
 
-    /// The places of its angles in [`JOINTS`].
+    /// The indices of its angles in [`JOINTS`].
     pub(super) fn joints(&self) -> impl Iterator<Item = usize> {
-        // The body has a hinge for each, which a test holds.
+        // The body has a hinge for every angle; a test checks that.
         self.dofs.iter().filter_map(|dof| JOINTS.iter().position(|joint| joint.strip_prefix(self.name) == Some(dof)))
     }
 }
@@ -49,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_bones_angles_are_the_bodys_hinges_each_once() {
+    fn each_hinge_of_the_body_is_one_angle_of_a_bone() {
         let mut joints: Vec<usize> = BONES.iter().flat_map(Bone::joints).collect();
         joints.sort_unstable();
         assert_eq!(joints, (0..56).collect::<Vec<_>>());

@@ -1,11 +1,12 @@
 //! Velocities by central differences.
 
 use super::floor::Poses;
-use crate::Motion;
+use crate::clip::Motion;
 use crate::spatial::rotation_between;
 
-/// One frame fewer than there are poses, `dt` seconds apart: the last pose only serves the velocities. The first
-/// velocity is a forward difference; the angular one is in the root's own frame, as MuJoCo has it.
+/// Adds velocities to poses that are `dt` seconds apart. The motion has one frame fewer than there are poses: the last
+/// pose is used only for velocities. The first velocity is a forward difference. The angular velocity is in the root
+/// frame, as in MuJoCo.
 pub(super) fn motion(mut poses: Poses, dt: f64) -> Motion {
     let velocity = central(&differences(&poses.position, dt));
     let joints_velocity = central(&differences(&poses.joints, dt));
@@ -19,11 +20,12 @@ pub(super) fn motion(mut poses: Poses, dt: f64) -> Motion {
     Motion { position, quaternion, joints, velocity, angular_velocity, joints_velocity }
 }
 
+/// Forward differences per second.
 fn differences<const N: usize>(values: &[[f64; N]], dt: f64) -> Vec<[f64; N]> {
     values.windows(2).map(|pair| std::array::from_fn(|i| (pair[1][i] - pair[0][i]) / dt)).collect()
 }
 
-/// The mean of each forward difference and the one before it.
+/// The mean of each forward difference and the previous one.
 fn central<const N: usize>(forward: &[[f64; N]]) -> Vec<[f64; N]> {
     let means = forward.windows(2).map(|pair| std::array::from_fn(|i| 0.5 * (pair[0][i] + pair[1][i])));
     forward.first().copied().into_iter().chain(means).collect()

@@ -7,7 +7,7 @@ use anyhow::{Context as _, Result};
 
 use super::Store;
 use super::steps::{carry_out, replace};
-use crate::error::Misuse;
+use crate::error::Error;
 
 const RUN: &str = "run";
 
@@ -16,13 +16,13 @@ impl Store {
     /// same address are told by it that theirs is over.
     ///
     /// # Errors
-    /// [`Misuse`] when its file is damaged; otherwise when it cannot be read or written.
+    /// [`Error::Configuration`] when its file is damaged; otherwise when it cannot be read or written.
     pub fn run(&self) -> Result<u64> {
         let path = self.directory.join(RUN);
         match fs::read(&path) {
             Ok(bytes) => u64::from_str_radix(String::from_utf8_lossy(&bytes).trim(), 16).map_err(|_| {
                 let remedy = "remove it, and start the actors again";
-                Misuse::new(format!("{} is damaged: {remedy}", path.display())).into()
+                Error::configuration(format!("{} is damaged: {remedy}", path.display())).into()
             }),
             Err(error) if error.kind() == ErrorKind::NotFound => {
                 let run = rand::random();

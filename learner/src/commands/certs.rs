@@ -5,7 +5,6 @@ use std::io::Write as _;
 use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result};
 use clap::Args;
 use rand::Rng as _;
 use rcgen::{
@@ -13,7 +12,7 @@ use rcgen::{
 };
 use time::{Duration, OffsetDateTime};
 
-use crate::error::Misuse;
+use crate::error::{Error, Result};
 
 /// Makes an authority and certificates for a learner and its actors, or, where DIR holds an authority, renews the
 /// certificates by it: a learner and actors that run take them up by themselves.
@@ -60,7 +59,7 @@ impl Certs {
     /// # Errors
     /// A name that is none, an authority that cannot be used, a directory that cannot be written.
     pub fn run(&self) -> Result<()> {
-        fs::create_dir_all(&self.out).with_context(|| format!("cannot make {}", self.out.display()))?;
+        fs::create_dir_all(&self.out).map_err(Error::file("make", &self.out))?;
         let now = OffsetDateTime::now_utc();
         let (from, until) = (now - SKEW, now + Duration::days(self.days.into()));
         let issuer = self.authority(now)?;
@@ -68,7 +67,7 @@ impl Certs {
         let client = ("client", vec!["comic-actor".to_owned()], ExtendedKeyUsagePurpose::ClientAuth);
         for (name, subjects, usage) in [server, client] {
             let mut params = CertificateParams::new(subjects)
-                .map_err(|error| Misuse::new(format!("--name is no host name and no address: {error}")))?;
+                .map_err(|error| Error::configuration(format!("--name is no host name and no address: {error}")))?;
             params.distinguished_name.push(DnType::CommonName, format!("CoMic {name}"));
             params.extended_key_usages = vec![usage];
             params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
@@ -78,7 +77,7 @@ impl Certs {
             self.write(name, &certificate.pem(), &key)?;
         }
         if self.token && !self.out.join("token").exists() {
-            let token: String = rand::rng().random_iter::<u8>().take(32).map(|byte| format!("{byte:02x}")).collect();
+            let token: String = hex::encode(rand::rng().random::<[u8; 32]>());
             put(&self.out, "token", 0o600, &format!("{token}\n"))?;
         }
         if let Some(place) = &self.copy_for_learner {
@@ -95,13 +94,13 @@ impl Certs {
         if !from.exists() {
             return Ok(());
         }
-        let text = fs::read_to_string(&from).with_context(|| format!("cannot read {}", from.display()))?;
+        let text = fs::read_to_string(&from).map_err(Error::file("read", &from))?;
         // What is the same is left alone: an actor may read it just now.
         if fs::read_to_string(place.join(file)).is_ok_and(|there| there == text) {
             return Ok(());
         }
-        fs::create_dir_all(place).with_context(|| format!("cannot make {}", place.display()))?;
-        let mode = fs::metadata(&from)?.permissions().mode() & 0o777;
+        fs::create_dir_all(place).map_err(Error::file("make", place))?;
+        let mode = fs::metadata(&from).map_err(Error::file("read", &from))?.permissions().mode() & 0o777;
         put(place, file, mode, &text)
     }
 
@@ -111,13 +110,16 @@ impl Certs {
         if certificate.exists() || key.exists() {
             let read = |path: &Path| {
                 let text = fs::read_to_string(path);
-                text.map_err(|error| Misuse::new(format!("half an authority: cannot read {}: {error}", path.display())))
+                text.map_err(|error| {
+                    Error::configuration(format!("half an authority: cannot read {}: {error}", path.display()))
+                })
             };
             let (certificate, key) = (read(&certificate)?, read(&key)?);
-            let unusable =
-                |error| Misuse::new(format!("the authority in {} cannot be used: {error}", self.out.display()));
+            let unusable = |error| {
+                Error::configuration(format!("the authority in {} cannot be used: {error}", self.out.display()))
+            };
             let key = KeyPair::from_pem(&key).map_err(unusable)?;
-            return Ok(Issuer::from_ca_cert_pem(&certificate, key).map_err(unusable)?);
+            return Issuer::from_ca_cert_pem(&certificate, key).map_err(unusable);
         }
         let mut params = CertificateParams::default();
         params.distinguished_name.push(DnType::CommonName, "CoMic development authority");
@@ -143,10 +145,10 @@ fn put(directory: &Path, file: &str, mode: u32, text: &str) -> Result<()> {
     let path = directory.join(file);
     let mut open = OpenOptions::new();
     let file = open.create(true).write(true).truncate(true).mode(mode).open(&path);
-    let mut file = file.with_context(|| format!("cannot write {}", path.display()))?;
+    let mut file = file.map_err(Error::file("write", &path))?;
     // A file that was there keeps its own mode.
-    file.set_permissions(fs::Permissions::from_mode(mode))?;
-    file.write_all(text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
+    let written = file.set_permissions(fs::Permissions::from_mode(mode)).and_then(|()| file.write_all(text.as_bytes()));
+    written.map_err(Error::file("write", &path))
 }
 
 #[cfg(test)]
@@ -220,6 +222,6 @@ mod tests {
         assert_eq!((read("ca.pem"), read("token")), (authority, token));
         assert_ne!(read("server.pem"), server);
         fs::remove_file(directory.path().join("ca-key.pem")).unwrap();
-        assert!(certs(directory.path()).run().unwrap_err().is::<Misuse>());
+        assert_eq!(certs(directory.path()).run().unwrap_err().exit_code(), 2);
     }
 }

@@ -2,12 +2,11 @@
 
 use std::path::Path;
 
-use anyhow::{Context as _, Result};
 use comic_experiment::Experiment;
 use comic_networks::export::{Exported, Part, Source};
 
 use crate::checkpoint::{self, Snapshot};
-use crate::error::Misuse;
+use crate::error::{Error, Result};
 use crate::train::trainer::Progress;
 
 /// What the file's extension says it is.
@@ -24,12 +23,15 @@ enum Form {
 pub fn run(path: &Path, part: Part, out: &Path) -> Result<()> {
     let form = form(out)?;
     let (place, snapshot) = checkpoint::find(path)?;
-    let exported = take(&place, part, &snapshot).with_context(|| format!("cannot export {}", place.display()))?;
+    let exported =
+        take(&place, part, &snapshot).map_err(Error::within(format!("cannot export {}", place.display())))?;
     let written = match form {
-        Form::Safetensors => std::fs::write(out, &exported.bytes).map_err(anyhow::Error::from),
-        Form::TorchScript => exported.save_script(out).map_err(anyhow::Error::from),
+        Form::Safetensors => std::fs::write(out, &exported.bytes).map_err(Error::file("write", out)),
+        Form::TorchScript => {
+            exported.save_script(out).map_err(Error::within(format!("cannot write {}", out.display())))
+        }
     };
-    written.with_context(|| format!("cannot write {}", out.display()))?;
+    written?;
     tracing::info!(checkpoint = %place.display(), %part, out = %out.display(), "exported");
     Ok(())
 }
@@ -38,19 +40,21 @@ fn form(out: &Path) -> Result<Form> {
     match out.extension().and_then(|extension| extension.to_str()) {
         Some("safetensors") => Ok(Form::Safetensors),
         Some("pt") => Ok(Form::TorchScript),
-        _ => Err(Misuse::new(format!("--out {}: name it .safetensors, or .pt for TorchScript", out.display())).into()),
+        _ => {
+            Err(Error::configuration(format!("--out {}: name it .safetensors, or .pt for TorchScript", out.display())))
+        }
     }
 }
 
 fn take(place: &Path, part: Part, snapshot: &Snapshot) -> Result<Exported> {
     let experiment = Experiment::from_toml("experiment.toml of the checkpoint", snapshot.text("experiment.toml")?)?;
     let progress: Progress =
-        serde_json::from_slice(snapshot.part("progress.json")?).context("the checkpoint's progress is damaged")?;
+        serde_json::from_slice(snapshot.part("progress.json")?).map_err(Error::json("the checkpoint's progress"))?;
     let name = |path: Option<&Path>| {
         path.and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
     };
     // RUN/checkpoints/NAME, wherever it was named from.
-    let place = std::path::absolute(place)?;
+    let place = std::path::absolute(place).map_err(Error::file("find", place))?;
     let source = Source {
         program: concat!(env!("CARGO_PKG_NAME"), " ", env!("CARGO_PKG_VERSION")).into(),
         run: name(place.ancestors().nth(2)),

@@ -4,12 +4,13 @@ use std::io::Write as _;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::{Context as _, Result, bail};
 use clap::Args;
 use comic_proto::{Access, chain};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
+
+use crate::error::{Error, Result};
 
 /// Asks a learner by the gRPC health protocol; where it wants client certificates, one has to be shown, and a token
 /// never. Exits with 0 if it serves, and with 1 whatever else is the case.
@@ -36,29 +37,31 @@ impl Health {
                 ExitCode::SUCCESS
             }
             Err(error) => {
-                eprintln!("comic-learner: {error:#}");
+                eprintln!("comic-learner: {}", chain(&error));
                 ExitCode::FAILURE
             }
         }
     }
 
     fn ask(&self) -> Result<()> {
-        let runtime =
-            tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start tokio")?;
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+        let runtime = runtime.map_err(Error::system("cannot start tokio"))?;
         runtime.block_on(async {
             let limit = Duration::from_secs(self.timeout);
-            tokio::time::timeout(limit, self.check()).await.with_context(|| format!("no answer in {limit:?}"))?
+            let answer = tokio::time::timeout(limit, self.check()).await;
+            answer.map_err(|_| Error::NoAnswer(format!("no answer in {limit:?}")))?
         })
     }
 
     async fn check(&self) -> Result<()> {
-        let channel = self.access.endpoint(&self.learner)?.connect().await?;
+        let channel = self.access.endpoint(&self.learner)?.connect().await;
+        let channel = channel.map_err(|error| Error::NoAnswer(chain(&error)))?;
         let request = HealthCheckRequest { service: "comic.v1.Learner".into() };
         let answer = HealthClient::new(channel).check(request).await;
-        let answer = answer.map_err(|status| anyhow::Error::msg(chain(&status)))?.into_inner();
+        let answer = answer.map_err(|status| Error::NoAnswer(chain(&status)))?.into_inner();
         match answer.status() {
             ServingStatus::Serving => Ok(()),
-            other => bail!("{} is {}", self.learner, other.as_str_name()),
+            other => Err(Error::NoAnswer(format!("{} is {}", self.learner, other.as_str_name()))),
         }
     }
 }

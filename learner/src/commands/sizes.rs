@@ -2,10 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use anyhow::{Result, anyhow};
 use comic_experiment::{Experiment, TaskSpec};
 use tch::Device;
 
+use crate::error::{Error, Result};
 use crate::options::Document;
 use crate::vmpo::VmpoLearner;
 
@@ -18,7 +18,8 @@ const PRESETS: [&str; 6] =
 /// # Errors
 /// When the experiment's networks cannot be built.
 pub fn count(experiment: &Experiment) -> Result<BTreeMap<&'static str, usize>> {
-    let spec = TaskSpec::new(experiment, vec!["clip".into()]).map_err(|name| anyhow!("no observation `{name}`"))?;
+    let spec = TaskSpec::new(experiment, vec!["clip".into()])
+        .map_err(|name| Error::Defect(format!("no observation `{name}`")))?;
     let learner = VmpoLearner::new(&spec, experiment, &vec![0.0; spec.action], Device::Cpu)?;
     let mut counts = BTreeMap::new();
     for (name, count) in learner.parameter_counts() {

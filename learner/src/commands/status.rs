@@ -4,7 +4,6 @@ use std::fmt::{self, Write as _};
 use std::io::{IsTerminal as _, Write as _};
 use std::time::Duration;
 
-use anyhow::{Context as _, Result};
 use clap::Args;
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{self, StatusRequest};
@@ -12,7 +11,7 @@ use comic_proto::{Access, chain, distrusted};
 use serde_json::{Value, json};
 use tonic::Code;
 
-use crate::error::Misuse;
+use crate::error::{Error, Result};
 
 /// How often `--watch` asks.
 const EVERY: Duration = Duration::from_secs(2);
@@ -40,10 +39,10 @@ impl Status {
     /// Asks and prints.
     ///
     /// # Errors
-    /// A learner that does not answer; [`Misuse`] if it refuses the token or one side the other's certificate.
+    /// A learner that does not answer; [`Error::Configuration`] if it refuses the token or one side the other's certificate.
     pub fn run(&self) -> Result<()> {
-        let runtime =
-            tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start tokio")?;
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+        let runtime = runtime.map_err(Error::system("cannot start tokio"))?;
         runtime.block_on(async {
             if !self.watch {
                 return print(&self.render(&self.ask().await?));
@@ -51,8 +50,8 @@ impl Status {
             loop {
                 match self.ask().await {
                     Ok(status) => self.show(&self.render(&status))?,
-                    Err(error) if error.is::<Misuse>() => return Err(error),
-                    Err(error) => self.show(&format!("{error:#}\n"))?,
+                    Err(error @ Error::Configuration(_)) => return Err(error),
+                    Err(error) => self.show(&format!("{}\n", chain(&error)))?,
                 }
                 tokio::select! {
                     () = tokio::time::sleep(EVERY) => {}
@@ -71,13 +70,14 @@ impl Status {
             answer.map_err(|status| self.judge(&status, status.code() == Code::Unauthenticated))
         };
         let answer = tokio::time::timeout(PATIENCE, call).await;
-        Ok(answer.with_context(|| format!("{} does not answer within {PATIENCE:?}", self.learner))??.into_inner())
+        let late = |_| Error::NoAnswer(format!("{} does not answer within {PATIENCE:?}", self.learner));
+        Ok(answer.map_err(late)??.into_inner())
     }
 
     /// What is refused now will be refused again.
-    fn judge(&self, error: &(dyn std::error::Error + 'static), refused: bool) -> anyhow::Error {
+    fn judge(&self, error: &(dyn std::error::Error + 'static), refused: bool) -> Error {
         let said = format!("{}: {}", self.learner, chain(error));
-        if refused || distrusted(error) { Misuse::new(said).into() } else { anyhow::Error::msg(said) }
+        if refused || distrusted(error) { Error::Configuration(said) } else { Error::NoAnswer(said) }
     }
 
     fn render(&self, status: &v1::Status) -> String {
@@ -93,7 +93,7 @@ impl Status {
 
 fn print(text: &str) -> Result<()> {
     let mut stdout = std::io::stdout();
-    stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()).context("cannot write to stdout")
+    stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()).map_err(Error::system("cannot write to stdout"))
 }
 
 fn metrics(status: &v1::Status) -> Value {

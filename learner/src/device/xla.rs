@@ -13,7 +13,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyList;
 use tch::Device;
 
-use crate::error::Misuse;
+use crate::error::Error;
 
 /// XLA in the terms of tch, which does not know it by name: see `xla.cpp`.
 pub(super) const DEVICE: Device = Device::Mps;
@@ -93,7 +93,7 @@ impl Plugin {
     pub(super) fn start(index: usize, precision: MatmulPrecision) -> Result<Self> {
         let packages = std::env::var(PACKAGES_VARIABLE).unwrap_or_else(|_| PACKAGES.to_string());
         if !Path::new(&packages).join("torch_xla").is_dir() {
-            return Err(Misuse::new(format!(
+            return Err(Error::configuration(format!(
                 "learner.device = \"xla:{index}\": there is no torch_xla in {packages}: `cargo xtask setup --xla`, or name its \
                  directory by {PACKAGES_VARIABLE}"
             ))
@@ -191,7 +191,7 @@ fn not_started(packages: &str, error: &PyErr) -> anyhow::Error {
         let number = error.value(python).getattr("errno");
         error.is_instance_of::<PyMemoryError>(python) || number.is_ok_and(|number| !number.is_none())
     });
-    if refused { anyhow!(said) } else { Misuse::new(said).into() }
+    if refused { anyhow!(said) } else { Error::configuration(said).into() }
 }
 
 /// What to say where there is no device of this number.
@@ -201,7 +201,7 @@ fn missing(index: usize, devices: &[String], problem: &str) -> anyhow::Error {
         format!("learner.device = \"xla:{index}\": PJRT has [{found}] {problem}; PJRT_DEVICE chooses (TPU, CPU)");
     // libtpu lets one process in: the learner before this one may still be on its way out. It says so in two ways.
     let busy = ["in use", "resource busy"].iter().any(|sign| problem.contains(sign));
-    if busy { anyhow!(said) } else { Misuse::new(said).into() }
+    if busy { anyhow!(said) } else { Error::configuration(said).into() }
 }
 
 impl Drop for Plugin {
@@ -223,9 +223,9 @@ mod tests {
             "The TPU is already in use by process with pid 7. Not attempting to load libtpu.so in this process.",
             "TPU initialization failed: open(/dev/vfio/0): Device or resource busy; Couldn't open iommu group /dev/vfio/0",
         ] {
-            assert!(!missing(0, &[], busy).is::<Misuse>(), "{busy}");
+            assert_eq!(Error::from(missing(0, &[], busy)).exit_code(), 1, "{busy}");
         }
-        assert!(missing(0, &[], "TPU initialization failed: no device found").is::<Misuse>());
-        assert!(missing(4, &["TPU:0".into()], "").is::<Misuse>());
+        assert_eq!(Error::from(missing(0, &[], "TPU initialization failed: no device found")).exit_code(), 2);
+        assert_eq!(Error::from(missing(4, &["TPU:0".into()], "")).exit_code(), 2);
     }
 }

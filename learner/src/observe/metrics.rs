@@ -14,8 +14,8 @@ use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
 use comic_replay::{AccountingByTask, Batch};
 use serde_json::{Map, Value, json};
 
+use crate::observe::evaluation::Evaluation;
 use crate::observe::tensorboard::Events;
-use crate::service::Evaluation;
 
 /// Sums since the last line.
 #[derive(Debug, Default)]
@@ -199,17 +199,17 @@ impl Metrics {
         writeln!(file, "{line}").with_context(|| format!("cannot write {}", path.display()))
     }
 
-    /// Counts what a batch held, whose unrolls are of these tasks, and says it by task.
-    pub fn count_rows(&mut self, batch: &Batch, tasks: &[usize]) -> Vec<Rows> {
+    /// Counts the rows of a batch and returns the counts of each task.
+    pub fn count_rows(&mut self, batch: &Batch) -> Vec<Rows> {
         let length = batch.layout.shape().length.max(1);
         self.window.tasks.resize(self.spec.tasks.len(), TaskWindow::default());
         let mut counted = vec![Rows::default(); self.spec.tasks.len()];
         let firsts = batch.f32(Field::First).chunks_exact(length + 1);
-        for ((valid, first), task) in batch.f32(Field::Valid).chunks_exact(length).zip(firsts).zip(tasks) {
+        for ((valid, first), task) in batch.f32(Field::Valid).chunks_exact(length).zip(firsts).zip(batch.tasks()) {
             let environment_steps = valid.iter().filter(|valid| **valid > 0.5).count() as u64;
             // Rows that begin an episode without a step.
             let padding = valid.iter().zip(first).filter(|(valid, first)| **valid < 0.5 && **first > 0.5).count();
-            if let (Some(window), Some(counted)) = (self.window.tasks.get_mut(*task), counted.get_mut(*task)) {
+            if let (Some(window), Some(counted)) = (self.window.tasks.get_mut(task), counted.get_mut(task)) {
                 window.unrolls += 1;
                 *counted += Rows { rows: length as u64, environment_steps, padding: padding as u64 };
             }
@@ -238,11 +238,11 @@ impl Metrics {
         for header in headers {
             window.unrolls += 1;
             window.age += version.saturating_sub(header.version);
+            let task = header.task as usize;
+            let max_reward = self.spec.tasks.get(task).map_or(1.0, |task| task.max_reward);
             for episode in &header.episodes {
-                let clip = episode.clip as usize;
-                let max_reward = self.spec.max_reward(clip);
                 window.episodes.add(episode, max_reward);
-                if let Some(task) = window.tasks.get_mut(self.spec.task_of(clip)) {
+                if let Some(task) = window.tasks.get_mut(task) {
                     task.episodes.add(episode, max_reward);
                 }
                 for (sum, value) in window.returns.iter_mut().zip(&episode.returns) {

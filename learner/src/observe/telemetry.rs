@@ -321,7 +321,7 @@ impl Default for Telemetry {
 
 impl Telemetry {
     /// Counts an update that took so long on unrolls of these ages.
-    pub(crate) fn count_update(&self, took: Duration, mut ages: Vec<u64>) {
+    pub fn count_update(&self, took: Duration, mut ages: Vec<u64>) {
         self.updates.inc();
         self.update_seconds.observe(took.as_secs_f64());
         for age in &ages {

@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::Result;
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
@@ -11,7 +10,7 @@ use rustls::{RootCertStore, ServerConfig};
 use tokio_rustls::TlsAcceptor;
 
 use super::watched::Watched;
-use crate::error::Misuse;
+use crate::error::{Error, Result};
 
 /// Certificates that are read again when they change.
 #[derive(Debug)]
@@ -21,11 +20,11 @@ impl Tls {
     /// Serves with this certificate chain; with an authority for clients, only those get in that it signed.
     ///
     /// # Errors
-    /// [`Misuse`] when a file cannot be read or used.
+    /// [`Error::Configuration`] when a file cannot be read or used.
     pub fn new(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Self> {
         let (cert, key, client_ca) = (cert.to_path_buf(), key.to_path_buf(), client_ca.map(Path::to_path_buf));
         let files: Vec<PathBuf> = [&cert, &key].into_iter().chain(&client_ca).cloned().collect();
-        let watched = Watched::new(files, move || Ok(configuration(&cert, &key, client_ca.as_deref())?))?;
+        let watched = Watched::new(files, move || configuration(&cert, &key, client_ca.as_deref()))?;
         Ok(Self(watched))
     }
 
@@ -35,10 +34,10 @@ impl Tls {
     }
 }
 
-fn configuration(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<ServerConfig, Misuse> {
+fn configuration(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<ServerConfig> {
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let unusable = |error: rustls::Error| {
-        Misuse::new(format!("the certificate {} cannot be used with its key: {error}", cert.display()))
+        Error::configuration(format!("the certificate {} cannot be used with its key: {error}", cert.display()))
     };
     let builder = ServerConfig::builder_with_provider(provider.clone())
         .with_safe_default_protocol_versions()
@@ -47,7 +46,7 @@ fn configuration(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Se
         None => builder.with_no_client_auth(),
         Some(ca) => {
             let unusable = |error: &dyn std::fmt::Display| {
-                Misuse::new(format!("the clients' authority {} cannot be used: {error}", ca.display()))
+                Error::configuration(format!("the clients' authority {} cannot be used: {error}", ca.display()))
             };
             let mut roots = RootCertStore::empty();
             for certificate in certificates(ca)? {
@@ -58,7 +57,7 @@ fn configuration(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Se
         }
     };
     let private = PrivateKeyDer::from_pem_file(key)
-        .map_err(|error| Misuse::new(format!("the key {} cannot be read: {error}", key.display())))?;
+        .map_err(|error| Error::configuration(format!("the key {} cannot be read: {error}", key.display())))?;
     let mut configuration = builder.with_single_cert(certificates(cert)?, private).map_err(unusable)?;
     configuration.alpn_protocols = vec![b"h2".to_vec()];
     // Every connection proves itself anew: a resumed session would outlive its certificate. Actors connect rarely.
@@ -67,12 +66,12 @@ fn configuration(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Se
     Ok(configuration)
 }
 
-fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, Misuse> {
-    let unusable = |error| Misuse::new(format!("the certificate {} cannot be read: {error}", path.display()));
+fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>> {
+    let unusable = |error| Error::configuration(format!("the certificate {} cannot be read: {error}", path.display()));
     let found: Vec<_> =
         CertificateDer::pem_file_iter(path).map_err(unusable)?.collect::<Result<_, _>>().map_err(unusable)?;
     if found.is_empty() {
-        return Err(Misuse::new(format!("{} holds no certificate", path.display())));
+        return Err(Error::configuration(format!("{} holds no certificate", path.display())));
     }
     Ok(found)
 }

@@ -2,12 +2,12 @@
 
 use std::path::Path;
 
-use anyhow::Result;
 use comic_proto::Token;
 use sha2::{Digest as _, Sha256};
 use subtle::{Choice, ConstantTimeEq as _};
 
 use super::watched::Watched;
+use crate::error::Result;
 
 /// The tokens of a file, or the one of the environment; only their SHA-256 is kept.
 #[derive(Debug)]
@@ -17,7 +17,7 @@ impl Tokens {
     /// The tokens in `file`, which may change later, or the one in `COMIC_TOKEN`; `None` without either.
     ///
     /// # Errors
-    /// [`AccessError`](comic_proto::AccessError) when there is no usable token where there should be.
+    /// [`Error::Access`](crate::error::Error::Access) when there is no usable token where there should be.
     pub fn new(file: Option<&Path>) -> Result<Option<Self>> {
         let path = file.map(Path::to_path_buf);
         let files = path.iter().cloned().collect();

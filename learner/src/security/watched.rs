@@ -3,9 +3,12 @@
 use std::fmt;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
-use anyhow::Result;
+use comic_proto::chain;
+use parking_lot::Mutex;
+
+use crate::error::Result;
 
 /// What tells one state of a file from another: device, inode, size, and the times of the last changes.
 type Stamp = Option<[i64; 7]>;
@@ -30,7 +33,7 @@ impl<T> Watched<T> {
 
     /// The value of the files as they are now, or the last one that could be used.
     pub(super) fn current(&self) -> Arc<T> {
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = self.state.lock();
         // Before the files are read: a change in between is noticed the next time.
         let stamps = stamps(&self.files);
         if state.0 != stamps {
@@ -41,7 +44,7 @@ impl<T> Watched<T> {
                     tracing::info!(files = ?self.files, "changed files are in use");
                 }
                 Err(error) => {
-                    tracing::error!(files = ?self.files, "changed files cannot be used, the old ones stay: {error:#}");
+                    tracing::error!(files = ?self.files, "changed files cannot be used, the old ones stay: {}", chain(&error));
                 }
             }
         }
@@ -67,9 +70,8 @@ impl<T> fmt::Debug for Watched<T> {
 
 #[cfg(test)]
 mod tests {
-    use anyhow::ensure;
-
     use super::*;
+    use crate::error::Error;
 
     #[test]
     fn a_change_counts_at_once_and_a_bad_one_changes_nothing() {
@@ -78,7 +80,10 @@ mod tests {
         std::fs::write(&path, "1").unwrap();
         let read = {
             let path = path.clone();
-            move || Ok(std::fs::read_to_string(&path)?.parse::<u32>()?)
+            move || {
+                let text = std::fs::read_to_string(&path).map_err(Error::file("read", &path))?;
+                text.parse::<u32>().map_err(|error| Error::configuration(error.to_string()))
+            }
         };
         let watched = Watched::new(vec![path.clone()], read).unwrap();
         assert_eq!(*watched.current(), 1);
@@ -94,10 +99,7 @@ mod tests {
 
     #[test]
     fn the_first_reading_has_to_succeed() {
-        let load = || {
-            ensure!(false, "unusable");
-            Ok(())
-        };
+        let load = || Err::<(), _>(Error::configuration("unusable"));
         assert!(Watched::new(Vec::new(), load).is_err());
     }
 }

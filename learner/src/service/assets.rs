@@ -26,7 +26,7 @@ pub(super) async fn open(
     sha256: &[u8],
 ) -> Result<impl Stream<Item = Result<AssetChunk, Status>> + use<>, Status> {
     let Some(asset) = shared.assets.iter().find(|asset| asset.sha256 == sha256).cloned() else {
-        let hash: String = sha256.iter().take(32).map(|byte| format!("{byte:02x}")).collect();
+        let hash = hex::encode(&sha256[..sha256.len().min(32)]);
         return Err(Status::not_found(format!("this learner has no asset with the SHA-256 {hash}")));
     };
     let path = asset.path.clone();

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use comic_experiment::seed;
 use comic_proto::v1::learner_server::Learner;
 use comic_proto::v1::{
     self, AssetChunk, AssetRequest, Environments, EvaluationAck, EvaluationReport, JoinReply, JoinRequest,
@@ -15,7 +16,8 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::assignments::{Assignment, Denied};
 use super::roster::Admission;
-use super::{Evaluation, Shared, assets, status};
+use super::{Shared, assets, status};
+use crate::observe::evaluation::Evaluation;
 
 /// Bytes of an actor's name, as many as a host's can have.
 const NAME_LIMIT: usize = 253;
@@ -99,7 +101,7 @@ impl Learner for Calls {
         Ok(Response::new(JoinReply {
             learner_epoch: epoch,
             actor: joined.actor,
-            seed: derived_seed(shared.seed, index),
+            seed: seed::derive(shared.seed, index),
             experiment: shared.experiment.clone(),
             task_spec: shared.task_spec.clone(),
             assets: shared.assets.iter().map(assets::described).collect(),
@@ -179,13 +181,4 @@ fn environments_of(shared: &Shared, request: &JoinRequest) -> Result<Option<Envi
         tracing::warn!(?environments, "begun anew by another actor: from here on this run is not what its seed gives");
     }
     Ok(Some(Environments { first: environments.start, count: environments.len() as u32 }))
-}
-
-/// The seed of an actor, or in lockstep of a life of the learner: the same for the same index of the same experiment,
-/// whatever process has it (SplitMix64).
-fn derived_seed(experiment: u64, index: u64) -> u64 {
-    let mut z = experiment.wrapping_add(index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15));
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
 }

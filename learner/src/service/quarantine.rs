@@ -10,12 +10,12 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
-use anyhow::{Context as _, Result};
 use clap::Args;
 use comic_proto::v1::UnrollHeader;
-use comic_proto::{Invalid, Pieces};
+use comic_proto::{Invalid, Pieces, chain};
 use serde_json::json;
 
+use crate::error::{Error, Result};
 use crate::log_limiter::LogLimiter;
 use crate::observe::telemetry::Telemetry;
 
@@ -62,8 +62,8 @@ impl Quarantine {
     /// When the directory cannot be made or read, or the system gives no thread.
     pub(crate) fn start(options: &QuarantineOptions, telemetry: &Arc<Telemetry>) -> Result<Option<Self>> {
         let Some(directory) = options.quarantine.clone() else { return Ok(None) };
-        fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
-        let taken = taken(&directory).with_context(|| format!("cannot list {}", directory.display()))?;
+        fs::create_dir_all(&directory).map_err(Error::file("make", &directory))?;
+        let taken = taken(&directory).map_err(Error::file("list", &directory))?;
         let (queue, refused) = sync_channel(QUEUE);
         let mut cell = Cell { room: options.quarantine_bytes.saturating_sub(taken), directory };
         let thread = std::thread::Builder::new()
@@ -72,7 +72,7 @@ impl Quarantine {
                 let telemetry = telemetry.clone();
                 move || cell.keep_all(&refused, &telemetry)
             })
-            .context("cannot start the quarantine's thread")?;
+            .map_err(Error::system("cannot start the quarantine's thread"))?;
         Ok(Some(Self { queue: Some(queue), thread: Some(thread), telemetry: telemetry.clone() }))
     }
 
@@ -114,7 +114,7 @@ impl Cell {
                 Ok(false) => "full",
                 Err(error) => {
                     if let Some(unreported) = log_limiter.due(()) {
-                        tracing::error!(unreported, "a refused unroll is not kept: {error:#}");
+                        tracing::error!(unreported, "a refused unroll is not kept: {}", chain(&error));
                     }
                     "failed"
                 }
@@ -126,7 +126,7 @@ impl Cell {
     /// False when there is no room.
     fn keep(&mut self, refused: &Refused) -> Result<bool> {
         let Refused { header, payload, reason } = refused;
-        let hash: String = header.layout_hash.iter().take(HASH).map(|byte| format!("{byte:02x}")).collect();
+        let hash = hex::encode(&header.layout_hash[..header.layout_hash.len().min(HASH)]);
         let label = json!({
             "reason": reason,
             "actor": header.actor,
@@ -134,7 +134,7 @@ impl Cell {
             "sequence": header.sequence,
             "learner_epoch": header.learner_epoch,
             "version": header.version,
-            "demonstration": header.demonstration,
+            "behaviour": header.behaviour().as_str_name(),
             "layout_hash": hash,
             "episodes": header.episodes.len(),
             "payload_bytes": payload.len(),
@@ -152,7 +152,7 @@ impl Cell {
         } else {
             self.room = room;
         }
-        written.map(|()| true).with_context(|| format!("cannot write {}", path.display()))
+        written.map(|()| true).map_err(Error::file("write", path))
     }
 }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::Bytes;
-use comic_proto::v1::{UnrollAck, UnrollHeader, Verdict};
+use comic_proto::v1::{Behaviour, UnrollAck, UnrollHeader, Verdict};
 use comic_proto::{Expected, Invalid, ReceivedUnroll, frame, validate};
 use comic_replay::Outcome;
 use tonic::Status;
@@ -160,7 +160,10 @@ fn out_of_time(header: &UnrollHeader, shared: &Shared) -> (Verdict, String) {
     if header.learner_epoch != epoch {
         return (Verdict::Rejoin, format!("made in learner epoch {}, this is {epoch}", header.learner_epoch));
     }
-    let wanted = if shared.batcher.phase().demonstration { "demonstrations" } else { "the policy's own unrolls" };
+    let wanted = match shared.batcher.phase().behaviour {
+        Behaviour::Demonstration => "demonstrations",
+        Behaviour::Policy | Behaviour::Unspecified => "the policy's own unrolls",
+    };
     (Verdict::Superseded, format!("the learner wants {wanted} now"))
 }
 

@@ -1,19 +1,13 @@
 //! From a batch as the wire has it to minibatches on the device.
 
 use anyhow::Result;
-use comic_experiment::TaskSpec;
-use comic_proto::Field;
+use comic_proto::{Field, PerField};
 use comic_replay::Batch;
 use rand::seq::SliceRandom as _;
 
+use crate::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
+use crate::algorithm::shape::MinibatchShape;
 use crate::train::trainer::Trainer;
-use crate::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors};
-
-/// The task of each unroll: that of its clips.
-pub(crate) fn tasks_of_unrolls(batch: &Batch, spec: &TaskSpec) -> Vec<usize> {
-    let rows = batch.layout.rows(Field::Clip).max(1);
-    batch.clip().iter().step_by(rows).map(|clip| spec.task_of(*clip as usize)).collect()
-}
 
 impl Trainer {
     /// The batch on the device, `[B, T(+1), …]`.
@@ -23,27 +17,10 @@ impl Trainer {
 
     /// The same, of which only those rows count, `[B, T]`, whose `valid` is 1.
     pub(crate) fn masked_tensors(&self, batch: &Batch, valid: &[f32]) -> Result<MinibatchTensors> {
-        let tasks = tasks_of_unrolls(batch, &self.spec);
         let shape =
             MinibatchShape { unrolls: batch.unrolls, tasks: self.spec.tasks.len(), unroll: *batch.layout.shape() };
-        let source = MinibatchSource {
-            proprioception: batch.f32(Field::Proprioception),
-            task: batch.f32(Field::Task),
-            previous_latent: batch.f32(Field::PreviousLatent),
-            latent_noise: batch.f32(Field::LatentNoise),
-            action: batch.f32(Field::Action),
-            mean: batch.f32(Field::Mean),
-            std: batch.f32(Field::Std),
-            log_weights: batch.f32(Field::LogWeights),
-            reward: batch.f32(Field::Reward),
-            discount: batch.f32(Field::Discount),
-            valid,
-            first: batch.f32(Field::First),
-            state: batch.f32(Field::State),
-            clip: batch.clip(),
-            image: batch.image(),
-            tasks: &tasks,
-        };
+        let floats = PerField::from_fn(|field| if field == Field::Valid { valid } else { batch.f32(field) });
+        let source = MinibatchSource { floats, clip: batch.clip(), image: batch.image(), tasks: &batch.tasks() };
         Ok(MinibatchTensors::new(&source, &shape, self.learner.device())?)
     }
 

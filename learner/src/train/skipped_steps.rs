@@ -3,9 +3,10 @@
 use anyhow::{Result, bail};
 use serde_json::{Map, Value, json};
 
+use crate::algorithm::Algorithm as _;
+use crate::algorithm::losses::LossValues;
 use crate::log_limiter::LogLimiter;
 use crate::train::trainer::Trainer;
-use crate::vmpo;
 
 /// Counts skipped steps. Too many in a row lead back to the last good state; as many again, before as many were taken,
 /// are the end: what goes wrong then goes wrong there too.
@@ -57,8 +58,8 @@ impl Trainer {
     ///
     /// # Errors
     /// When the way back was taken already and led nowhere.
-    pub(crate) fn report(&mut self, losses: &vmpo::LossValues) -> Result<bool> {
-        let vmpo::LossValues { steps, skipped, skipped_last, .. } = *losses;
+    pub(crate) fn report(&mut self, losses: &LossValues) -> Result<bool> {
+        let LossValues { steps, skipped, skipped_last, .. } = *losses;
         let update = self.progress.updates;
         self.count_skipped(skipped);
         if skipped > 0 && self.skipped_steps.log_limiter.due(()).is_some() {
@@ -97,9 +98,9 @@ impl Trainer {
         Ok(())
     }
 
-    fn shown(&self, losses: &vmpo::LossValues) -> Map<String, Value> {
+    fn shown(&self, losses: &LossValues) -> Map<String, Value> {
         let mut shown: Map<_, _> =
-            losses.entries().into_iter().map(|(name, value)| (name.to_string(), json!(value))).collect();
+            losses.entries().iter().map(|(name, value)| ((*name).to_string(), json!(value))).collect();
         if self.spec.tasks.len() > 1 && losses.temperatures.len() == self.spec.tasks.len() {
             let names = self.spec.tasks.iter().map(|task| task.name.clone());
             let temperatures: Map<_, _> = names.zip(losses.temperatures.iter().map(|eta| json!(eta))).collect();

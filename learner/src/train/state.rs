@@ -7,6 +7,7 @@ use anyhow::{Context as _, Result};
 use bytes::Bytes;
 use comic_networks::to_safetensors;
 
+use crate::algorithm::Algorithm as _;
 use crate::checkpoint::{Name, PROGRESS, Snapshot};
 use crate::service::memory::{Bounds, Sizes};
 use crate::train::trainer::{Progress, Trainer};

@@ -38,11 +38,12 @@ impl ObservationStatistics {
         tasks.iter().any(|task| self.tasks.get(*task).is_some_and(|(_, statistics)| statistics.count() == 0.0))
     }
 
-    /// Adds the observations of a batch whose unrolls are of these tasks.
+    /// Adds the observations of a batch.
     ///
     /// Where there are several tasks, a row that begins an episode counts only if a step follows it: the others may be
     /// padding.
-    pub fn absorb(&mut self, batch: &Batch, tasks: &[usize]) {
+    pub fn absorb(&mut self, batch: &Batch) {
+        let tasks = batch.tasks();
         let length = batch.layout.shape().length;
         let (valid, first) = (batch.f32(Field::Valid), batch.f32(Field::First));
         let alone = self.tasks.len() == 1;
@@ -218,19 +219,19 @@ mod tests {
         let mut experiment = resolve("tracking-mlp", &["unroll.length=3".into()]).unwrap();
         experiment.network.latent.size = 1;
         let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, &experiment)));
-        let unroll = |observations: [f32; 4], clip: u32, padded: bool| {
+        let unroll = |observations: [f32; 4], task: u32, padded: bool| {
             let mut unroll = UnrollBuffer::new(&layout);
             for (t, observation) in observations.into_iter().enumerate() {
                 unroll.row_mut(Field::Proprioception, t)[0] = observation;
                 unroll.row_mut(Field::Task, t)[0] = observation;
-                unroll.set_clip(t, clip);
+                unroll.set_clip(t, task);
             }
             unroll.row_mut(Field::Valid, 0)[0] = 1.0;
             for t in 1..3 {
                 unroll.row_mut(Field::Valid, t)[0] = if padded { 0.0 } else { 1.0 };
                 unroll.row_mut(Field::First, t + 1)[0] = if padded { 1.0 } else { 0.0 };
             }
-            (UnrollHeader::default(), unroll.into_bytes())
+            (UnrollHeader { task, ..UnrollHeader::default() }, unroll.into_bytes())
         };
         let unrolls = [unroll([1.0, 2.0, 3.0, 2.0], 0, false), unroll([10.0, 30.0, 99.0, 99.0], 1, true)];
         Batch::assemble(layout.clone(), unrolls).unwrap()
@@ -241,7 +242,7 @@ mod tests {
         let spec = spec();
         let mut statistics = ObservationStatistics::new(&spec);
         assert!(statistics.lacks(&[1]));
-        statistics.absorb(&batch(&spec), &[0, 1]);
+        statistics.absorb(&batch(&spec));
         let normaliser = statistics.to_normaliser().unwrap();
         assert_eq!(normaliser.task_mean, [2.0, 20.0]);
         assert!((normaliser.proprioception_mean[0] - 8.0).abs() < 1e-5, "{normaliser:?}");
@@ -253,7 +254,7 @@ mod tests {
     fn a_checkpoint_brings_them_back() {
         let spec = spec();
         let mut statistics = ObservationStatistics::new(&spec);
-        statistics.absorb(&batch(&spec), &[0, 1]);
+        statistics.absorb(&batch(&spec));
         let mut state = statistics.state();
         state.push(("policy".into(), Tensor::from(1.0)));
         let mut restored = ObservationStatistics::new(&spec);
@@ -269,7 +270,7 @@ mod tests {
         let (spec, run) = (spec(), tempfile::tempdir().unwrap());
         let mut metrics = crate::observe::metrics::Metrics::open(run.path(), &spec).unwrap();
         let rows = |environment_steps, padding| crate::observe::metrics::Rows { rows: 3, environment_steps, padding };
-        assert_eq!(metrics.count_rows(&batch(&spec), &[0, 1]), [rows(3, 0), rows(1, 1)]);
+        assert_eq!(metrics.count_rows(&batch(&spec)), [rows(3, 0), rows(1, 1)]);
         let position =
             crate::observe::metrics::Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
         let mut accounting = comic_replay::AccountingByTask::default();

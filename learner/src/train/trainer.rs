@@ -15,16 +15,17 @@ use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use crate::algorithm::Algorithm as _;
+use crate::algorithm::losses::Losses;
 use crate::checkpoint::{Name, Snapshot, Store, incompatible};
 use crate::device::Backend;
 use crate::observe::metrics::{Metrics, Position};
 use crate::publish::Publisher;
 use crate::service::Shared;
-use crate::train::minibatches::tasks_of_unrolls;
 use crate::train::skipped_steps::SkippedSteps;
 use crate::train::statistics::ObservationStatistics;
 use crate::train::writer::Writer;
-use crate::vmpo::{Losses, VmpoLearner};
+use crate::vmpo::VmpoLearner;
 
 /// How often a trainer without batches looks at the clock.
 const PATIENCE: std::time::Duration = std::time::Duration::from_millis(500);
@@ -210,7 +211,7 @@ impl Trainer {
         let began = Instant::now();
         let _update = tracing::debug_span!("update", update = self.progress.updates + 1).entered();
         let tensors = tracing::debug_span!("to_device").in_scope(|| self.tensors(&batch))?;
-        let unseen = self.normalises() && self.statistics.lacks(&tasks_of_unrolls(&batch, &self.spec));
+        let unseen = self.normalises() && self.statistics.lacks(&batch.tasks());
         if unseen || self.normalises_still() {
             self.absorb(&batch);
             self.set_normaliser()?;
@@ -298,8 +299,7 @@ impl Trainer {
 
     /// Counts a batch's steps and diverged episodes, and gives its memory back.
     pub(crate) fn book(&mut self, batch: Batch) {
-        let tasks = tasks_of_unrolls(&batch, &self.spec);
-        for (rows, task) in self.metrics.count_rows(&batch, &tasks).into_iter().zip(&self.spec.tasks) {
+        for (rows, task) in self.metrics.count_rows(&batch).into_iter().zip(&self.spec.tasks) {
             self.progress.environment_steps += rows.environment_steps;
             self.shared.telemetry.count_rows(&task.name, rows);
         }
@@ -339,8 +339,7 @@ impl Trainer {
     /// Tells actors and batcher of the newest version, for instance after a restart.
     fn announce(&self, behaviour: Behaviour) {
         let version = self.progress.version;
-        let demonstration = behaviour == Behaviour::Demonstrate;
-        self.batcher.set_phase(Phase { epoch: self.epoch, version, oldest: self.oldest, demonstration });
+        self.batcher.set_phase(Phase { epoch: self.epoch, version, oldest: self.oldest, behaviour });
         self.publisher.publish(version, behaviour, &self.target);
     }
 
@@ -353,7 +352,7 @@ impl Trainer {
     }
 
     pub(crate) fn absorb(&mut self, batch: &Batch) {
-        self.statistics.absorb(batch, &tasks_of_unrolls(batch, &self.spec));
+        self.statistics.absorb(batch);
     }
 
     pub(crate) fn set_normaliser(&mut self) -> Result<()> {

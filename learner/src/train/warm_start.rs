@@ -8,10 +8,11 @@ use comic_proto::v1::Behaviour;
 use rand::Rng;
 use rand::seq::index::sample;
 
+use crate::algorithm::Algorithm as _;
+use crate::algorithm::losses::Losses;
+use crate::algorithm::minibatch::MinibatchTensors;
 use crate::checkpoint::Name;
-use crate::train::minibatches::tasks_of_unrolls;
 use crate::train::trainer::{Trainer, Wait};
-use crate::vmpo::{Losses, MinibatchTensors};
 
 /// Which unrolls of a batch demonstrate something; the others are masked.
 #[derive(Debug)]
@@ -57,7 +58,7 @@ impl Trainer {
     /// Gathers demonstrations, regresses on them, and leaves the checkpoint `warm-started`. `None` when the learner was
     /// asked to stop meanwhile; the warm start then begins anew next time.
     pub(crate) fn warm_start(&mut self) -> Result<Option<()>> {
-        self.publish(Behaviour::Demonstrate)?;
+        self.publish(Behaviour::Demonstration)?;
         tracing::info!(steps = self.experiment.warm_start.demonstration_steps, "gathering demonstrations");
         let Some(mut demonstrations) = self.gather()? else { return Ok(None) };
         if self.experiment.network.normaliser_steps > 0 {
@@ -77,7 +78,12 @@ impl Trainer {
                 && let Some(losses) = Losses::mean(&std::mem::take(&mut unreported))
             {
                 let losses = losses.to_values();
-                tracing::info!(step, regression = losses.regression_loss, latent_kl = losses.latent_kl, "regressing");
+                tracing::info!(
+                    step,
+                    regression = losses.get("regression_loss"),
+                    latent_kl = losses.get("latent_kl"),
+                    "regressing"
+                );
                 if self.report(&losses)? {
                     step = 0;
                     continue;
@@ -106,7 +112,7 @@ impl Trainer {
             match self.next_batch()? {
                 Wait::Batch(batch) => {
                     // What has no reference has nothing to demonstrate: holding still is no example.
-                    let demonstrated = Demonstrated::among(&tasks_of_unrolls(&batch, &self.spec), |task| {
+                    let demonstrated = Demonstrated::among(&batch.tasks(), |task| {
                         self.spec.tasks.get(task).is_some_and(|task| task.demonstrated)
                     });
                     if !demonstrated.unrolls.is_empty() {
@@ -117,7 +123,7 @@ impl Trainer {
                     self.absorb(&batch);
                     self.metrics.absorb(batch.headers(), 0);
                     if (demonstrations.len() as u64) < wanted {
-                        self.keep_step(Behaviour::Demonstrate);
+                        self.keep_step(Behaviour::Demonstration);
                     }
                     self.book(batch);
                 }

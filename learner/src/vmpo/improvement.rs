@@ -3,9 +3,9 @@
 use comic_experiment::Vmpo;
 use tch::{Kind, Tensor};
 
-use super::Multipliers;
+use crate::vmpo::multipliers::Multipliers;
 
-/// What the losses are made of: one number a step, every tensor of the same shape.
+/// The inputs of the losses: one number a step, every tensor of the same shape.
 #[derive(Debug)]
 pub struct Evidence<'a> {
     /// ln π(a|s), of the unclipped action, under the current parameters.
@@ -20,11 +20,11 @@ pub struct Evidence<'a> {
     pub kl_weights: Option<&'a Tensor>,
     /// 1 where the step is a transition; a step with 0 has no influence, whatever its other numbers are.
     pub valid: &'a Tensor,
-    /// The steps that each E-step ranks, booleans: as many as there are ηs, and no step in two of them.
+    /// The steps that each E-step ranks, booleans: one group for each η, and no step is in two groups.
     pub groups: &'a [Tensor],
 }
 
-/// V-MPO's limits.
+/// V-MPO's limits on the KLs, and the fraction of the steps that it ranks highest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KlLimits {
     /// ε_η.
@@ -35,7 +35,7 @@ pub struct KlLimits {
     pub epsilon_std: f64,
     /// ε_discrete.
     pub epsilon_discrete: f64,
-    /// Assignment of the valid steps in D̃.
+    /// Fraction of the valid steps in D̃.
     pub top_fraction: f64,
 }
 
@@ -83,8 +83,8 @@ impl Improvement {
 /// - L_η = η ε_η + η ln(1/|D̃| Σ_{D̃} exp(A/η)).
 /// - L_α = Σ_k α_k (ε_k − sg KL_k) + sg(α_k) KL_k, KL_k the mean over all valid steps.
 ///
-/// Several groups have a D̃ and an η each, and L_π and L_η are their means, weighed by their assignments of the valid steps
-/// (D): a step counts the same whatever it is grouped with, and a group without a step has no influence.
+/// Each group has its own D̃ and η. L_π and L_η are the means over the groups, weighted by each group's fraction of the
+/// valid steps (D). So a step counts the same whatever its group, and a group without a step has no influence.
 pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits: &KlLimits) -> Improvement {
     let mask = evidence.valid.gt(0.5);
     let (policy, temperature) = expectation_steps(evidence, &mask, multipliers, limits);
@@ -130,8 +130,8 @@ fn expectation_step(evidence: &Evidence, mask: &Tensor, eta: &Tensor, limits: &K
     let advantage = evidence.advantage.detach();
     let selected = top(&advantage, mask, limits.top_fraction);
     let scaled = &advantage / eta;
-    // Subtracting the maximum is what makes this a log-sum-exp. Where no step is valid it is 0: what it would be otherwise is no
-    // number on a CPU, and on XLA the least one that there is, which is finite and overflows below.
+    // The log-sum-exp subtracts the maximum. If no step is valid, the maximum is set to 0. Otherwise it would be −∞ on a CPU,
+    // which gives NaN, and the smallest finite number on XLA, which overflows below.
     let maximum = scaled.detach().where_scalarother(&selected, f64::NEG_INFINITY).max();
     let maximum = maximum.where_scalarother(&selected.any(), 0.0);
     let exponentials = (&scaled - &maximum).where_scalarother(&selected, f64::NEG_INFINITY).exp();

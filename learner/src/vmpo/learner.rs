@@ -1,17 +1,20 @@
 //! Networks, multipliers and optimiser, stepped together.
 
-use comic_experiment::{Experiment, Network, Optimiser, Prior, TaskSpec, Vmpo};
-use comic_networks::{Acting, ActionDistribution, Memory, NormaliserStatistics, Policy, Routing, Value};
-use comic_proto::UnrollShape;
+use comic_experiment::{Experiment, Prior, TaskSpec};
+use comic_networks::{Acting, ActionDistribution, NormaliserStatistics, Policy, RecurrentState, Value, to_safetensors};
+use comic_proto::{Field, UnrollShape};
 use tch::{Device, Kind, Tensor, nn};
 
-use super::error::Error;
-use super::stores::{named, trainable};
-use super::{
-    Evidence, Improvement, KlLimits, Losses, MinibatchShape, MinibatchTensors, Multipliers, masked_mean,
-    policy_improvement, returns,
-};
 use crate::adam::{self, Adam};
+use crate::algorithm::Algorithm;
+use crate::algorithm::error::Error;
+use crate::algorithm::losses::Losses;
+use crate::algorithm::minibatch::MinibatchTensors;
+use crate::algorithm::shape::MinibatchShape;
+use crate::vmpo::improvement::{Evidence, Improvement, KlLimits, masked_mean, policy_improvement};
+use crate::vmpo::multipliers::Multipliers;
+use crate::vmpo::returns::returns;
+use crate::vmpo::stores::{named, trainable};
 
 /// The online networks, the multipliers and Adam.
 ///
@@ -20,10 +23,7 @@ use crate::adam::{self, Adam};
 #[derive(Debug)]
 pub struct VmpoLearner {
     spec: TaskSpec,
-    network: Network,
-    vmpo: Vmpo,
-    optimiser: Optimiser,
-    limits: KlLimits,
+    experiment: Experiment,
     policy_store: nn::VarStore,
     value_store: nn::VarStore,
     policy: Policy,
@@ -47,15 +47,15 @@ struct Pass {
     valid: Tensor,
     /// The steps that each E-step ranks, `[N]` booleans; together all of them.
     groups: Vec<Tensor>,
-    /// Assignment of the rows that are transitions.
-    share: Tensor,
+    /// Fraction of the rows that are transitions.
+    valid_share: Tensor,
     /// ½ mean (V − G)², summed over the reward terms.
     value_loss: Tensor,
     /// Mean KL to the prior, nats a step.
     latent_kl: Tensor,
 }
 
-/// What became of gradients.
+/// The result of applying gradients.
 struct Descent {
     /// Global norm of the networks' gradients before clipping.
     norm: Tensor,
@@ -64,8 +64,8 @@ struct Descent {
 }
 
 impl VmpoLearner {
-    /// New networks on `device`, from libtorch's generator on the CPU: call `tch::manual_seed` first, and they are the same
-    /// on every device. `pose` is the action at which the policy's mean starts, A entries.
+    /// New networks on `device`. Their first values come from libtorch's generator on the CPU, so after `tch::manual_seed`
+    /// they are the same on every device. `pose` is the action at which the policy's mean starts, A entries.
     ///
     /// # Errors
     /// [`Error::Networks`] when `pose` is no action of this task.
@@ -95,10 +95,7 @@ impl VmpoLearner {
         let multipliers_group = adam.add_group("multipliers", multiplier, optimiser.multiplier_learning_rate);
         Ok(Self {
             spec: spec.clone(),
-            network: network.clone(),
-            vmpo: vmpo.clone(),
-            optimiser: optimiser.clone(),
-            limits: KlLimits::from(vmpo),
+            experiment: experiment.clone(),
             policy_store,
             value_store,
             policy,
@@ -125,17 +122,9 @@ impl VmpoLearner {
         &self.multipliers
     }
 
-    /// The device everything lives on.
+    /// The device of all tensors.
     pub fn device(&self) -> Device {
         self.policy_store.device()
-    }
-
-    /// Fixes the statistics by which observations are normalised.
-    ///
-    /// # Errors
-    /// [`Error::Networks`] when they do not fit the task.
-    pub fn set_normaliser(&mut self, statistics: &NormaliserStatistics) -> Result<(), Error> {
-        Ok(self.policy.set_normaliser(statistics)?)
     }
 
     /// Sets the learning rates of the networks and of the multipliers, until they are set again.
@@ -144,99 +133,11 @@ impl VmpoLearner {
         self.adam.set_learning_rate(self.multipliers_group, multipliers);
     }
 
-    /// Forgets Adam's moments, as between a warm start and V-MPO.
-    pub fn reset_optimiser(&mut self) {
-        self.adam.reset();
-    }
-
-    /// One gradient step of V-MPO. It is skipped when the loss or a gradient is not finite: the report says so, and
-    /// nothing is changed.
-    ///
-    /// # Errors
-    /// [`Error::Shape`] when the minibatch is another task's; nothing is changed then.
-    pub fn step(&mut self, minibatch: &MinibatchTensors) -> Result<Losses, Error> {
-        self.check(minibatch)?;
-        let pass = self.forward(minibatch);
-        let advantage = (&pass.targets - pass.values.detach()).sum_dim_intlist(-1i64, false, Kind::Float);
-        let policy = &pass.acting.action;
-        let kl_weights = policy.kl_weights(&pass.behaviour);
-        let evidence = Evidence {
-            log_prob: &policy.log_prob(&rows(&minibatch.action)),
-            advantage: &advantage,
-            kl_mean: &policy.kl_mean(&pass.behaviour),
-            kl_std: &policy.kl_std(&pass.behaviour),
-            kl_weights: kl_weights.as_ref(),
-            valid: &pass.valid,
-            groups: &pass.groups,
-        };
-        let improvement = policy_improvement(&evidence, &self.multipliers, &self.limits);
-        let mut total = improvement.total()
-            + &pass.value_loss * self.vmpo.value_weight
-            + &pass.latent_kl * self.network.latent.beta;
-        if self.vmpo.entropy != 0.0 {
-            // A new tensor: an in-place sum would write over what the graph holds.
-            let bonus = masked_mean(&policy.entropy(), &pass.valid) * self.vmpo.entropy;
-            total = &total - &bonus;
-        }
-        let networks = self.adam.parameters(self.networks_group);
-        let inputs: Vec<&Tensor> = networks.iter().chain([self.multipliers.parameter()]).collect();
-        let mut gradients = Tensor::f_run_backward(&[&total], &inputs, false, false)?;
-        let multipliers = gradients.split_off(networks.len());
-        let descent = self.descend(&total, gradients, Some(&multipliers));
-        Ok(self.report(&total, &pass, Some(&improvement), None, &descent))
-    }
-
-    /// One gradient step of the warm start: the policy's mean towards the stored mean,
-    /// mean over valid steps of Σ ½ ((μ_θ − μ_stored) / initial_std)², with β times the latent's KL; the value function
-    /// as in [`VmpoLearner::step`]. The policy's standard deviation gets no gradient. Returns the report and the latents
-    /// z_t, `[B, T, Z]`, with which [`MinibatchTensors::refresh_previous_latent`] keeps the demonstrations' z_{t−1}
-    /// those of this encoder. It is skipped where [`VmpoLearner::step`] would be.
-    ///
-    /// # Errors
-    /// [`Error::Shape`] when the minibatch is another task's; nothing is changed then.
-    pub fn regress(&mut self, minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error> {
-        self.check(minibatch)?;
-        let pass = self.forward(minibatch);
-        let errors = pass.acting.action.mean_error(&pass.behaviour.mean(), self.network.initial_std);
-        let regression = masked_mean(&errors, &pass.valid);
-        let total =
-            &regression + &pass.value_loss * self.vmpo.value_weight + &pass.latent_kl * self.network.latent.beta;
-        let gradients = Tensor::f_run_backward(&[&total], self.adam.parameters(self.networks_group), false, false)?;
-        let descent = self.descend(&total, gradients, None);
-        let shape = minibatch.shape();
-        let sizes = [shape.unrolls, shape.unroll.length, shape.unroll.latent].map(|size| size as i64);
-        // What is no number must not stay behind in the demonstrations.
-        let latents = pass.acting.latent.detach().reshape(sizes).nan_to_num(0.0, 0.0, 0.0);
-        let losses = self.report(&total, &pass, None, Some(&regression), &descent);
-        Ok((losses, latents))
-    }
-
-    /// Whether every parameter and multiplier is a number; waits for the device.
-    pub fn is_finite(&self) -> bool {
-        let networks = self.adam.parameters(self.networks_group).iter().map(Tensor::detach);
-        let parameters: Vec<Tensor> = networks.chain([self.multipliers.parameter().detach()]).collect();
-        adam::global_norm(&parameters).double_value(&[]).is_finite()
-    }
-
     /// Every trained parameter's name and number of elements.
     pub fn parameter_counts(&self) -> Vec<(String, usize)> {
         let mut parameters = trainable("policy", &self.policy_store);
         parameters.extend(trainable("value", &self.value_store));
         parameters.into_iter().map(|(name, tensor)| (name, tensor.numel())).collect()
-    }
-
-    /// Everything that changes future steps, by name: both networks, the multipliers and Adam. The tensors are copies on
-    /// the CPU, so another thread can write them while the next step runs.
-    pub fn state(&self) -> Vec<(String, Tensor)> {
-        self.entries().into_iter().map(|(name, tensor)| (name, tensor.detach().to_device(Device::Cpu).copy())).collect()
-    }
-
-    /// Restores what [`VmpoLearner::state`] gave.
-    ///
-    /// # Errors
-    /// [`Error::State`] when names, shapes or element types differ; nothing is changed then.
-    pub fn load_state(&mut self, state: &[(String, Tensor)]) -> Result<(), Error> {
-        Ok(adam::restore(self.entries(), state)?)
     }
 
     fn entries(&self) -> Vec<(String, Tensor)> {
@@ -254,64 +155,66 @@ impl VmpoLearner {
             proprioception: self.spec.proprioception,
             task: self.spec.task,
             action: self.spec.action,
-            latent: self.network.latent.size,
+            latent: self.experiment.network.latent.size,
             reward_terms: self.spec.reward_terms.len(),
             image: self.spec.image,
-            components: self.network.components(),
-            state: self.network.state_size(),
+            components: self.experiment.network.components(),
+            state: self.experiment.network.state_size(),
         };
         let expected = MinibatchShape { unrolls: found.unrolls, tasks: self.spec.tasks.len(), unroll };
         let known = self.spec.clips.len();
-        if found == expected && minibatch.clips <= known {
+        if found == expected && minibatch.clips() <= known {
             return Ok(());
         }
-        Err(Error::Shape { expected: Box::new(expected), found: Box::new(found), clips: minibatch.clips, known })
+        Err(Error::Shape { expected: Box::new(expected), found: Box::new(found), clips: minibatch.clips(), known })
     }
 
     fn forward(&self, minibatch: &MinibatchTensors) -> Pass {
         let length = minibatch.shape().unroll.length as i64;
-        let MinibatchTensors { reward, discount, valid, first, routing, .. } = minibatch;
-        let image = minibatch.image.as_ref();
-        let observation = self.policy.normalise(&minibatch.proprioception, &minibatch.task, image, routing);
-        let values = self.value.forward(&observation, &minibatch.clip, first);
+        let Experiment { network, vmpo, .. } = &self.experiment;
+        let [proprioception, task, valid, first] =
+            [Field::Proprioception, Field::Task, Field::Valid, Field::First].map(|field| &minibatch[field]);
+        let observation = self.policy.normalise(proprioception, task, minibatch.image(), minibatch.routing());
+        let values = self.value.forward(&observation, &minibatch[Field::Clip], first);
         let first = first.narrow(1, 0, length);
+        let previous_latent = &minibatch[Field::PreviousLatent];
         let acting = self.policy.act(
             &observation.first_steps(length),
-            &minibatch.previous_latent,
-            &minibatch.latent_noise,
-            Memory { state: &minibatch.state, first: Some(&first) },
+            previous_latent,
+            &minibatch[Field::LatentNoise],
+            RecurrentState { state: &minibatch[Field::State], first: Some(&first) },
         );
-        let targets = returns(reward, discount, valid, &values, self.vmpo.discount, self.vmpo.lambda);
+        let (reward, discount) = (&minibatch[Field::Reward], &minibatch[Field::Discount]);
+        let targets = returns(reward, discount, valid, &values, vmpo.discount, vmpo.lambda);
         let (targets, values) = (rows(&targets), rows(&values.narrow(1, 0, length)));
-        let share = valid.mean(Kind::Float);
+        let valid_share = valid.mean(Kind::Float);
         let valid = self.learnt_from(valid).reshape([-1]);
         let errors = (&values - &targets).square().sum_dim_intlist(-1i64, false, Kind::Float) * 0.5;
-        let prior: &Prior = &self.network.latent.prior;
+        let prior: &Prior = &network.latent.prior;
         let latent_kl = match &acting.latent_posterior {
-            Some(posterior) => posterior.kl_to_prior(prior, &rows(&minibatch.previous_latent), &first.reshape([-1])),
+            Some(posterior) => posterior.kl_to_prior(prior, &rows(previous_latent), &first.reshape([-1])),
             None => valid.zeros_like(),
         };
+        let [mean, std, log_weights] =
+            [Field::Mean, Field::Std, Field::LogWeights].map(|field| rows(&minibatch[field]));
         Pass {
-            behaviour: ActionDistribution::from_rows(
-                &rows(&minibatch.mean),
-                &rows(&minibatch.std),
-                &rows(&minibatch.log_weights),
-            ),
-            groups: self.groups(routing, length, &valid),
+            behaviour: ActionDistribution::from_rows(&mean, &std, &log_weights),
+            groups: self.groups(minibatch, &valid),
             value_loss: masked_mean(&errors, &valid),
             latent_kl: masked_mean(&latent_kl, &valid),
             acting,
             values,
             targets,
             valid,
-            share,
+            valid_share,
         }
     }
 
-    /// Task by task the steps that belong to it, if each has an E-step of its own.
-    fn groups(&self, routing: &Routing, length: i64, valid: &Tensor) -> Vec<Tensor> {
-        match routing.tasks() {
-            Some(tasks) if self.vmpo.temperature_per_task => {
+    /// The steps of each task, if each task has an E-step of its own; otherwise all steps.
+    fn groups(&self, minibatch: &MinibatchTensors, valid: &Tensor) -> Vec<Tensor> {
+        match minibatch.routing().tasks() {
+            Some(tasks) if self.experiment.vmpo.temperature_per_task => {
+                let length = minibatch.shape().unroll.length as i64;
                 let of_rows = tasks.unsqueeze(1).expand([-1, length], false).reshape([-1]);
                 (0..self.spec.tasks.len() as i64).map(|task| of_rows.eq(task)).collect()
             }
@@ -319,9 +222,9 @@ impl VmpoLearner {
         }
     }
 
-    /// `valid` without the rows that only wake a recurrent value function.
+    /// `valid` without the rows that only warm up a recurrent value function.
     fn learnt_from(&self, valid: &Tensor) -> Tensor {
-        let burnt = self.vmpo.value_burn_in as i64;
+        let burnt = self.experiment.vmpo.value_burn_in as i64;
         if burnt == 0 {
             return valid.shallow_clone();
         }
@@ -345,8 +248,9 @@ impl VmpoLearner {
             sum = &sum + adam::global_norm(multipliers).square();
         }
         let finite = sum.isfinite().all();
-        if self.optimiser.max_gradient_norm > 0.0 {
-            adam::clip_by_global_norm(&mut gradients, &norm, self.optimiser.max_gradient_norm);
+        let limit = self.experiment.optimiser.max_gradient_norm;
+        if limit > 0.0 {
+            adam::clip_by_global_norm(&mut gradients, &norm, limit);
         }
         self.adam.step(self.networks_group, &gradients, &finite);
         if let Some(multipliers) = multipliers {
@@ -356,7 +260,7 @@ impl VmpoLearner {
         Descent { norm, finite }
     }
 
-    /// Packs the report of a V-MPO step (`improvement`) or of a regression step (`regression`).
+    /// The report of a V-MPO step (`improvement`) or of a regression step (`regression`).
     fn report(
         &self,
         total: &Tensor,
@@ -373,28 +277,127 @@ impl VmpoLearner {
             let alpha_discrete = self.multipliers.alpha_discrete();
             let kl_weights = improvement.and_then(|improvement| improvement.kl_weights.as_ref());
             let std = pass.acting.action.std().mean_dim(-1i64, false, Kind::Float);
-            let scalars = [
-                total,
-                of(|improvement| &improvement.policy),
-                of(|improvement| &improvement.temperature),
-                of(|improvement| &improvement.alpha),
-                &pass.value_loss,
-                regression.unwrap_or(&zero),
-                &pass.latent_kl,
-                of(|improvement| &improvement.kl_mean),
-                of(|improvement| &improvement.kl_std),
-                kl_weights.unwrap_or(&zero),
-                &temperatures.mean(Kind::Float),
-                &alpha_mean,
-                &alpha_std,
-                alpha_discrete.as_ref().unwrap_or(&zero),
-                &masked_mean(&std, &pass.valid),
-                &descent.norm,
-                &variance_explained(pass),
-                &pass.share,
+            let named = [
+                // The loss that was differentiated.
+                ("total_loss", total),
+                // L_π, L_η and L_α.
+                ("policy_loss", of(|improvement| &improvement.policy)),
+                ("temperature_loss", of(|improvement| &improvement.temperature)),
+                ("alpha_loss", of(|improvement| &improvement.alpha)),
+                // ½ (V − G)², mean over valid steps, summed over reward terms.
+                ("value_loss", &pass.value_loss),
+                // 0 in a V-MPO step.
+                ("regression_loss", regression.unwrap_or(&zero)),
+                // KL of the latent to its prior, nats a step.
+                ("latent_kl", &pass.latent_kl),
+                // Mean KL_μ and KL_Σ to the behaviour policy, and that of a mixture's weights (0 for one Gaussian), nats a
+                // step.
+                ("kl_mean", of(|improvement| &improvement.kl_mean)),
+                ("kl_std", of(|improvement| &improvement.kl_std)),
+                ("kl_weights", kl_weights.unwrap_or(&zero)),
+                // η after the step; the mean if there are several.
+                ("temperature", &temperatures.mean(Kind::Float)),
+                // α_μ, α_Σ and α_discrete (0 for one Gaussian) after the step.
+                ("alpha_mean", &alpha_mean),
+                ("alpha_std", &alpha_std),
+                ("alpha_discrete", alpha_discrete.as_ref().unwrap_or(&zero)),
+                // Mean standard deviation of the policy over valid steps and action dimensions.
+                ("policy_std", &masked_mean(&std, &pass.valid)),
+                // Global norm of the networks' gradients, before any clipping.
+                ("gradient_norm", &descent.norm),
+                // 1 − Var(G − V) / Var(G), of the return summed over reward terms.
+                ("variance_explained", &variance_explained(pass)),
+                // Fraction of the rows that are transitions, and in a warm start are demonstrated.
+                ("valid_share", &pass.valid_share),
             ];
-            Losses::pack(scalars, &temperatures, &descent.finite)
+            Losses::pack(named, &temperatures, &descent.finite)
         })
+    }
+}
+
+impl Algorithm for VmpoLearner {
+    /// L = L_π + L_η + L_α + w · value loss + β · the latent's KL − the entropy bonus.
+    fn step(&mut self, minibatch: &MinibatchTensors) -> Result<Losses, Error> {
+        self.check(minibatch)?;
+        let pass = self.forward(minibatch);
+        let advantage = (&pass.targets - pass.values.detach()).sum_dim_intlist(-1i64, false, Kind::Float);
+        let policy = &pass.acting.action;
+        let kl_weights = policy.kl_weights(&pass.behaviour);
+        let evidence = Evidence {
+            log_prob: &policy.log_prob(&rows(&minibatch[Field::Action])),
+            advantage: &advantage,
+            kl_mean: &policy.kl_mean(&pass.behaviour),
+            kl_std: &policy.kl_std(&pass.behaviour),
+            kl_weights: kl_weights.as_ref(),
+            valid: &pass.valid,
+            groups: &pass.groups,
+        };
+        let Experiment { network, vmpo, .. } = &self.experiment;
+        let improvement = policy_improvement(&evidence, &self.multipliers, &KlLimits::from(vmpo));
+        let mut total =
+            improvement.total() + &pass.value_loss * vmpo.value_weight + &pass.latent_kl * network.latent.beta;
+        if vmpo.entropy != 0.0 {
+            // A new tensor: an in-place sum would write over what the graph holds.
+            let bonus = masked_mean(&policy.entropy(), &pass.valid) * vmpo.entropy;
+            total = &total - &bonus;
+        }
+        let networks = self.adam.parameters(self.networks_group);
+        let inputs: Vec<&Tensor> = networks.iter().chain([self.multipliers.parameter()]).collect();
+        let mut gradients = Tensor::f_run_backward(&[&total], &inputs, false, false)?;
+        let multipliers = gradients.split_off(networks.len());
+        let descent = self.descend(&total, gradients, Some(&multipliers));
+        Ok(self.report(&total, &pass, Some(&improvement), None, &descent))
+    }
+
+    /// Mean over valid steps of Σ ½ ((μ_θ − μ_stored) / initial_std)², with β times the latent's KL; the value function as
+    /// in [`step`](Algorithm::step). The policy's standard deviation gets no gradient.
+    fn regress(&mut self, minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error> {
+        self.check(minibatch)?;
+        let pass = self.forward(minibatch);
+        let Experiment { network, vmpo, .. } = &self.experiment;
+        let errors = pass.acting.action.mean_error(&pass.behaviour.mean(), network.initial_std);
+        let regression = masked_mean(&errors, &pass.valid);
+        let total = &regression + &pass.value_loss * vmpo.value_weight + &pass.latent_kl * network.latent.beta;
+        let gradients = Tensor::f_run_backward(&[&total], self.adam.parameters(self.networks_group), false, false)?;
+        let descent = self.descend(&total, gradients, None);
+        let shape = minibatch.shape();
+        let sizes = [shape.unrolls, shape.unroll.length, shape.unroll.latent].map(|size| size as i64);
+        // NaN must not stay in the demonstrations.
+        let latents = pass.acting.latent.detach().reshape(sizes).nan_to_num(0.0, 0.0, 0.0);
+        let losses = self.report(&total, &pass, None, Some(&regression), &descent);
+        Ok((losses, latents))
+    }
+
+    fn set_normaliser(&mut self, statistics: &NormaliserStatistics) -> Result<(), Error> {
+        Ok(self.policy.set_normaliser(statistics)?)
+    }
+
+    /// The multipliers keep the experiment's rate.
+    fn set_learning_rate(&mut self, rate: f64) {
+        self.set_learning_rates(rate, self.experiment.optimiser.multiplier_learning_rate);
+    }
+
+    fn reset_optimiser(&mut self) {
+        self.adam.reset();
+    }
+
+    fn is_finite(&self) -> bool {
+        let networks = self.adam.parameters(self.networks_group).iter().map(Tensor::detach);
+        let parameters: Vec<Tensor> = networks.chain([self.multipliers.parameter().detach()]).collect();
+        adam::global_norm(&parameters).double_value(&[]).is_finite()
+    }
+
+    fn policy_parameters(&self) -> Result<Vec<u8>, Error> {
+        Ok(to_safetensors(&self.policy_store)?)
+    }
+
+    /// Both networks, the multipliers and Adam.
+    fn state(&self) -> Vec<(String, Tensor)> {
+        self.entries().into_iter().map(|(name, tensor)| (name, tensor.detach().to_device(Device::Cpu).copy())).collect()
+    }
+
+    fn load_state(&mut self, state: &[(String, Tensor)]) -> Result<(), Error> {
+        Ok(adam::restore(self.entries(), state)?)
     }
 }
 

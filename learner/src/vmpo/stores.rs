@@ -1,4 +1,4 @@
-//! What a variable store holds, by name.
+//! The variables of a store, by name.
 
 use tch::{Tensor, nn};
 
@@ -10,7 +10,7 @@ pub(super) fn named(prefix: &str, store: &nn::VarStore) -> Vec<(String, Tensor)>
     variables
 }
 
-/// [`named`], without what is not trained.
+/// The trained parameters among [`named`].
 pub(super) fn trainable(prefix: &str, store: &nn::VarStore) -> Vec<(String, Tensor)> {
     named(prefix, store).into_iter().filter(|(_, tensor)| tensor.requires_grad()).collect()
 }

@@ -4,7 +4,8 @@
 
 use crate::support::RUN;
 use comic_learner::checkpoint::{Evaluated, Judgement, Name, Snapshot, Store, find, read};
-use comic_learner::error::Misuse;
+use comic_learner::error::Error;
+use comic_proto::chain;
 use proptest::prelude::*;
 
 fn snapshot(content: &str) -> Snapshot {
@@ -71,8 +72,9 @@ fn what_cannot_be_read_is_no_damage_and_stays_where_it_is() {
     // The system refuses to open a link that leads to itself, whoever asks.
     std::fs::remove_file(newest.join("part")).unwrap();
     std::os::unix::fs::symlink("part", newest.join("part")).unwrap();
-    let refused = store.newest().unwrap_err();
-    assert!(!refused.is::<Misuse>() && format!("{refused:#}").contains("cannot read"), "{refused:#}");
+    let refused = Error::from(store.newest().unwrap_err());
+    assert_eq!(refused.exit_code(), 1, "{refused}");
+    assert!(chain(&refused).contains("cannot read"), "{}", chain(&refused));
     assert!(newest.is_dir());
 }
 
@@ -99,9 +101,9 @@ fn a_run_with_nothing_but_damaged_ones_does_not_begin_anew() {
     let only = store.write(Name::Updates(1), &snapshot("one")).unwrap();
     std::fs::write(only.join("part"), "øne").unwrap();
     for start in 1..=2 {
-        let refused = Store::open(run.path(), 3).unwrap().newest().unwrap_err();
-        assert!(refused.is::<Misuse>(), "whoever restarts it would be wrong to: {refused:#}");
-        assert!(format!("{refused:#}").contains("--run"), "start {start}: {refused:#}");
+        let refused = Error::from(Store::open(run.path(), 3).unwrap().newest().unwrap_err());
+        assert_eq!(refused.exit_code(), 2, "a restart cannot help: {refused}");
+        assert!(refused.to_string().contains("--run"), "start {start}: {refused}");
     }
     assert!(run.path().join("checkpoints/damaged-checkpoint-0000000001").is_dir());
 }
@@ -202,8 +204,8 @@ fn a_run_has_one_number_for_all_its_lives_and_every_other_run_another() {
     assert_eq!(number(&run).unwrap(), drawn);
     assert_ne!(number(&other).unwrap(), drawn);
     std::fs::write(run.path().join("checkpoints/run"), "the best").unwrap();
-    let damaged = number(&run).unwrap_err();
-    assert!(damaged.is::<Misuse>() && damaged.to_string().contains("checkpoints/run is damaged"), "{damaged}");
+    let damaged = Error::from(number(&run).unwrap_err());
+    assert!(damaged.exit_code() == 2 && damaged.to_string().contains("checkpoints/run is damaged"), "{damaged}");
 }
 
 #[test]
@@ -211,8 +213,8 @@ fn a_damaged_epoch_is_an_error_that_names_the_file() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 1).unwrap();
     std::fs::write(run.path().join("checkpoints/epoch"), "many").unwrap();
-    let damaged = store.begin_epoch().unwrap_err();
-    assert!(damaged.is::<Misuse>() && damaged.to_string().contains("checkpoints/epoch is damaged"), "{damaged}");
+    let damaged = Error::from(store.begin_epoch().unwrap_err());
+    assert!(damaged.exit_code() == 2 && damaged.to_string().contains("checkpoints/epoch is damaged"), "{damaged}");
 }
 
 /// A run with these checkpoints, all of one life.

@@ -161,11 +161,11 @@ async fn the_end_of_the_run_is_told_and_ends_the_stream() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut stream = actor.watch().await;
-    world.publisher.publish(1, Behaviour::Demonstrate, &parameters(1, 10));
-    assert_eq!(stream.message().await.unwrap().unwrap().behaviour(), Behaviour::Demonstrate);
-    world.publisher.publish(1, Behaviour::Leave, &parameters(1, 0));
+    world.publisher.publish(1, Behaviour::Demonstration, &parameters(1, 10));
+    assert_eq!(stream.message().await.unwrap().unwrap().behaviour(), Behaviour::Demonstration);
+    world.publisher.end_run();
     let farewell = within(Duration::from_secs(10), stream.message()).await.unwrap().unwrap();
-    assert_eq!((farewell.behaviour(), farewell.total), (Behaviour::Leave, 0));
+    assert_eq!((farewell.run_over, farewell.total), (true, 0));
     assert!(within(Duration::from_secs(10), stream.message()).await.unwrap().is_none());
 }
 

@@ -33,10 +33,10 @@ async fn who_asks_while_the_learner_drains_is_told_to_come_back() {
     assert!(world.shared.metrics_page().contains("comic_joins_total{result=\"draining\"} 1\n"));
     assert!(actor.client.get_status(StatusRequest {}).await.is_ok(), "the accounting can still be read");
     // The update that was under way was the last one: who was sent away may come and hear that.
-    world.publisher.publish(1, Behaviour::Leave, &parameters(1, 0));
+    world.publisher.end_run();
     let mut late = world.actor(71).await;
     let mut watch = late.watch().await;
-    assert_eq!(within(LIMIT, watch.message()).await.unwrap().unwrap().behaviour(), Behaviour::Leave);
+    assert!(within(LIMIT, watch.message()).await.unwrap().unwrap().run_over);
 }
 
 #[tokio::test]
@@ -88,10 +88,10 @@ async fn the_farewell_is_still_delivered() {
     let mut watch = actor.watch().await;
     world.publisher.publish(1, Behaviour::Policy, &parameters(1, 10));
     assert_eq!(watch.message().await.unwrap().unwrap().behaviour(), Behaviour::Policy);
-    world.publisher.publish(1, Behaviour::Leave, &parameters(1, 0));
+    world.publisher.end_run();
     world.begin_shutdown();
     let farewell = within(LIMIT, watch.message()).await.unwrap().unwrap();
-    assert_eq!(farewell.behaviour(), Behaviour::Leave);
+    assert!(farewell.run_over);
     assert!(within(LIMIT, watch.message()).await.unwrap().is_none());
 }
 

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use crate::support::{EPOCH, RUN, World};
-use comic_learner::service::Evaluation;
+use comic_learner::observe::evaluation::Evaluation;
 use comic_proto::v1::{EvaluationReport, StatusRequest};
 use tonic::Code;
 

@@ -7,7 +7,7 @@ use std::time::Duration;
 use crate::support::{BATCH, EPOCH, World, within};
 use bytes::Bytes;
 use comic_learner::service::quarantine::QuarantineOptions;
-use comic_proto::v1::{UnrollMessage, Verdict};
+use comic_proto::v1::{Behaviour, UnrollMessage, Verdict};
 use comic_proto::{Field, UnrollBuffer};
 use comic_replay::{Next, Phase};
 use tonic::Code;
@@ -105,7 +105,7 @@ async fn old_unrolls_are_refused_as_stale_and_those_of_another_life_or_phase_as_
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;
-    world.batcher.set_phase(Phase { epoch: EPOCH, version: 6, oldest: 0, demonstration: false });
+    world.batcher.set_phase(Phase { epoch: EPOCH, version: 6, oldest: 0, behaviour: Behaviour::Policy });
     let ack = unrolls.send(actor.unroll(0)).await.unwrap();
     assert_eq!((ack.verdict(), ack.detail.as_str()), (Verdict::Stale, "version 0 is too old, the newest is 6"));
 
@@ -115,7 +115,7 @@ async fn old_unrolls_are_refused_as_stale_and_those_of_another_life_or_phase_as_
     let ack = unrolls.send(earlier).await.unwrap();
     assert_eq!((ack.verdict(), ack.detail.as_str()), (Verdict::Rejoin, "made in learner epoch 2, this is 3"));
 
-    let demonstration = actor.unroll_with(2, |header| header.demonstration = true);
+    let demonstration = actor.unroll_with(2, |header| header.behaviour = Behaviour::Demonstration.into());
     let ack = unrolls.send(demonstration).await.unwrap();
     assert_eq!(ack.verdict(), Verdict::Superseded);
     assert!(ack.detail.contains("the policy's own unrolls"), "{}", ack.detail);

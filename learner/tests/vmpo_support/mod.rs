@@ -1,10 +1,13 @@
-//! Small tasks and made-up unrolls for the tests of V-MPO.
+//! Small tasks and generated unrolls for the tests of V-MPO.
 #![allow(dead_code, reason = "each test uses its part")]
 
 use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives, TaskPart, TaskSpec};
-use comic_learner::vmpo::{MinibatchShape, MinibatchSource, MinibatchTensors, VmpoLearner};
-use comic_networks::{Acting, Memory, Routing};
-use comic_proto::UnrollShape;
+use comic_learner::algorithm::Algorithm as _;
+use comic_learner::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
+use comic_learner::algorithm::shape::MinibatchShape;
+use comic_learner::vmpo::VmpoLearner;
+use comic_networks::{Acting, RecurrentState, Routing};
+use comic_proto::{Field, PerField, UnrollShape};
 use tch::{Device, Kind, Tensor};
 
 pub(crate) const UNROLLS: usize = 6;
@@ -228,24 +231,23 @@ impl Unrolls {
     }
 
     pub(crate) fn source(&self) -> MinibatchSource<'_> {
-        MinibatchSource {
-            proprioception: &self.proprioception,
-            task: &self.task,
-            previous_latent: &self.previous_latent,
-            latent_noise: &self.latent_noise,
-            action: &self.action,
-            mean: &self.mean,
-            std: &self.std,
-            log_weights: &self.log_weights,
-            reward: &self.reward,
-            discount: &self.discount,
-            valid: &self.valid,
-            first: &self.first,
-            state: &self.state,
-            clip: &self.clip,
-            image: &[],
-            tasks: &self.tasks,
-        }
+        let floats = |field| match field {
+            Field::Proprioception => &self.proprioception[..],
+            Field::Task => &self.task,
+            Field::PreviousLatent => &self.previous_latent,
+            Field::LatentNoise => &self.latent_noise,
+            Field::Action => &self.action,
+            Field::Mean => &self.mean,
+            Field::Std => &self.std,
+            Field::LogWeights => &self.log_weights,
+            Field::Reward => &self.reward,
+            Field::Discount => &self.discount,
+            Field::Valid => &self.valid,
+            Field::First => &self.first,
+            Field::State => &self.state,
+            Field::Clip | Field::Image => &[],
+        };
+        MinibatchSource { floats: PerField::from_fn(floats), clip: &self.clip, image: &[], tasks: &self.tasks }
     }
 
     pub(crate) fn minibatch(&self) -> MinibatchTensors {
@@ -276,7 +278,7 @@ impl Unrolls {
             let acting = tch::no_grad(|| {
                 let state = s.narrow(1, 0, 0);
                 let observation = learner.policy().normalise(&s, &x, None, &Routing::single());
-                learner.policy().act(&observation, &z, &noise, Memory { state: &state, first: None })
+                learner.policy().act(&observation, &z, &noise, RecurrentState { state: &state, first: None })
             });
             means.extend(values(&acting.action.mean()));
             stds.extend(values(&acting.action.std()));
@@ -312,7 +314,7 @@ impl Unrolls {
             let (proprioception, task) = (steps(&self.proprioception, LENGTH + 1), steps(&self.task, LENGTH + 1));
             let observation = learner.policy().normalise(&proprioception, &task, None, routing);
             let (previous, noise) = (steps(&self.previous_latent, LENGTH), steps(&self.latent_noise, LENGTH));
-            let memory = Memory { state: &before, first: Some(&begins) };
+            let memory = RecurrentState { state: &before, first: Some(&begins) };
             learner.policy().act(&observation, &previous, &noise, memory)
         })
     }

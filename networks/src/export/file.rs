@@ -10,9 +10,12 @@ use safetensors::SafeTensors;
 use safetensors::tensor::TensorView;
 use tch::{Device, nn};
 
-use super::spec::task_spec;
-use super::{FORMAT, Part, Source, Spec, weights};
-use crate::{Error, Policy, parameters};
+use super::part::Part;
+use super::spec::{FORMAT, Source, Spec, task_spec};
+use super::weights;
+use crate::error::Error;
+use crate::parameters;
+use crate::policy::Policy;
 
 /// Where in the metadata the [`Spec`] stands.
 pub const KEY: &str = "comic";

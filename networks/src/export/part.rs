@@ -3,7 +3,7 @@
 use comic_experiment::{Experiment, TaskName};
 use serde::{Deserialize, Serialize};
 
-use crate::Error;
+use crate::error::Error;
 
 /// What a file holds: as the command line and the file write it, `policy`, `policy:TASK`, `encoder:TASK` or `low-level`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -34,7 +34,9 @@ impl Part {
         match self {
             Self::Policy(None) => true,
             Self::Policy(Some(task)) => !name.starts_with("encoder.") || encodes(task),
-            Self::Encoder(task) => encodes(task) || name.starts_with("sight.") || name.starts_with("normaliser."),
+            Self::Encoder(task) => {
+                encodes(task) || name.starts_with("image_encoder.") || name.starts_with("normaliser.")
+            }
             Self::LowLevel => name.starts_with("low_level.") || name.starts_with("normaliser.proprioception_"),
         }
     }
@@ -115,7 +117,7 @@ mod tests {
             "low_level.head.bias",
             "normaliser.proprioception_std",
             "normaliser.task_std",
-            "sight.first.weight",
+            "image_encoder.first.weight",
         ];
         let held = |part: &str| names.map(|name| part.parse::<Part>().unwrap().holds(name));
         assert_eq!(held("policy"), [true; 6]);

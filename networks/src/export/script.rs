@@ -8,13 +8,17 @@ use tch::{CModule, Kind, Tensor};
 use zip::write::FileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
+use super::file::{Exported, KEY};
+use super::part::Part;
 use super::spec::task_spec;
-use super::{Exported, KEY, Part};
-use crate::{Error, Memory, Policy, Routing};
+use crate::error::Error;
+use crate::lstm::RecurrentState;
+use crate::policy::Policy;
+use crate::routing::Routing;
 
 impl Exported {
     /// Writes the policy of one task as TorchScript to `path`: a module whose `forward` takes the inputs of the
-    /// [`super::Spec`], `[1, size]` each, an image last, and gives the outputs side by side, `[1, A + M]`. The
+    /// [`Spec`](super::spec::Spec), `[1, size]` each, an image last, and gives the outputs side by side, `[1, A + M]`. The
     /// specification lies in it as the extra file `comic.json`.
     ///
     /// # Errors
@@ -60,7 +64,7 @@ impl Exported {
 fn step(policy: &Policy, inputs: &[Tensor], latent: i64, state: i64) -> Tensor {
     let observation = policy.normalise(&inputs[0], &inputs[1], inputs.get(3), &Routing::single());
     let previous = inputs[2].narrow(1, 0, latent);
-    let memory = Memory { state: &inputs[2].narrow(1, latent, state), first: None };
-    let acting = policy.act(&observation, &previous, &previous.zeros_like(), memory);
+    let recurrent = RecurrentState { state: &inputs[2].narrow(1, latent, state), first: None };
+    let acting = policy.act(&observation, &previous, &previous.zeros_like(), recurrent);
     Tensor::cat(&[acting.action.mode().clamp(-1.0, 1.0), acting.latent, acting.state], 1)
 }

@@ -3,8 +3,9 @@
 use comic_experiment::{Experiment, PROPRIOCEPTION, TaskSpec};
 use serde::{Deserialize, Serialize};
 
-use super::Part;
-use crate::{Error, NORMALISED_LIMIT};
+use super::part::Part;
+use crate::error::Error;
+use crate::normaliser::NORMALISED_LIMIT;
 
 /// The form of files that this program writes and reads: another one whenever the same tensors come to mean something
 /// else, as in an encoder that reads its inputs in another order.
@@ -155,16 +156,16 @@ fn observations(experiment: &Experiment, sizes: &TaskSpec) -> Result<Vec<Vector>
 
 fn policy(experiment: &Experiment, sizes: &TaskSpec) -> Result<(Vec<Vector>, Vec<Vector>), Error> {
     let network = &experiment.network;
-    let memory = || {
+    let recurrent = || {
         let entries = [("latent", network.latent.size), ("state", network.state_size())];
         let entries = entries.map(|(name, size)| (name.to_string(), size));
-        Vector::of("memory", entries, "what the step before gave; zeros at an episode's first step")
+        Vector::of("recurrent_state", entries, "what the step before gave; zeros at an episode's first step")
     };
     let mut inputs = vec![proprioception()];
     inputs.extend(observations(experiment, sizes)?);
-    inputs.push(memory());
+    inputs.push(recurrent());
     let meaning = "without noise: the mean, of a mixture its likeliest component's; within [-1, 1], in control order";
-    Ok((inputs, vec![Vector::plain("action", sizes.action, meaning), memory()]))
+    Ok((inputs, vec![Vector::plain("action", sizes.action, meaning), recurrent()]))
 }
 
 fn encoder(experiment: &Experiment, sizes: &TaskSpec) -> Result<(Vec<Vector>, Vec<Vector>), Error> {

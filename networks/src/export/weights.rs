@@ -2,7 +2,7 @@
 
 use comic_experiment::{Network, TaskSpec};
 
-use super::Part;
+use super::part::Part;
 use crate::low_level::{Layer, Sizes, low_level_layers};
 
 /// Entries of the matrices of encoders and low level, as far as `part` goes. Whoever reads a file compares it with what
@@ -29,8 +29,8 @@ fn hidden(input: u64, sizes: &[usize]) -> (u64, u64) {
 
 fn encoder(spec: &TaskSpec, observation: usize, network: &Network) -> u64 {
     let latent = network.latent.size as u64;
-    let seen = if spec.image > 0 { network.image_features } else { 0 };
-    let input = (spec.proprioception + observation + seen) as u64 + latent;
+    let image_features = if spec.image > 0 { network.image_features } else { 0 };
+    let input = (spec.proprioception + observation + image_features) as u64 + latent;
     let (weights, width) = hidden(input, &network.encoder);
     let output = if latent == 0 { network.primitives.count as u64 } else { 2 * latent };
     let path = if latent > 0 && network.encoder_linear_path { output * input } else { 0 };
@@ -48,8 +48,8 @@ mod tests {
     use tch::{Device, nn};
 
     use super::*;
-    use crate::Policy;
     use crate::export::spec::task_spec;
+    use crate::policy::Policy;
 
     #[test]
     fn the_count_is_that_of_the_built_networks_in_every_preset() {

@@ -2,8 +2,9 @@
 
 use tch::{Tensor, nn};
 
-use super::{Config, Input, Layer, LowLevel, Output, Sizes};
-use crate::ActionDistribution;
+use super::interface::{Config, Input, LowLevel, Output};
+use super::size::{Layer, Sizes};
+use crate::action::ActionDistribution;
 use crate::layers::{GaussianHead, GaussianHeadConfig};
 use crate::lstm::LstmStack;
 
@@ -34,8 +35,8 @@ pub(super) fn layers(sizes: &Sizes<'_>) -> Vec<Layer> {
 impl LowLevel for LstmLowLevel {
     fn act(&self, input: &Input<'_>) -> Output {
         let joined = Tensor::cat(&[input.intent, input.proprioception], 1);
-        let unrolls = input.memory.state.size()[0];
-        let (hidden, state) = self.stack.forward(&joined.reshape([unrolls, -1, joined.size()[1]]), input.memory);
+        let unrolls = input.recurrent.state.size()[0];
+        let (hidden, state) = self.stack.forward(&joined.reshape([unrolls, -1, joined.size()[1]]), input.recurrent);
         let hidden = hidden.flatten(0, 1);
         Output { action: ActionDistribution::Gaussian(self.head.forward(&hidden)), state }
     }

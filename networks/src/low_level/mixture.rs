@@ -2,9 +2,9 @@
 
 use tch::{Kind, nn};
 
+use super::interface::{Config, Input, LowLevel, Output};
 use super::primitives::{Gate, Primitives};
-use super::{Config, Input, LowLevel, Output};
-use crate::ActionDistribution;
+use crate::action::ActionDistribution;
 
 /// π(a|s, z) = Σ_k w_k(z, s) N_k(s), Σ w_k = 1 (S; after Wulfmeier et al., 2019).
 #[derive(Debug)]
@@ -25,6 +25,6 @@ impl LowLevel for MixtureLowLevel {
         let components = self.primitives.forward(input.proprioception);
         let log_weights = self.gate.forward(input).log_softmax(-1, None::<Kind>);
         let action = ActionDistribution::Mixture { log_weights, components };
-        Output { action, state: input.memory.state.shallow_clone() }
+        Output { action, state: input.recurrent.state.shallow_clone() }
     }
 }

@@ -2,8 +2,9 @@
 
 use tch::{Tensor, nn};
 
-use super::{Config, Input, Layer, LowLevel, Output, Sizes};
-use crate::ActionDistribution;
+use super::interface::{Config, Input, LowLevel, Output};
+use super::size::{Layer, Sizes};
+use crate::action::ActionDistribution;
 use crate::layers::{GaussianHead, GaussianHeadConfig, Torso};
 
 /// `[z, s]` → torso → mean and σ (S: 2×1024). The mean's bias starts at the pose, σ at `initial_std`; the head's weights
@@ -32,6 +33,6 @@ impl LowLevel for MlpLowLevel {
     fn act(&self, input: &Input<'_>) -> Output {
         let joined = Tensor::cat(&[input.intent, input.proprioception], 1);
         let action = self.head.forward(&self.torso.forward(&joined));
-        Output { action: ActionDistribution::Gaussian(action), state: input.memory.state.shallow_clone() }
+        Output { action: ActionDistribution::Gaussian(action), state: input.recurrent.state.shallow_clone() }
     }
 }

@@ -2,8 +2,9 @@
 
 use tch::{Tensor, nn};
 
-use super::{Config, Input, Layer, Sizes};
-use crate::DiagonalGaussian;
+use super::interface::{Config, Input};
+use super::size::{Layer, Sizes};
+use crate::gaussian::DiagonalGaussian;
 use crate::layers::{Torso, inverse_softplus, linear};
 
 /// The outermost fixed bias of a primitive's mean (S).

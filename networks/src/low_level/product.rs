@@ -2,9 +2,10 @@
 
 use tch::nn;
 
+use super::interface::{Config, Input, LowLevel, Output};
 use super::primitives::{Gate, Primitives};
-use super::{Config, Input, LowLevel, Output};
-use crate::{ActionDistribution, DiagonalGaussian};
+use crate::action::ActionDistribution;
+use crate::gaussian::DiagonalGaussian;
 
 /// π(a|s, z) ∝ Π_k N_k(s)^{w_k(z, s)}, w_k in (0, 1) and not normalised (S; MCP, Peng et al., 2019): one Gaussian again.
 ///
@@ -33,6 +34,6 @@ impl LowLevel for ProductLowLevel {
         let exponents = self.gate.forward(input).sigmoid() * (1.0 - LEAST_EXPONENT) + LEAST_EXPONENT;
         let DiagonalGaussian { mean, std } = self.primitives.forward(input.proprioception).product(&exponents);
         let action = DiagonalGaussian { mean, std: std.clamp_min(self.min_std) };
-        Output { action: ActionDistribution::Gaussian(action), state: input.memory.state.shallow_clone() }
+        Output { action: ActionDistribution::Gaussian(action), state: input.recurrent.state.shallow_clone() }
     }
 }

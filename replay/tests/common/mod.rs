@@ -6,11 +6,11 @@ use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 
 use bytes::Bytes;
-use comic_proto::v1::UnrollHeader;
+use comic_proto::v1::{Behaviour, UnrollHeader};
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{Batch, BatchOrder, Batcher, Config, Ledger, Next, Outcome, Phase};
 
-pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, oldest: 0, demonstration: false };
+pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, oldest: 0, behaviour: Behaviour::Policy };
 pub(crate) const CONFIG: Config = Config { unrolls: 3, max_staleness: 4, ahead: 2, order: BatchOrder::Arrival };
 /// Slots that fill up while nobody trains: the open batch and the full one.
 pub(crate) const SLOTS: usize = 2 * CONFIG.unrolls;
@@ -30,13 +30,19 @@ pub(crate) fn layout() -> Arc<UnrollLayout> {
     Arc::new(UnrollLayout::new(shape))
 }
 
-/// Clips are numbered as sequences are here: an actor's first ten unrolls are of one task, the next ten of another, and
-/// those that follow of none.
-pub(crate) const TASKS: [(&str, usize); 2] = [("tracking", 10), ("get-up", 10)];
+/// An actor's first ten unrolls belong to the first task, its next ten to the second, and all later ones to no task.
+pub(crate) const TASKS: [&str; 2] = ["tracking", "get-up"];
+/// See [`TASKS`].
+pub(crate) const UNROLLS_OF_A_TASK: usize = 10;
+
+/// The index of the task of an actor's unroll; the number of tasks for no task.
+pub(crate) fn task_of(sequence: u64) -> usize {
+    (sequence as usize / UNROLLS_OF_A_TASK).min(TASKS.len())
+}
 
 /// The accounting of these tasks are kept.
 pub(crate) fn with_tasks(ledger: Ledger) -> Ledger {
-    ledger.with_tasks(TASKS.map(|(name, clips)| (name.to_string(), clips)))
+    ledger.with_tasks(TASKS.map(String::from))
 }
 
 pub(crate) fn batcher() -> Batcher {
@@ -63,9 +69,10 @@ impl Actor {
             learner_epoch: PHASE.epoch,
             version: PHASE.version,
             layout_hash: layout().hash().to_vec(),
-            demonstration: PHASE.demonstration,
+            behaviour: PHASE.behaviour.into(),
             episodes: Vec::new(),
             environment: 0,
+            task: task_of(sequence) as u32,
         }
     }
 

@@ -37,7 +37,7 @@ fn run() -> Run {
     state.extend(statistics.state());
     let policy = to_safetensors(learner.policy_store()).expect("parameters are written");
     let config = Config { unrolls: 2, max_staleness: 2, ahead: 0, order: BatchOrder::Arrival };
-    let batcher = Batcher::new(Arc::new(layout(&spec, &experiment)), config, Phase::default(), with_tasks(Ledger::new(), &spec));
+    let batcher = Batcher::new(Arc::new(layout(&spec, &experiment)), config, Phase::begin(0), with_tasks(Ledger::new(), &spec));
     let text = |written: Result<Vec<u8>, serde_json::Error>| written.expect("JSON is written");
     let parts = [
         ("experiment.toml", experiment.to_toml().expect("an experiment is written").into_bytes()),
@@ -80,7 +80,7 @@ fuzz_target!(init: {
 });
 
 fn with_tasks(ledger: Ledger, spec: &TaskSpec) -> Ledger {
-    ledger.with_tasks(spec.tasks.iter().map(|task| (task.name.clone(), task.clips)))
+    ledger.with_tasks(spec.tasks.iter().map(|task| task.name.clone()))
 }
 
 /// What a learner makes of each part when it goes on from a checkpoint.

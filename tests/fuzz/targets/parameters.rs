@@ -33,6 +33,7 @@ fn store() -> nn::VarStore {
         total: whole.len() as u64,
         offset: offset as u64,
         data,
+        run_over: false,
     };
     let pieces = [piece(0, whole.slice(..half)), piece(half, whole.slice(half..))];
     seed("sound", &pieces.iter().flat_map(Message::encode_length_delimited_to_vec).collect::<Vec<u8>>());

@@ -6,7 +6,7 @@ use std::sync::{Arc, LazyLock};
 
 use bytes::Bytes;
 use comic_fuzz::{experiment, layout, seed, spec};
-use comic_proto::v1::{UnrollHeader, UnrollMessage};
+use comic_proto::v1::{Behaviour, UnrollHeader, UnrollMessage};
 use comic_proto::{Expected, Field, Pieces, ReceivedUnroll, UnrollBuffer, UnrollLayout, validate};
 use comic_replay::{Batcher, Config, Ledger, BatchOrder, Phase, TaskAccounting};
 use futures::executor::block_on;
@@ -29,7 +29,7 @@ static SERVICE: LazyLock<Service> = LazyLock::new(|| {
             unroll.row_mut(field, t).fill(1.0);
         }
     }
-    let header = UnrollHeader { layout_hash: layout.hash().to_vec(), ..UnrollHeader::default() };
+    let header = UnrollHeader { layout_hash: layout.hash().to_vec(), behaviour: Behaviour::Policy.into(), ..UnrollHeader::default() };
     let message = UnrollMessage { header: Some(header), payload: unroll.into_bytes() }.encode_to_vec();
     seed("sound", &[&[128], &message[..]].concat());
     Service { layout, clips: spec.tasks.iter().map(|task| task.clips).collect() }
@@ -52,10 +52,9 @@ fuzz_target!(init: {
     let expected = Expected { clips, epoch: 0, newest_version: 3 };
     if validate(layout, &header, &payload, &expected).is_ok() {
         let config = Config { unrolls: 2, max_staleness: 2, ahead: 0, order: BatchOrder::Arrival };
-        let tasks = clips.iter().enumerate().map(|(task, clips)| (task.to_string(), *clips));
-        let mut ledger = Ledger::new().with_tasks(tasks);
+        let mut ledger = Ledger::new().with_tasks((0..clips.len()).map(|task| task.to_string()));
         let _ = ledger.join(header.incarnation, None);
-        let batcher = Batcher::new(layout.clone(), config, Phase::default(), ledger);
+        let batcher = Batcher::new(layout.clone(), config, Phase::begin(0), ledger);
         // The first of two: there is room.
         block_on(batcher.insert(&header, payload));
         let accounting = batcher.accounting_by_task();

@@ -105,6 +105,14 @@ impl FakeLearner {
     }
 
     pub(super) fn publish(&self, behaviour: Behaviour, version: u64, parameters: &[u8]) {
+        self.send_parameters(behaviour, version, parameters, false);
+    }
+
+    pub(super) fn end_run(&self, version: u64) {
+        self.send_parameters(Behaviour::Unspecified, version, &[], true);
+    }
+
+    fn send_parameters(&self, behaviour: Behaviour, version: u64, parameters: &[u8], run_over: bool) {
         let total = parameters.len() as u64;
         let piece = |(index, data): (usize, &[u8])| ParametersChunk {
             learner_epoch: 1,
@@ -113,6 +121,7 @@ impl FakeLearner {
             total,
             offset: (index * PIECE) as u64,
             data: data.to_vec().into(),
+            run_over,
         };
         let mut pieces: Vec<_> = parameters.chunks(PIECE).enumerate().map(piece).collect();
         if pieces.is_empty() {

@@ -11,7 +11,7 @@ fn in_lockstep_a_version_makes_one_unroll_of_every_environment() {
         mailbox.publish(Directive {
             learner_epoch,
             version,
-            conduct: Conduct::Policy,
+            behaviour: Behaviour::Policy,
             parameters: Bytes::from_static(b"1"),
         });
     };
@@ -46,7 +46,7 @@ fn a_closed_mailbox_ends_the_worker_and_a_full_channel_holds_it() {
     mailbox.publish(Directive {
         learner_epoch: 1,
         version: 1,
-        conduct: Conduct::Policy,
+        behaviour: Behaviour::Policy,
         parameters: Bytes::from_static(b"1"),
     });
     let progress = Progress::default();

@@ -16,7 +16,7 @@ use comic_learner::service::quarantine::QuarantineOptions;
 use comic_learner::service::{Setup, Shared, serve};
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{
-    JoinReply, JoinRequest, ParametersChunk, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict,
+    Behaviour, JoinReply, JoinRequest, ParametersChunk, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict,
     WatchRequest,
 };
 use comic_proto::{Access, Client, Field, PROTOCOL_VERSION, UnrollBuffer, UnrollLayout, UnrollShape};
@@ -48,7 +48,7 @@ pub(crate) struct World {
     pub(crate) shared: Arc<Shared>,
     pub(crate) address: String,
     shutdown: Option<oneshot::Sender<()>>,
-    server: JoinHandle<Result<()>>,
+    server: JoinHandle<comic_learner::error::Result<()>>,
 }
 
 impl World {
@@ -114,7 +114,7 @@ impl World {
         };
         let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
         let config = Config { unrolls: BATCH, max_staleness: 5, ahead: 2, order: BatchOrder::Arrival };
-        let phase = Phase { epoch: EPOCH, version: 0, oldest: 0, demonstration: false };
+        let phase = Phase { epoch: EPOCH, version: 0, oldest: 0, behaviour: Behaviour::Policy };
         let batcher = Batcher::new(layout, config, phase, Ledger::new());
         let publisher = Publisher::new(EPOCH);
         let setup = Setup {
@@ -189,7 +189,7 @@ impl World {
     }
 
     /// What [`serve`] returned after the signal.
-    pub(crate) async fn ended(self) -> Result<()> {
+    pub(crate) async fn ended(self) -> comic_learner::error::Result<()> {
         within(Duration::from_secs(20), self.server).await.unwrap()
     }
 }
@@ -225,9 +225,10 @@ impl Actor {
             learner_epoch: self.reply.learner_epoch,
             version: 0,
             layout_hash: self.layout.hash().to_vec(),
-            demonstration: false,
+            behaviour: Behaviour::Policy.into(),
             episodes: Vec::new(),
             environment: 0,
+            task: 0,
         };
         let mut unroll = UnrollBuffer::new(&self.layout);
         for t in 0..self.layout.shape().length {

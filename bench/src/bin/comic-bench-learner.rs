@@ -1,0 +1,44 @@
+//! The program `comic-bench-learner`.
+
+use clap::{Parser, Subcommand};
+use comic_bench::service::{Crowd, Host, Ingest, Publish, Stalled, Swarm};
+use comic_bench::update::Update;
+
+/// The allocator of `comic-learner`.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+/// Measures the learner's update and its service; one JSON line for each figure.
+#[derive(Debug, Parser)]
+#[command(version)]
+struct Arguments {
+    #[command(subcommand)]
+    measurement: Measurement,
+}
+
+#[derive(Debug, Subcommand)]
+enum Measurement {
+    Update(Update),
+    Ingest(Ingest),
+    Publish(Publish),
+    Stalled(Stalled),
+    Swarm(Swarm),
+    #[command(hide = true)]
+    Host(Host),
+    #[command(hide = true)]
+    Crowd(Crowd),
+}
+
+fn main() -> anyhow::Result<()> {
+    let Arguments { measurement } = Arguments::parse();
+    comic_bench::start_logging();
+    match measurement {
+        Measurement::Update(update) => update.run(),
+        Measurement::Ingest(ingest) => ingest.run(),
+        Measurement::Publish(publish) => publish.run(),
+        Measurement::Stalled(stalled) => stalled.run(),
+        Measurement::Swarm(swarm) => swarm.run(),
+        Measurement::Host(host) => host.run(),
+        Measurement::Crowd(crowd) => crowd.run(),
+    }
+}

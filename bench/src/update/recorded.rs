@@ -1,0 +1,61 @@
+//! The batch that is learned from.
+
+use anyhow::{Context as _, Result};
+use comic_experiment::{Experiment, TaskSpec};
+use comic_learner::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
+use comic_learner::algorithm::shape::MinibatchShape;
+use comic_proto::{Field, PerField, UnrollLayout, UnrollShape};
+use tch::{Device, Kind, Tensor};
+
+/// A batch of random unrolls in the memory layout in which batches arrive.
+pub(super) struct Recorded {
+    shape: MinibatchShape,
+    floats: PerField<Vec<f32>>,
+    clips: Vec<u32>,
+    tasks: Vec<usize>,
+}
+
+impl Recorded {
+    pub(super) fn new(spec: &TaskSpec, experiment: &Experiment) -> Result<Self> {
+        let shape = UnrollShape::new(spec, experiment);
+        let layout = UnrollLayout::new(shape);
+        let unrolls = experiment.unroll.batch;
+        let mut floats = PerField::<Vec<f32>>::default();
+        for (field, values) in floats.iter_mut() {
+            let count = unrolls * layout.elements(field);
+            *values = match field {
+                Field::Clip | Field::Image => Vec::new(),
+                Field::Std => vec![0.7; count],
+                Field::LogWeights => vec![-(shape.components as f32).ln(); count],
+                Field::Discount | Field::Valid => vec![1.0; count],
+                Field::First | Field::State => vec![0.0; count],
+                Field::Proprioception
+                | Field::Task
+                | Field::PreviousLatent
+                | Field::LatentNoise
+                | Field::Action
+                | Field::Mean
+                | Field::Reward => Vec::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu)))
+                    .context("cannot read random numbers")?,
+            };
+        }
+        // The tasks take turns; each has one clip here.
+        let tasks: Vec<usize> = (0..unrolls).map(|unroll| unroll % spec.tasks.len()).collect();
+        Ok(Self {
+            floats,
+            clips: tasks.iter().flat_map(|task| vec![*task as u32; shape.length + 1]).collect(),
+            tasks,
+            shape: MinibatchShape { unrolls, tasks: spec.tasks.len(), unroll: shape },
+        })
+    }
+
+    pub(super) fn to_tensors(&self, device: Device) -> Result<MinibatchTensors> {
+        let source = MinibatchSource {
+            floats: self.floats.each_ref().map(|_, values| values.as_slice()),
+            clip: &self.clips,
+            image: &[],
+            tasks: &self.tasks,
+        };
+        Ok(MinibatchTensors::new(&source, &self.shape, device)?)
+    }
+}

@@ -1,0 +1,218 @@
+//! The sections of learning, experience, actors, the learner and the budget.
+
+use serde::{Deserialize, Serialize};
+
+use crate::device::{DeviceName, MatmulPrecision};
+
+/// V-MPO.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Vmpo {
+    /// γ (S).
+    pub discount: f64,
+    /// ε_η: limit of the E-step (S).
+    pub epsilon_eta: f64,
+    /// ε_μ: limit on the mean (S).
+    pub epsilon_mean: f64,
+    /// ε_Σ: limit on the covariance (S: MLP and LSTM; 1e-3 for mixture and product).
+    pub epsilon_std: f64,
+    /// ε_discrete: limit on a mixture's weights (S).
+    pub epsilon_discrete: f64,
+    /// η at the start (S).
+    pub initial_temperature: f64,
+    /// α_μ at the start (S).
+    pub initial_alpha_mean: f64,
+    /// α_Σ at the start (S).
+    pub initial_alpha_std: f64,
+    /// α_discrete at the start (S).
+    pub initial_alpha_discrete: f64,
+    /// Share of the valid steps that the E-step imitates: those with the best advantages (S: the top half).
+    pub top_fraction: f64,
+    /// In joint training each task has its own temperature and its own best steps, because advantages of different tasks
+    /// have different scales (D). Without this, one E-step ranks the steps of all tasks.
+    pub temperature_per_task: bool,
+    /// Gradient steps between two updates of the target network. Actors act with the target network (V).
+    pub target_period: u64,
+    /// Gradient steps on each batch (V: 1).
+    pub gradient_steps: usize,
+    /// Unrolls in a gradient step. The number must divide the batch (V: the whole batch).
+    pub minibatch_unrolls: usize,
+    /// λ of the return: 1 is the paper's n-step return; less is GAE's mixture of returns (D).
+    pub lambda: f64,
+    /// Entropy bonus (V: none).
+    pub entropy: f64,
+    /// Weight of the value loss (D).
+    pub value_weight: f64,
+    /// Rows at the start of an unroll that only build up the recurrent state of the value function. No loss uses them (D).
+    pub value_burn_in: usize,
+}
+
+impl Default for Vmpo {
+    fn default() -> Self {
+        Self {
+            discount: 0.95,
+            epsilon_eta: 0.1,
+            epsilon_mean: 0.1,
+            epsilon_std: 1e-5,
+            epsilon_discrete: 1e-3,
+            initial_temperature: 1.0,
+            initial_alpha_mean: 1.0,
+            initial_alpha_std: 1.0,
+            initial_alpha_discrete: 1.0,
+            top_fraction: 0.5,
+            temperature_per_task: true,
+            target_period: 100,
+            gradient_steps: 1,
+            minibatch_unrolls: 128,
+            lambda: 1.0,
+            entropy: 0.0,
+            value_weight: 1.0,
+            value_burn_in: 0,
+        }
+    }
+}
+
+/// Adam.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Optimiser {
+    /// Learning rate of every network (S).
+    pub learning_rate: f64,
+    /// Learning rate of the multipliers (S: the same).
+    pub multiplier_learning_rate: f64,
+    /// Share of the learning rate that is left at the budget's end. It falls linearly; 1 keeps it constant (S).
+    pub final_learning_rate_share: f64,
+    /// β₁.
+    pub beta1: f64,
+    /// β₂.
+    pub beta2: f64,
+    /// ε.
+    pub epsilon: f64,
+    /// Limit of the global gradient norm. Larger gradients are scaled down; 0 is no limit (V).
+    pub max_gradient_norm: f64,
+}
+
+impl Default for Optimiser {
+    fn default() -> Self {
+        Self {
+            learning_rate: 1e-4,
+            multiplier_learning_rate: 1e-4,
+            final_learning_rate_share: 1.0,
+            beta1: 0.9,
+            beta2: 0.999,
+            epsilon: 1e-8,
+            max_gradient_norm: 0.0,
+        }
+    }
+}
+
+/// Unrolls and batches.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Unroll {
+    /// T: transitions in an unroll (S).
+    pub length: usize,
+    /// B: unrolls in a batch (S).
+    pub batch: usize,
+    /// Largest age of an unroll's parameters, in published versions. An older unroll is refused as stale (D).
+    pub max_staleness: u64,
+    /// Batches that are assembled while the learner trains on one: 1 keeps the device busy (D), 0 keeps the experience new.
+    pub ahead: usize,
+    /// Lockstep, for debugging and tests. A batch has one unroll of each of `batch` environments, made with the newest
+    /// parameters. The seed alone decides all learned parameters, for any number of actors. Lockstep is slower. It needs
+    /// `ahead` 0 and no budget in minutes.
+    pub lockstep: bool,
+}
+
+impl Default for Unroll {
+    fn default() -> Self {
+        Self { length: 32, batch: 128, max_staleness: 1000, ahead: 1, lockstep: false }
+    }
+}
+
+/// One actor process.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Actor {
+    /// Threads. Each has its own environments and its own copy of the policy.
+    pub threads: usize,
+    /// Environments in a thread. One batched forward pass computes all their actions.
+    pub environments: usize,
+}
+
+impl Default for Actor {
+    fn default() -> Self {
+        Self { threads: 1, environments: 16 }
+    }
+}
+
+/// Regression of the policy towards the servo action of frame t + 1, on rollouts of that action with noise (D; not in the
+/// paper).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct WarmStart {
+    /// Gradient steps. 0 is no warm start.
+    pub steps: u64,
+    /// Environment steps that are collected with the servo action before the first gradient step. In joint training this
+    /// includes the steps of tasks without a reference.
+    pub demonstration_steps: u64,
+    /// Standard deviation of the noise added to the servo action.
+    pub noise: f64,
+    /// Unrolls in a regression step.
+    pub minibatch_unrolls: usize,
+    /// Adam's learning rate while regressing.
+    pub learning_rate: f64,
+}
+
+impl Default for WarmStart {
+    fn default() -> Self {
+        Self { steps: 0, demonstration_steps: 32_768, noise: 0.1, minibatch_unrolls: 32, learning_rate: 1e-3 }
+    }
+}
+
+/// The learner as a service.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Learner {
+    /// The device on which the update runs.
+    pub device: DeviceName,
+    /// How precisely XLA multiplies matrices. The losses are float32 on every device.
+    pub matmul_precision: MatmulPrecision,
+    /// Threads of libtorch in the update.
+    pub threads: usize,
+    /// Seconds between checkpoints.
+    pub checkpoint_seconds: f64,
+    /// Checkpoints kept.
+    pub checkpoints_kept: usize,
+    /// Seconds between metric lines.
+    pub metrics_seconds: f64,
+    /// A gradient step with a loss or gradient that is not finite is skipped. After this many skipped steps in a row, the
+    /// learner restores its last good state (D).
+    pub restore_after: u64,
+}
+
+impl Default for Learner {
+    fn default() -> Self {
+        Self {
+            device: DeviceName::Cpu,
+            matmul_precision: MatmulPrecision::Highest,
+            threads: 1,
+            checkpoint_seconds: 60.0,
+            checkpoints_kept: 3,
+            metrics_seconds: 5.0,
+            restore_after: 10,
+        }
+    }
+}
+
+/// When the run ends: at the first limit that is reached. 0 is no limit.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Budget {
+    /// Minutes since the first unroll. Time before a restart of the learner counts, too.
+    pub minutes: f64,
+    /// Environment steps of the batches that were trained on, in the whole run.
+    pub environment_steps: u64,
+    /// Batches that were trained on, in the whole run.
+    pub updates: u64,
+}

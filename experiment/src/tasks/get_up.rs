@@ -1,0 +1,87 @@
+//! Getting up and standing.
+
+use serde::{Deserialize, Serialize};
+
+use super::{StartPose, TaskParameters, fixed};
+use crate::fault::{Fault, Section};
+
+/// Get up and stand (supplement 1.3; no published code). Numbers without a mark are decisions of this project.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GetUp {
+    /// Share of the episodes that begin with a lying humanoid (S: "about 5%"). The others begin with a standing humanoid
+    /// above the ground.
+    pub lying_share: f64,
+    /// Where lying poses come from.
+    pub lying_pose: LyingPose,
+    /// Height of the head with the largest reward, m: the height in the upright pose.
+    pub target_height: f64,
+    /// Range of a standing start's height above the ground, m.
+    pub drop_height: [f64; 2],
+    /// Standard deviation of a standing start's tilt about a random horizontal axis, rad.
+    pub tilt: f64,
+    /// Standard deviation of a standing start's joint angles around the start pose, rad.
+    pub joint_noise: f64,
+    /// Standard deviation of each component of the root's velocity in a standing start, m/s.
+    pub velocity_noise: f64,
+    /// Standard deviation of the root's angular velocities and of the joints' velocities in a standing start, rad/s.
+    pub angular_velocity_noise: f64,
+    /// The pose of standing starts, before noise is added.
+    pub start_pose: StartPose,
+    /// Seconds an episode lasts (S).
+    pub time_limit: f64,
+}
+
+impl Default for GetUp {
+    fn default() -> Self {
+        Self {
+            lying_share: 0.05,
+            lying_pose: LyingPose::Simulated,
+            target_height: 1.808,
+            drop_height: [0.02, 0.15],
+            tilt: 0.15,
+            joint_noise: 0.1,
+            velocity_noise: 0.3,
+            angular_velocity_noise: 0.5,
+            start_pose: StartPose::Upright,
+            time_limit: 8.0,
+        }
+    }
+}
+
+/// Where lying poses come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LyingPose {
+    /// The humanoid falls from a random pose and is simulated for three seconds without control.
+    Simulated,
+    /// The first frame of each clip of the experiment. It is meant for clips of getting up: dm_control's subset `get_up`.
+    Clips,
+}
+
+impl TaskParameters for GetUp {
+    fn check(&self, section: Section) -> Result<(), Fault> {
+        let share = self.lying_share;
+        section.ensure("lying_share", share, (0.0..=1.0).contains(&share), "must be in [0, 1]")?;
+        section.metres("target_height", self.target_height)?;
+        section.range("drop_height", self.drop_height, [0.0, 10.0])?;
+        section.deviation("tilt", self.tilt)?;
+        section.deviation("joint_noise", self.joint_noise)?;
+        section.deviation("velocity_noise", self.velocity_noise)?;
+        section.deviation("angular_velocity_noise", self.angular_velocity_noise)?;
+        section.seconds("time_limit", self.time_limit)
+    }
+
+    fn reward_terms(&self) -> &'static [&'static str] {
+        &["height"]
+    }
+
+    fn observations(&self) -> Result<Vec<(String, usize)>, String> {
+        // The root's height, m.
+        Ok(fixed(&[("body_height", 1)]))
+    }
+
+    fn max_reward(&self) -> f64 {
+        1.0
+    }
+}

@@ -1,0 +1,178 @@
+//! Unrolls as tensors.
+
+use std::ops::Index;
+
+use comic_networks::Routing;
+use comic_proto::{Field, PerField};
+use tch::{Device, Tensor};
+
+use crate::algorithm::error::Error;
+use crate::algorithm::shape::MinibatchShape;
+use crate::device::upload;
+
+/// The fields of a batch as contiguous slices, `[B, rows, width]` each, in the wire's own element types.
+#[derive(Clone, Debug)]
+pub struct MinibatchSource<'a> {
+    /// Every field of `f32`; empty for [`Field::Clip`] and [`Field::Image`].
+    pub floats: PerField<&'a [f32]>,
+    /// [`Field::Clip`].
+    pub clip: &'a [u32],
+    /// [`Field::Image`]; empty when the task has no camera.
+    pub image: &'a [u8],
+    /// The task of each unroll, `[B]`.
+    pub tasks: &'a [usize],
+}
+
+/// A minibatch of unrolls, batch first, one tensor for each field: float32, but int64 for [`Field::Clip`] and uint8 for
+/// [`Field::Image`]. A field with one number in each row is `[B, rows]`, [`Field::State`] is `[B, S]`, every other field
+/// `[B, rows, width]`.
+///
+/// The numbers of a row that holds no transition (its action, distribution, reward, latent) are blanked when the tensors
+/// are made, so no formula can use them. Its observation stays, because a truncated episode is bootstrapped there.
+#[derive(Debug)]
+pub struct MinibatchTensors {
+    fields: PerField<Tensor>,
+    shape: MinibatchShape,
+    /// One more than the largest clip index: known on the host, so no step has to ask the device.
+    clips: usize,
+    /// The task of each unroll, `[B]`, on the host, where it is decided which network each goes through.
+    tasks: Vec<usize>,
+    routing: Routing,
+}
+
+impl MinibatchTensors {
+    /// Copies the fields onto `device`.
+    ///
+    /// # Errors
+    /// [`Error::Length`] when a slice is not as long as `shape` says; [`Error::Task`] when there is no such task.
+    pub fn new(source: &MinibatchSource<'_>, shape: &MinibatchShape, device: Device) -> Result<Self, Error> {
+        check_length("tasks", source.tasks.len(), &[shape.unrolls])?;
+        if let Some(task) = source.tasks.iter().copied().find(|task| *task >= shape.tasks) {
+            return Err(Error::Task { task, tasks: shape.tasks });
+        }
+        let uploaded = |field: Field| {
+            let size = size(field, shape);
+            let elements = match field {
+                Field::Clip => source.clip.len(),
+                Field::Image => source.image.len(),
+                _ => source.floats[field].len(),
+            };
+            check_length(field.name(), elements, &size)?;
+            let size: Vec<i64> = size.into_iter().map(|size| size as i64).collect();
+            let tensor = match field {
+                Field::Clip => {
+                    let clips: Vec<i64> = source.clip.iter().map(|clip| i64::from(*clip)).collect();
+                    upload(&clips, &size, device)
+                }
+                Field::Image => upload(source.image, &size, device),
+                _ => upload(source.floats[field], &size, device),
+            };
+            Ok::<Tensor, Error>(tensor?)
+        };
+        let valid = uploaded(Field::Valid)?;
+        let mask = valid.gt(0.5).unsqueeze(-1);
+        let mut fields = PerField::from_fn(|_| Tensor::new());
+        for (field, tensor) in fields.iter_mut() {
+            *tensor = match (field, field.blank(&shape.unroll)) {
+                (Field::Valid, _) => valid.shallow_clone(),
+                (Field::Discount, _) => uploaded(field)? * &valid,
+                (_, Some(blank)) => uploaded(field)?.f_where_scalarother(&mask, blank)?,
+                (_, None) => uploaded(field)?,
+            };
+        }
+        Ok(Self {
+            fields,
+            shape: *shape,
+            clips: source.clip.iter().max().map_or(0, |clip| *clip as usize + 1),
+            routing: Routing::blocked(source.tasks, shape.tasks, device),
+            tasks: source.tasks.to_vec(),
+        })
+    }
+
+    /// The sizes of this minibatch.
+    pub fn shape(&self) -> MinibatchShape {
+        self.shape
+    }
+
+    /// The task of each unroll, `[B]`.
+    pub fn tasks(&self) -> &[usize] {
+        &self.tasks
+    }
+
+    /// Which of the tasks' networks each unroll goes through.
+    pub fn routing(&self) -> &Routing {
+        &self.routing
+    }
+
+    /// One more than the largest clip index.
+    pub fn clips(&self) -> usize {
+        self.clips
+    }
+
+    /// The camera images, `[B, T+1, I]`, uint8; `None` when the task has no camera.
+    pub fn image(&self) -> Option<&Tensor> {
+        (self.shape.unroll.image > 0).then(|| &self.fields[Field::Image])
+    }
+
+    /// The unrolls at `unrolls`, each below B, copied.
+    pub fn select(&self, unrolls: &[usize]) -> Self {
+        let indices = self.indices(unrolls);
+        let tasks: Vec<usize> = unrolls.iter().filter_map(|unroll| self.tasks.get(*unroll).copied()).collect();
+        Self {
+            routing: Routing::blocked(&tasks, self.shape.tasks, self.device()),
+            tasks,
+            shape: MinibatchShape { unrolls: unrolls.len(), ..self.shape },
+            fields: self.fields.each_ref().map(|_, tensor| tensor.index_select(0, &indices)),
+            clips: self.clips,
+        }
+    }
+
+    fn device(&self) -> Device {
+        self.fields[Field::Valid].device()
+    }
+
+    fn indices(&self, unrolls: &[usize]) -> Tensor {
+        let indices: Vec<i64> = unrolls.iter().map(|unroll| *unroll as i64).collect();
+        Tensor::from_slice(&indices).to_device(self.device())
+    }
+
+    /// Replaces z_{t−1} of M unrolls by `latents`, z_t as recomputed for them, `[M, T, Z]`. Row t takes z_{t−1}; an
+    /// episode's first row takes zeros; row 0 keeps its value, because the step before it is not part of the unroll.
+    pub fn refresh_previous_latent(&mut self, unrolls: &[usize], latents: &Tensor) {
+        let indices = &self.indices(unrolls);
+        tch::no_grad(|| {
+            let steps = latents.size()[1] - 1;
+            let stored = self.fields[Field::PreviousLatent].index_select(0, indices);
+            let within = 1.0 - self.fields[Field::First].index_select(0, indices).narrow(1, 1, steps);
+            let valid = self.fields[Field::Valid].index_select(0, indices).narrow(1, 1, steps);
+            let kept: Tensor = within * valid;
+            let moved = latents.narrow(1, 0, steps) * kept.unsqueeze(-1);
+            let refreshed = Tensor::cat(&[stored.narrow(1, 0, 1), moved], 1);
+            let _ = self.fields[Field::PreviousLatent].index_copy_(0, indices, &refreshed);
+        });
+    }
+}
+
+/// The tensor of a field.
+impl Index<Field> for MinibatchTensors {
+    type Output = Tensor;
+
+    fn index(&self, field: Field) -> &Tensor {
+        &self.fields[field]
+    }
+}
+
+/// The size of a field's tensor.
+fn size(field: Field, shape: &MinibatchShape) -> Vec<usize> {
+    let (rows, width) = (field.rows(shape.unroll.length), field.width(&shape.unroll));
+    match field {
+        Field::Discount | Field::Valid | Field::First | Field::Clip => vec![shape.unrolls, rows],
+        Field::State => vec![shape.unrolls, width],
+        _ => vec![shape.unrolls, rows, width],
+    }
+}
+
+fn check_length(field: &'static str, found: usize, size: &[usize]) -> Result<(), Error> {
+    let expected = size.iter().product();
+    if found == expected { Ok(()) } else { Err(Error::Length { field, expected, found }) }
+}

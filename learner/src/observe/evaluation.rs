@@ -1,0 +1,27 @@
+//! Evaluations that actors report.
+
+use crate::checkpoint::Evaluated;
+
+/// An evaluation that an actor reported.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Evaluation {
+    /// The run whose parameters were evaluated, if the actor knows it.
+    pub run: Option<u64>,
+    /// The learner epoch of the parameters.
+    pub epoch: u64,
+    /// The version of the parameters.
+    pub version: u64,
+    /// Updates before the checkpoint that holds them.
+    pub updates: u64,
+    /// As `comic-actor evaluate --json` prints it.
+    pub json: String,
+}
+
+impl Evaluation {
+    /// The result that checkpoints are compared by; `None` if the report has no mean.
+    pub(crate) fn evaluated(&self) -> Option<Evaluated> {
+        let report: serde_json::Value = serde_json::from_str(&self.json).ok()?;
+        let normalised_reward = report["overall"]["normalised_reward"].as_f64()?;
+        Some(Evaluated { run: self.run, epoch: self.epoch, updates: self.updates, normalised_reward })
+    }
+}

@@ -1,0 +1,60 @@
+//! From an image to a few numbers.
+
+use comic_experiment::IMAGE_SIZE;
+use tch::{Kind, Tensor, nn};
+
+use crate::layers::linear;
+
+/// Two strided convolutions and a linear layer: 8×8 with stride 4 to 16 channels, 4×4 with stride 2 to 32, ELU after
+/// each; then Linear → LayerNorm → tanh like every first layer. Small enough for two cores; the supplement is silent on
+/// images under V-MPO (its ResNet is that of the off-policy transfer).
+#[derive(Debug)]
+pub(crate) struct ImageEncoder {
+    first: nn::Conv2D,
+    second: nn::Conv2D,
+    output: nn::Linear,
+    norm: nn::LayerNorm,
+    features: i64,
+}
+
+/// Height and width of an image.
+const SIZE: i64 = IMAGE_SIZE as i64;
+/// What the second convolution gives: 32 channels of 6×6 from 64×64.
+const SECOND: i64 = 32 * 6 * 6;
+
+impl ImageEncoder {
+    pub(crate) fn new(path: &nn::Path, features: i64) -> Self {
+        let convolution = |name: &str, input: i64, output: i64, size: i64, stride: i64| {
+            let bound = 1.0 / ((input * size * size) as f64).sqrt();
+            let config = nn::ConvConfig {
+                stride,
+                ws_init: nn::Init::Uniform { lo: -bound, up: bound },
+                bs_init: nn::Init::Const(0.0),
+                ..nn::ConvConfig::default()
+            };
+            nn::conv2d(path / name, input, output, size, config)
+        };
+        Self {
+            first: convolution("first", 3, 16, 8, 4),
+            second: convolution("second", 16, 32, 4, 2),
+            output: linear(&(path / "output"), SECOND, features, 1.0),
+            norm: nn::layer_norm(path / "norm", vec![features], nn::LayerNormConfig::default()),
+            features,
+        }
+    }
+
+    /// Width of what [`ImageEncoder::forward`] gives.
+    pub(crate) fn output(&self) -> i64 {
+        self.features
+    }
+
+    /// `[.., 64·64·3]` uint8, pixels of red, green and blue row by row, to `[.., F]`.
+    pub(crate) fn forward(&self, image: &Tensor) -> Tensor {
+        let mut leading = image.size();
+        leading.pop();
+        let pixels = image.reshape([-1, SIZE, SIZE, 3]).permute([0, 3, 1, 2]).to_kind(Kind::Float) / 255.0 - 0.5;
+        let seen = pixels.apply(&self.first).elu_().apply(&self.second).elu_().flatten(1, -1);
+        leading.push(self.features);
+        seen.apply(&self.output).apply(&self.norm).tanh_().reshape(leading)
+    }
+}
