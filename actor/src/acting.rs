@@ -1,200 +1,69 @@
-//! What one batched forward pass reads and writes, and who can make one.
+//! What one batched forward pass reads and writes.
 
-use comic_experiment::{Experiment, TaskSpec};
-use comic_proto::UnrollShape;
+use std::ops::{Index, IndexMut};
+
+use comic_proto::{Field, PerField, UnrollShape};
 use rand::Rng;
 use rand_distr::{Distribution as _, StandardNormal};
 
 use crate::Error;
 
-/// Widths of the arrays of an [`ActingBatch`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ActingSizes {
-    /// P.
-    pub proprioception: usize,
-    /// X.
-    pub task: usize,
-    /// Z.
-    pub latent: usize,
-    /// A.
-    pub action: usize,
-    /// I, bytes; 0 when the task is blind.
-    pub image: usize,
-    /// K, Gaussians that the action is drawn from.
-    pub components: usize,
-    /// S, numbers that the policy remembers.
-    pub state: usize,
-}
+/// The fields of an unroll that a forward pass reads or writes.
+const FIELDS: [Field; 8] = [
+    Field::Proprioception,
+    Field::Task,
+    Field::PreviousLatent,
+    Field::LatentNoise,
+    Field::State,
+    Field::Mean,
+    Field::Std,
+    Field::LogWeights,
+];
 
-impl ActingSizes {
-    /// The widths of an experiment's acting arrays.
-    pub fn new(spec: &TaskSpec, experiment: &Experiment) -> Self {
-        Self::from(&UnrollShape::new(spec, experiment))
-    }
-
-    /// The weights' width: one component needs none.
-    fn weights(&self) -> usize {
-        if self.components > 1 { self.components } else { 0 }
-    }
-}
-
-impl From<&UnrollShape> for ActingSizes {
-    fn from(shape: &UnrollShape) -> Self {
-        let UnrollShape { length: _, proprioception, task, action, latent, reward_terms: _, image, components, state } =
-            *shape;
-        Self { proprioception, task, latent, action, image, components, state }
-    }
-}
-
-/// The observations of E environments, and what the behaviour policy makes of them: row-major f32 arrays.
+/// The observations of E environments and the action distributions of the behaviour policy. Arrays are row-major.
+///
+/// Indexed by a [`Field`] it gives `[E, width]` f32; fields that acting has no part in are empty. Actors read and write:
+///
+/// - `Proprioception` and `Task`: the observation;
+/// - `PreviousLatent`: z_{t−1}, zero at an episode's first step;
+/// - `LatentNoise`: the standard normal noise that makes z_t;
+/// - `State`: the recurrent state, zero at an episode's first step; the forward pass reads and writes it;
+/// - `Mean`, `Std`, `LogWeights`: the action distribution, written by the forward pass.
 #[derive(Clone, Debug)]
 pub struct ActingBatch {
     environments: usize,
-    sizes: ActingSizes,
-    /// `[E, P]`.
-    pub proprioception: Vec<f32>,
-    /// `[E, X]`.
-    pub task: Vec<f32>,
-    /// What the humanoids see, `[E, I]`.
-    pub image: Vec<u8>,
-    /// z_{t−1} `[E, Z]`; zero at an episode's first step.
-    pub previous_latent: Vec<f32>,
-    /// The standard normal noise that makes z_t `[E, Z]`.
-    pub latent_noise: Vec<f32>,
+    widths: PerField<usize>,
+    fields: PerField<Vec<f32>>,
     /// z_t `[E, Z]`: written by the forward pass.
     pub latent: Vec<f32>,
-    /// Mean of each component `[E, K·A]`: written by the forward pass.
-    pub mean: Vec<f32>,
-    /// Standard deviation of each component `[E, K·A]`: written by the forward pass.
-    pub std: Vec<f32>,
-    /// ln of the components' weights `[E, K]`, empty where K is 1: written by the forward pass.
-    pub log_weights: Vec<f32>,
-    /// What the policy remembers `[E, S]`; zero at an episode's first step: read and written by the forward pass.
-    pub state: Vec<f32>,
-    /// Whose episode it is, `[E]`: the task's place among the tasks.
+    /// Camera images, `[E, I]`.
+    pub image: Vec<u8>,
+    /// The task of each environment's episode, `[E]`: its index among the tasks of the experiment.
     pub tasks: Vec<usize>,
 }
 
-/// One environment's row of an [`ActingBatch`].
+/// One environment's row of an [`ActingBatch`], indexed in the same way.
 #[derive(Debug)]
 pub struct ActingRow<'a> {
-    /// `[P]`.
-    pub proprioception: &'a mut [f32],
-    /// `[X]`.
-    pub task: &'a mut [f32],
-    /// `[I]`.
-    pub image: &'a mut [u8],
-    /// `[Z]`.
-    pub previous_latent: &'a mut [f32],
-    /// `[Z]`.
-    pub latent_noise: &'a mut [f32],
+    pub(crate) fields: PerField<&'a mut [f32]>,
     /// `[Z]`.
     pub latent: &'a mut [f32],
-    /// `[K·A]`.
-    pub mean: &'a mut [f32],
-    /// `[K·A]`.
-    pub std: &'a mut [f32],
-    /// `[K]`, or empty.
-    pub log_weights: &'a mut [f32],
-    /// `[S]`.
-    pub state: &'a mut [f32],
-    /// The task's place among the tasks.
-    pub of_task: &'a mut usize,
-}
-
-impl ActingRow<'_> {
-    /// Takes everything from another row of the same sizes.
-    pub fn copy_from(&mut self, other: &ActingRow<'_>) {
-        self.proprioception.copy_from_slice(other.proprioception);
-        self.task.copy_from_slice(other.task);
-        self.image.copy_from_slice(other.image);
-        self.previous_latent.copy_from_slice(other.previous_latent);
-        self.latent_noise.copy_from_slice(other.latent_noise);
-        self.latent.copy_from_slice(other.latent);
-        self.mean.copy_from_slice(other.mean);
-        self.std.copy_from_slice(other.std);
-        self.log_weights.copy_from_slice(other.log_weights);
-        self.state.copy_from_slice(other.state);
-        *self.of_task = *other.of_task;
-    }
-
-    /// Draws the latent's noise of the coming step.
-    pub fn draw_latent_noise(&mut self, rng: &mut impl Rng) {
-        fill_normal(self.latent_noise, rng);
-    }
-
-    /// A mind without memory: an episode's beginning.
-    pub fn forget(&mut self) {
-        self.previous_latent.fill(0.0);
-        self.state.fill(0.0);
-    }
-
-    /// Draws an action, unclipped: clipped actions must never be scored. Of a mixture first the component is drawn.
-    pub fn sample(&self, action: &mut [f32], rng: &mut impl Rng) {
-        let component = if self.log_weights.is_empty() { 0 } else { draw(self.log_weights, rng.random()) };
-        let place = component * action.len()..(component + 1) * action.len();
-        fill_normal(action, rng);
-        for ((action, mean), std) in action.iter_mut().zip(&self.mean[place.clone()]).zip(&self.std[place]) {
-            *action = mean + std * *action;
-        }
-    }
-
-    /// The action without noise, `[A]`: the mean of the likeliest component.
-    pub fn mode(&self) -> &[f32] {
-        let components = self.log_weights.len().max(1);
-        let actions = self.mean.len() / components;
-        let component = likeliest(self.log_weights);
-        &self.mean[component * actions..(component + 1) * actions]
-    }
-
-    /// Decides for one action, whatever the policy's form: every component is N(mean, std²), and they weigh the same.
-    /// `mean` is `[A]`.
-    pub fn decide(&mut self, mean: impl Fn(&mut [f32]), std: f32) {
-        let components = self.log_weights.len().max(1);
-        for component in self.mean.chunks_exact_mut((self.mean.len() / components).max(1)) {
-            mean(component);
-        }
-        self.std.fill(std);
-        self.log_weights.fill(-(components as f32).ln());
-    }
-}
-
-/// The component of the largest weight; the first where there is one component, which has none.
-fn likeliest(log_weights: &[f32]) -> usize {
-    let likelier = |best: usize, other: usize| if log_weights[other] > log_weights[best] { other } else { best };
-    (1..log_weights.len()).fold(0, likelier)
-}
-
-/// The component at `uniform` in [0, 1) of the weights' sum.
-fn draw(log_weights: &[f32], uniform: f32) -> usize {
-    let mut left = uniform;
-    for (component, log_weight) in log_weights.iter().enumerate() {
-        left -= log_weight.exp();
-        if left < 0.0 {
-            return component;
-        }
-    }
-    // Rounding may leave a little over: then it is the likeliest.
-    likeliest(log_weights)
+    /// `[I]`.
+    pub image: &'a mut [u8],
+    /// The task's index among the tasks of the experiment.
+    pub task: &'a mut usize,
 }
 
 impl ActingBatch {
-    /// Zeros for `environments` environments.
-    pub fn new(environments: usize, sizes: ActingSizes) -> Self {
-        let zeros = |width| vec![0.0; environments * width];
+    /// Zeros for `environments` environments whose unrolls have this shape.
+    pub fn new(environments: usize, shape: &UnrollShape) -> Self {
+        let widths = PerField::from_fn(|field| if FIELDS.contains(&field) { shape.width(field) } else { 0 });
         Self {
             environments,
-            sizes,
-            proprioception: zeros(sizes.proprioception),
-            task: zeros(sizes.task),
-            image: vec![0; environments * sizes.image],
-            previous_latent: zeros(sizes.latent),
-            latent_noise: zeros(sizes.latent),
-            latent: zeros(sizes.latent),
-            mean: zeros(sizes.components * sizes.action),
-            std: zeros(sizes.components * sizes.action),
-            log_weights: zeros(sizes.weights()),
-            state: zeros(sizes.state),
+            widths,
+            fields: widths.map(|_, width| vec![0.0; environments * width]),
+            latent: vec![0.0; environments * shape.latent],
+            image: vec![0; environments * shape.image],
             tasks: vec![0; environments],
         }
     }
@@ -204,37 +73,123 @@ impl ActingBatch {
         self.environments
     }
 
-    /// The widths.
-    pub fn sizes(&self) -> ActingSizes {
-        self.sizes
-    }
-
     /// The row of one environment, counted from 0.
     pub fn row(&mut self, environment: usize) -> ActingRow<'_> {
         fn part<T>(array: &mut [T], environment: usize, width: usize) -> &mut [T] {
             &mut array[environment * width..(environment + 1) * width]
         }
-        let ActingSizes { proprioception, task, latent, action, image, components, state } = self.sizes;
-        let weights = self.sizes.weights();
+        let (widths, environments) = (&self.widths, self.environments.max(1));
+        let (latent, image) = (self.latent.len() / environments, self.image.len() / environments);
         ActingRow {
-            proprioception: part(&mut self.proprioception, environment, proprioception),
-            task: part(&mut self.task, environment, task),
-            image: part(&mut self.image, environment, image),
-            previous_latent: part(&mut self.previous_latent, environment, latent),
-            latent_noise: part(&mut self.latent_noise, environment, latent),
+            fields: self.fields.each_mut().map(|field, array| part(array, environment, widths[field])),
             latent: part(&mut self.latent, environment, latent),
-            mean: part(&mut self.mean, environment, components * action),
-            std: part(&mut self.std, environment, components * action),
-            log_weights: part(&mut self.log_weights, environment, weights),
-            state: part(&mut self.state, environment, state),
-            of_task: &mut self.tasks[environment],
+            image: part(&mut self.image, environment, image),
+            task: &mut self.tasks[environment],
+        }
+    }
+}
+
+impl Index<Field> for ActingBatch {
+    type Output = [f32];
+
+    fn index(&self, field: Field) -> &[f32] {
+        &self.fields[field]
+    }
+}
+
+impl IndexMut<Field> for ActingBatch {
+    fn index_mut(&mut self, field: Field) -> &mut [f32] {
+        &mut self.fields[field]
+    }
+}
+
+impl Index<Field> for ActingRow<'_> {
+    type Output = [f32];
+
+    fn index(&self, field: Field) -> &[f32] {
+        self.fields[field]
+    }
+}
+
+impl IndexMut<Field> for ActingRow<'_> {
+    fn index_mut(&mut self, field: Field) -> &mut [f32] {
+        self.fields[field]
+    }
+}
+
+impl ActingRow<'_> {
+    /// Copies everything from another row of the same shape.
+    pub fn copy_from(&mut self, other: &ActingRow<'_>) {
+        for (field, values) in self.fields.iter_mut() {
+            values.copy_from_slice(&other[field]);
+        }
+        self.latent.copy_from_slice(other.latent);
+        self.image.copy_from_slice(other.image);
+        *self.task = *other.task;
+    }
+
+    /// Draws the latent's noise of the coming step.
+    pub fn draw_latent_noise(&mut self, rng: &mut impl Rng) {
+        fill_normal(&mut self[Field::LatentNoise], rng);
+    }
+
+    /// Sets the recurrent state and the previous latent to zero, as at an episode's beginning.
+    pub fn reset_recurrent_state(&mut self) {
+        self[Field::PreviousLatent].fill(0.0);
+        self[Field::State].fill(0.0);
+    }
+
+    /// Draws an action from the distribution. It is not clipped: only the action as drawn has the distribution's density.
+    /// A mixture draws its component first.
+    pub fn sample(&self, action: &mut [f32], rng: &mut impl Rng) {
+        let log_weights = &self[Field::LogWeights];
+        let component = if log_weights.is_empty() { 0 } else { draw_component(log_weights, rng.random()) };
+        let place = component * action.len()..(component + 1) * action.len();
+        fill_normal(action, rng);
+        let (mean, std) = (&self[Field::Mean][place.clone()], &self[Field::Std][place]);
+        for ((action, mean), std) in action.iter_mut().zip(mean).zip(std) {
+            *action = mean + std * *action;
         }
     }
 
-    /// Draws the latents' noise of the coming step, all from one source.
-    pub fn draw_latent_noise(&mut self, rng: &mut impl Rng) {
-        fill_normal(&mut self.latent_noise, rng);
+    /// The action without noise, `[A]`: the mean of the most likely component.
+    pub fn mode(&self) -> &[f32] {
+        let (mean, log_weights) = (&self[Field::Mean], &self[Field::LogWeights]);
+        let actions = mean.len() / log_weights.len().max(1);
+        let component = most_likely(log_weights);
+        &mean[component * actions..(component + 1) * actions]
     }
+
+    /// Makes the action distribution N(mean, std²): every component has these values, and all weights are equal. `mean`
+    /// fills `[A]`.
+    pub fn set_gaussian(&mut self, mean: impl Fn(&mut [f32]), std: f32) {
+        let components = self[Field::LogWeights].len().max(1);
+        let means = &mut self[Field::Mean];
+        for component in means.chunks_exact_mut((means.len() / components).max(1)) {
+            mean(component);
+        }
+        self[Field::Std].fill(std);
+        self[Field::LogWeights].fill(-(components as f32).ln());
+    }
+}
+
+/// The component with the largest weight. A single component has no weight and is the first.
+fn most_likely(log_weights: &[f32]) -> usize {
+    let likelier = |best: usize, other: usize| if log_weights[other] > log_weights[best] { other } else { best };
+    (1..log_weights.len()).fold(0, likelier)
+}
+
+/// The component at `uniform` in [0, 1) of the weights' sum.
+fn draw_component(log_weights: &[f32], uniform: f32) -> usize {
+    let mut left = uniform;
+    for (component, log_weight) in log_weights.iter().enumerate() {
+        left -= log_weight.exp();
+        if left < 0.0 {
+            return component;
+        }
+    }
+    // Rounding can make the sum a little less than 1.
+    most_likely(log_weights)
 }
 
 /// Fills `values` with independent draws of N(0, 1).
@@ -244,28 +199,28 @@ fn fill_normal(values: &mut [f32], rng: &mut impl Rng) {
     }
 }
 
-/// What the simulator sees of an action: each dimension within [−1, 1], and 0 where it is not a number.
+/// The action for the simulator: each dimension within [−1, 1], and 0 instead of NaN.
 pub fn clip_action(action: &[f32], clipped: &mut [f32]) {
     for (clipped, action) in clipped.iter_mut().zip(action) {
         *clipped = if action.is_nan() { 0.0 } else { action.clamp(-1.0, 1.0) };
     }
 }
 
-/// Whoever turns observations into latents and action distributions, for all environments of a thread at once.
+/// Makes latents and action distributions of observations, for all environments of a thread at once.
 ///
-/// The hot loop is generic over it, so that the law of its rows is tested without libtorch.
+/// The acting loop is generic over it, so that the rows of unrolls are tested without libtorch.
 pub trait ForwardPass {
-    /// Takes new parameters (safetensors).
+    /// Loads new parameters (safetensors).
     ///
     /// # Errors
-    /// When they do not fit; the ones before stay in force.
+    /// When they do not fit; the parameters before stay in use.
     fn load(&mut self, parameters: &[u8]) -> Result<(), Error>;
 
-    /// Reads observations, previous latents, latent noise and state; writes `latent`, `mean`, `std`, `log_weights` and
-    /// the state after.
+    /// Reads observations, previous latents, latent noise and recurrent state. Writes the latent, the action distribution
+    /// and the next recurrent state.
     ///
     /// # Errors
-    /// When the library beneath fails.
+    /// When libtorch fails.
     fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error>;
 }
 
@@ -279,18 +234,18 @@ impl<F: ForwardPass + ?Sized> ForwardPass for Box<F> {
     }
 }
 
-/// A forward pass for each environment alone. The order in which a library adds up depends on the size of the batch, so
-/// this is how an environment's numbers do not depend on how many others there are.
+/// A forward pass for each environment alone. The order of a library's sums depends on the size of the batch. With a batch
+/// of one, an environment's numbers do not depend on the number of environments.
 #[derive(Debug)]
 pub struct OneByOne<F> {
     forward: F,
-    alone: ActingBatch,
+    single: ActingBatch,
 }
 
 impl<F: ForwardPass> OneByOne<F> {
-    /// By this forward pass, over arrays of these widths.
-    pub fn new(forward: F, sizes: ActingSizes) -> Self {
-        Self { forward, alone: ActingBatch::new(1, sizes) }
+    /// Uses this forward pass for environments whose unrolls have this shape.
+    pub fn new(forward: F, shape: &UnrollShape) -> Self {
+        Self { forward, single: ActingBatch::new(1, shape) }
     }
 }
 
@@ -301,9 +256,9 @@ impl<F: ForwardPass> ForwardPass for OneByOne<F> {
 
     fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
         for environment in 0..batch.environments() {
-            self.alone.row(0).copy_from(&batch.row(environment));
-            self.forward.forward(&mut self.alone)?;
-            batch.row(environment).copy_from(&self.alone.row(0));
+            self.single.row(0).copy_from(&batch.row(environment));
+            self.forward.forward(&mut self.single)?;
+            batch.row(environment).copy_from(&self.single.row(0));
         }
         Ok(())
     }
@@ -316,38 +271,48 @@ mod tests {
 
     use super::*;
 
-    /// Adds the batch's size to what it reads, so that whoever depends on it shows.
-    struct Sizes;
+    /// Adds the batch's size to the recurrent state.
+    struct AddsBatchSize;
 
-    impl ForwardPass for Sizes {
+    impl ForwardPass for AddsBatchSize {
         fn load(&mut self, _: &[u8]) -> Result<(), Error> {
             Ok(())
         }
 
         fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
             let environments = batch.environments() as f32;
-            batch.state.iter_mut().for_each(|value| *value += environments);
+            batch[Field::State].iter_mut().for_each(|value| *value += environments);
             Ok(())
         }
     }
 
     #[test]
     fn one_by_one_every_environment_is_a_batch_of_its_own() {
-        let mut batch = ActingBatch::new(3, SIZES);
-        batch.state = (0..12).map(|value| value as f32).collect();
-        OneByOne::new(Sizes, SIZES).forward(&mut batch).unwrap();
-        assert_eq!(batch.state, (1..13).map(|value| value as f32).collect::<Vec<_>>());
+        let mut batch = ActingBatch::new(3, &SHAPE);
+        let state: Vec<f32> = (0..12).map(|value| value as f32).collect();
+        batch[Field::State].copy_from_slice(&state);
+        OneByOne::new(AddsBatchSize, &SHAPE).forward(&mut batch).unwrap();
+        assert_eq!(batch[Field::State], (1..13).map(|value| value as f32).collect::<Vec<_>>());
     }
 
-    const SIZES: ActingSizes =
-        ActingSizes { proprioception: 0, task: 0, latent: 0, action: 2, image: 0, components: 3, state: 4 };
+    const SHAPE: UnrollShape = UnrollShape {
+        length: 1,
+        proprioception: 0,
+        task: 0,
+        latent: 0,
+        action: 2,
+        reward_terms: 1,
+        image: 0,
+        components: 3,
+        state: 4,
+    };
 
-    /// Components that no noise can confuse, and their weights.
+    /// Components whose samples cannot be confused, with these weights.
     fn mixture(weights: [f32; 3]) -> ActingBatch {
-        let mut batch = ActingBatch::new(1, SIZES);
-        batch.mean = vec![-10.0, -20.0, 0.5, 0.25, 10.0, 20.0];
-        batch.std.fill(0.1);
-        batch.log_weights = weights.map(f32::ln).to_vec();
+        let mut batch = ActingBatch::new(1, &SHAPE);
+        batch[Field::Mean].copy_from_slice(&[-10.0, -20.0, 0.5, 0.25, 10.0, 20.0]);
+        batch[Field::Std].fill(0.1);
+        batch[Field::LogWeights].copy_from_slice(&weights.map(f32::ln));
         batch
     }
 
@@ -360,7 +325,7 @@ mod tests {
         for _ in 0..10_000 {
             batch.row(0).sample(&mut action, &mut rng);
             let component = if action[0] < -5.0 { 0 } else { 1 + usize::from(action[0] > 5.0) };
-            let mean = &batch.mean[2 * component..2 * component + 2];
+            let mean = &batch[Field::Mean][2 * component..2 * component + 2];
             assert!(action.iter().zip(mean).all(|(action, mean)| (action - mean).abs() < 1.0), "{action:?}");
             counts[component] += 1;
         }
@@ -371,30 +336,34 @@ mod tests {
     }
 
     #[test]
-    fn without_noise_the_likeliest_component_acts() {
+    fn without_noise_the_most_likely_component_acts() {
         assert_eq!(mixture([0.2, 0.3, 0.5]).row(0).mode(), [10.0, 20.0]);
         assert_eq!(mixture([0.2, 0.5, 0.3]).row(0).mode(), [0.5, 0.25]);
-        let mut one = ActingBatch::new(1, ActingSizes { components: 1, ..SIZES });
-        one.mean = vec![0.5, -0.5];
+        let mut one = ActingBatch::new(1, &UnrollShape { components: 1, ..SHAPE });
+        one[Field::Mean].copy_from_slice(&[0.5, -0.5]);
         assert_eq!(one.row(0).mode(), [0.5, -0.5]);
     }
 
     #[test]
-    fn weights_that_rounding_leaves_short_of_one_still_draw_a_component() {
-        assert_eq!(draw(&[0.1_f32.ln(), 0.2_f32.ln()], 0.999), 1);
-        assert_eq!(draw(&[(1.0_f32 - 1e-6).ln(), -80.0], 1.0 - 1e-7), 0, "and none that all but never acts");
-        assert_eq!(draw(&[0.0, f32::NEG_INFINITY], 0.0), 0);
+    fn weights_whose_rounded_sum_is_below_one_still_draw_a_component() {
+        assert_eq!(draw_component(&[0.1_f32.ln(), 0.2_f32.ln()], 0.999), 1);
+        assert_eq!(
+            draw_component(&[(1.0_f32 - 1e-6).ln(), -80.0], 1.0 - 1e-7),
+            0,
+            "not the one that all but never acts"
+        );
+        assert_eq!(draw_component(&[0.0, f32::NEG_INFINITY], 0.0), 0);
     }
 
     #[test]
-    fn a_decision_fills_every_component_and_forgetting_empties_the_mind() {
+    fn a_gaussian_fills_every_component_and_a_reset_empties_the_recurrent_state() {
         let mut batch = mixture([0.2, 0.3, 0.5]);
-        batch.state.fill(1.0);
+        batch[Field::State].fill(1.0);
         let mut row = batch.row(0);
-        row.decide(|mean| mean.copy_from_slice(&[0.1, 0.2]), 0.3);
-        row.forget();
-        assert_eq!(batch.mean, [0.1, 0.2, 0.1, 0.2, 0.1, 0.2]);
-        assert_eq!((batch.std, batch.state), (vec![0.3; 6], vec![0.0; 4]));
-        assert!(batch.log_weights.iter().all(|weight| (weight.exp() - 1.0 / 3.0).abs() < 1e-6));
+        row.set_gaussian(|mean| mean.copy_from_slice(&[0.1, 0.2]), 0.3);
+        row.reset_recurrent_state();
+        assert_eq!(batch[Field::Mean], [0.1, 0.2, 0.1, 0.2, 0.1, 0.2]);
+        assert_eq!((&batch[Field::Std], &batch[Field::State]), (&[0.3; 6][..], &[0.0; 4][..]));
+        assert!(batch[Field::LogWeights].iter().all(|weight| (weight.exp() - 1.0 / 3.0).abs() < 1e-6));
     }
 }

@@ -1,11 +1,10 @@
-//! Reading what the learner wrote; writing is the learner's affair alone.
+//! Reads checkpoints; only the learner writes them.
 //!
 //! A checkpoint is a directory whose `MANIFEST.json` maps each file's name to its SHA-256 (hexadecimal). Of its files
-//! two matter here: `experiment.toml` and `policy.safetensors`, the parameters of the online policy. A file that
-//! `comic-learner export` made of one is as good.
+//! three matter here: `experiment.toml`, `progress.json`, and `policy.safetensors`, the parameters of the online policy. A
+//! file that `comic-learner export` made of a checkpoint can be read too.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use comic_experiment::Experiment;
@@ -18,7 +17,7 @@ const MANIFEST: &str = "MANIFEST.json";
 const EXPERIMENT: &str = "experiment.toml";
 const PROGRESS: &str = "progress.json";
 const POLICY: &str = "policy.safetensors";
-/// What a path should have named.
+/// What a path has to name.
 const WANTED: &str = "name a run's directory (runs/… of `cargo xtask train`), its `checkpoints`, one of them, or a file of `comic-learner export`";
 
 /// What acting needs of a checkpoint.
@@ -34,22 +33,22 @@ pub struct Checkpoint {
     pub position: Position,
 }
 
-/// The run and the life of the learner that wrote a checkpoint, and the newest version it had published.
+/// The run and the learner epoch that wrote a checkpoint, and the newest version it had published.
 #[derive(Clone, Copy, Debug, Default, serde::Deserialize)]
 pub struct Position {
-    /// The run's number; `None` of learners that had none, and of exported files.
+    /// The run's number; `None` in checkpoints of learners without one, and in exported files.
     pub run: Option<u64>,
-    /// Which life.
+    /// The learner epoch.
     pub epoch: u64,
-    /// Which version.
+    /// The newest version published.
     pub version: u64,
-    /// Updates until then, by which checkpoints are named.
+    /// Updates until then; checkpoints are named by this number.
     pub updates: u64,
 }
 
 /// Reads the newest complete checkpoint that `path` names: a run directory (which holds `checkpoints/`), a directory of
-/// checkpoints (`checkpoint-NNNNNNNNNN`), or one checkpoint; or reads the policy that was exported to a file of this name.
-/// Among several, a damaged one is passed over with a warning.
+/// checkpoints (`checkpoint-NNNNNNNNNN`), or one checkpoint. If `path` is a file, reads the policy that was exported to it.
+/// A damaged checkpoint among several is skipped with a warning.
 ///
 /// # Errors
 /// [`Error::Checkpoint`] when there is none, or the one that was named is damaged.
@@ -68,8 +67,8 @@ pub fn read(path: &Path) -> Result<Checkpoint, Error> {
     for candidate in numbered(&directory)?.into_iter().rev() {
         match read_one(&candidate) {
             Ok(checkpoint) => return Ok(checkpoint),
-            // With its causes: what is wrong stands in the last of them.
-            Err(error) => tracing::warn!("passed over a damaged checkpoint: {:#}", anyhow::Error::from(error)),
+            // With its causes: the last one says what is wrong.
+            Err(error) => tracing::warn!("skipped a damaged checkpoint: {:#}", anyhow::Error::from(error)),
         }
     }
     Err(refuse(path, format!("no complete checkpoint here; {WANTED}")))
@@ -79,7 +78,7 @@ fn read_exported(path: &Path) -> Result<Checkpoint, Error> {
     let Exported { spec, experiment, bytes } = Exported::open(path).map_err(|error| refuse(path, error))?;
     if !matches!(spec.part, Part::Policy(_)) {
         let part = spec.part;
-        return Err(refuse(path, format!("{part} does not act for itself: export a policy, with --part policy")));
+        return Err(refuse(path, format!("{part} cannot act alone: export a policy with --part policy")));
     }
     let Source { epoch, version, updates, .. } = spec.source;
     let position = Position { run: None, epoch, version, updates };
@@ -116,12 +115,11 @@ fn read_one(path: &Path) -> Result<Checkpoint, Error> {
 fn part(path: &Path, manifest: &BTreeMap<String, String>, name: &str) -> Result<Vec<u8>, Error> {
     let expected = manifest.get(name).ok_or_else(|| refuse(path, format!("{MANIFEST} does not name {name}")))?;
     let bytes = std::fs::read(path.join(name)).map_err(|error| refuse(path, format!("{name}: {error}")))?;
-    let mut found = String::with_capacity(64);
-    for byte in Sha256::digest(&bytes) {
-        // Writing to a string cannot fail.
-        let _ = write!(found, "{byte:02x}");
+    if hex::encode(Sha256::digest(&bytes)) == *expected {
+        Ok(bytes)
+    } else {
+        Err(refuse(path, format!("{name} is damaged: its SHA-256 differs")))
     }
-    if found == *expected { Ok(bytes) } else { Err(refuse(path, format!("{name} is damaged: its SHA-256 differs"))) }
 }
 
 fn refuse(path: &Path, reason: impl ToString) -> Error {
@@ -139,8 +137,7 @@ mod tests {
         let progress = br#"{"epoch": 2, "version": 30, "updates": 29}"#;
         for (name, bytes) in [(EXPERIMENT, experiment.as_bytes()), (PROGRESS, progress), (POLICY, policy)] {
             std::fs::write(path.join(name), bytes).unwrap();
-            let hash: String = Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect();
-            manifest.insert(name, hash);
+            manifest.insert(name, hex::encode(Sha256::digest(bytes)));
         }
         std::fs::write(path.join(MANIFEST), serde_json::to_vec(&manifest).unwrap()).unwrap();
     }
@@ -161,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_checkpoint_is_passed_over_but_refused_when_named() {
+    fn a_damaged_checkpoint_is_skipped_but_refused_when_named() {
         let run = run_with_two();
         let newest = run.path().join("checkpoints/checkpoint-0000000010");
         std::fs::write(newest.join(POLICY), b"altered").unwrap();
@@ -171,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn an_incomplete_checkpoint_is_passed_over() {
+    fn an_incomplete_checkpoint_is_skipped() {
         let run = run_with_two();
         std::fs::remove_file(run.path().join("checkpoints/checkpoint-0000000010").join(MANIFEST)).unwrap();
         assert_eq!(read(run.path()).unwrap().policy, b"older");
@@ -184,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_nobody_exported_is_refused_with_its_name() {
+    fn a_file_that_is_no_export_is_refused_with_its_name() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("policy.safetensors");
         for bytes in [&b""[..], b"not one", &[255; 64], b"\x02\0\0\0\0\0\0\0{}"] {

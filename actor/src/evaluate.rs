@@ -6,6 +6,7 @@
 
 pub mod command;
 mod delivery;
+mod options;
 mod report;
 mod rewards;
 mod rollout;
@@ -13,49 +14,34 @@ mod table;
 
 use std::sync::Arc;
 
+use comic_experiment::seed::derive;
+use comic_proto::UnrollShape;
 use comic_tasks::{ClipStarts, Simulated, Task};
 use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 
 use crate::Error;
-use crate::acting::{ActingSizes, ForwardPass};
-use comic_experiment::seed::derive;
+use crate::acting::ForwardPass;
+use crate::acting_loop::Controller;
 
+pub use options::Options;
 pub use report::{ClipReport, Finished, Report};
-pub use rollout::{Audience, Evaluated, Start};
+pub use rollout::{Audience, Start};
 
-/// How to evaluate.
-#[derive(Clone, Copy, Debug)]
-pub struct Options {
-    /// Episodes of each clip from random starts; every start once when absent.
-    pub episodes: Option<usize>,
-    /// The mean action and the latent's mean instead of samples.
-    pub deterministic: bool,
-    /// Seed of random starts and of the noise.
-    pub seed: u64,
-    /// Environments in one forward pass.
-    pub environments: usize,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Self { episodes: None, deterministic: false, seed: 1, environments: 16 }
-    }
-}
-
-/// Rolls out the starts of the clips of `task` that the options choose; `sizes` are its experiment's.
+/// Rolls out the starts of the clips of `task` that the options choose; `shape` is the shape of its experiment's
+/// unrolls.
 ///
 /// # Errors
 /// A failing forward pass, a start that the task does not have, or what the audience returns.
 pub fn evaluate<F: ForwardPass>(
-    evaluated: &mut Evaluated<'_, F>,
+    controller: &mut Controller<'_, F>,
     task: &Arc<dyn Task>,
-    sizes: ActingSizes,
+    shape: &UnrollShape,
     options: &Options,
     audience: &mut dyn Audience<Box<dyn Simulated>>,
 ) -> Result<Vec<Finished>, Error> {
     let starts = chosen(task.starts(), options);
-    roll_out(evaluated, task, sizes, &starts, options, audience)
+    roll_out(controller, task, shape, &starts, options, audience)
 }
 
 /// Rolls out these starts, or as many as the audience wants to see.
@@ -63,9 +49,9 @@ pub fn evaluate<F: ForwardPass>(
 /// # Errors
 /// As for [`evaluate`].
 pub fn roll_out<F: ForwardPass>(
-    evaluated: &mut Evaluated<'_, F>,
+    controller: &mut Controller<'_, F>,
     task: &Arc<dyn Task>,
-    sizes: ActingSizes,
+    shape: &UnrollShape,
     starts: &[Start],
     options: &Options,
     audience: &mut dyn Audience<Box<dyn Simulated>>,
@@ -73,7 +59,7 @@ pub fn roll_out<F: ForwardPass>(
     let environments = (0..options.environments.min(starts.len()).max(1) as u64)
         .map(|index| Arc::clone(task).environment(derive(options.seed, index)))
         .collect::<Result<Vec<Box<dyn Simulated>>, _>>()?;
-    rollout::run(evaluated, environments, sizes, starts, options, audience)
+    rollout::run(controller, environments, shape, starts, options, audience)
 }
 
 /// What is to be rolled out: all starts, or random ones.

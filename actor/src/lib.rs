@@ -1,30 +1,33 @@
-//! Whatever needs a simulator: acting for a learner, evaluating a policy.
+//! Everything that needs a simulator: acting for a learner, and evaluating and filming policies.
 //!
 //! # Layout
-//! - [`worker`] is the hot path: one thread, its environments, one batched forward pass a step, unrolls out.
-//! - [`acting`] is what a forward pass reads and writes; [`policy`] is the one through libtorch.
-//! - [`mailbox`] hands the newest parameters to the workers, who look at unroll boundaries only.
-//! - [`session`] is the connection to the learner: it joins, fetches assets, watches parameters, sends unrolls until
-//!   each is acknowledged, and comes back by itself after every loss.
-//! - [`dump`] keeps episodes whose simulation diverged, and plays them again.
-//! - [`pulse`] is the process's sign of life, for a container's health check.
-//! - [`run`] puts these together into an actor process.
-//! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads what the learner wrote.
-//! - [`render`] films a policy at work, or shows it in a window.
-//! - [`clips`] is `comic-actor clips`: motion capture in files, and off the network.
+//! - [`worker`] is the hot path: one thread, its environments, one batched forward pass a step, full unrolls out.
+//! - [`acting_loop`] is the loop that the worker and the evaluation share.
+//! - [`acting`] holds the arrays of a forward pass; [`policy`] is the forward pass through libtorch.
+//! - [`mailbox`] gives the newest parameters to the workers, which take them at unroll boundaries only.
+//! - [`round`] lets a worker wait until the learner has answered for its last unrolls.
+//! - [`session`] is the connection to the learner. It joins, fetches assets, receives parameters, sends each unroll until
+//!   it is acknowledged, and reconnects after every loss.
+//! - [`dump`] writes episodes whose simulation diverged, and replays them.
+//! - [`liveness`] is the file for a container's health check.
+//! - [`run`] is the actor process made of these parts.
+//! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads the learner's checkpoints.
+//! - [`render`] films a policy, or shows it in a window.
+//! - [`clips`] is `comic-actor clips`: motion capture from files and from the network.
 //!
-//! Nothing here knows a loss, and nothing here is unbounded: finished unrolls wait in a bounded channel, unrolls that
-//! are not acknowledged in a bounded window, and behind a full window the environments stand still.
+//! No loss is computed here. All memory is bounded: full unrolls wait in a bounded channel, unrolls without
+//! acknowledgement in a bounded window. When the window is full, the environments wait.
 
 pub mod acting;
+pub mod acting_loop;
 pub mod checkpoint;
 pub mod clips;
 pub mod dump;
 mod error;
 pub mod evaluate;
+pub mod liveness;
 pub mod mailbox;
 pub mod policy;
-pub mod pulse;
 pub mod render;
 pub mod round;
 pub mod run;

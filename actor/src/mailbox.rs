@@ -1,10 +1,11 @@
 //! The newest directive of the learner, kept for the workers.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
 use bytes::Bytes;
 use comic_proto::v1::Behaviour;
+use parking_lot::{Condvar, Mutex, MutexGuard};
 
 /// One version of how to act; a version means nothing without its learner epoch.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -69,13 +70,13 @@ impl Mailbox {
                 Some(directive) if (directive.learner_epoch, directive.version) >= state.announced.max(oldest) => {
                     return Some(Arc::clone(directive));
                 }
-                _ => state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
+                _ => self.changed.wait(&mut state),
             }
         }
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock()
     }
 
     /// Tells the workers to stop after the step they are in.

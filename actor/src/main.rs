@@ -5,14 +5,15 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Context as _;
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, CommandFactory as _, Parser, Subcommand, ValueEnum};
 use comic_actor::clips::Clips;
 use comic_actor::dump;
 use comic_actor::evaluate::command::Evaluate;
-use comic_actor::pulse::Health;
+use comic_actor::liveness::Health;
 use comic_actor::render::command::Render;
 use comic_actor::render::view::View;
 use comic_actor::{Error, policy, run};
+use comic_manual::Manual;
 use comic_proto::Access;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
@@ -23,7 +24,7 @@ certificate that is not accepted, another release), 1 otherwise (told to stop be
 serves another experiment).
 Logs go to standard error; RUST_LOG chooses what (default: info).";
 
-/// Steps humanoids for a learner; it needs nothing but the learner's address.
+/// Steps humanoids for a learner; it needs only the learner's address.
 #[derive(Debug, Parser)]
 #[command(version, args_conflicts_with_subcommands = true, after_help = EXIT_CODES)]
 struct Arguments {
@@ -46,10 +47,13 @@ enum Command {
     View(View),
     /// Lists, checks, imports, merges and fetches motion capture.
     Clips(Clips),
-    /// Plays a diverged episode again, as --dump-diverged wrote it down.
+    /// Replays a diverged episode that --dump-diverged wrote.
     Replay(dump::Command),
-    /// Exit with 0 if an actor steps environments and with 1 if not, for a container's health check.
+    /// Exits with 0 if an actor steps environments and with 1 if not, for a container's health check.
     Health(Health),
+    /// Write shell completions and man pages.
+    #[command(hide = true)]
+    Manual(Manual),
 }
 
 #[derive(Args, Debug)]
@@ -59,8 +63,8 @@ struct Act {
     learner: Option<String>,
     #[command(flatten)]
     access: Access,
-    /// Who this actor is over its restarts, such as a pod's index: of two processes of one name the newer one takes the older
-    /// one's place. Nobody unless given.
+    /// A name that stays the same over restarts, such as a pod's index. A newer process of the same name replaces the
+    /// older one. No name unless given.
     #[arg(long, value_name = "NAME", env = "COMIC_ACTOR_NAME")]
     name: Option<String>,
     /// Threads; the experiment's number unless given.
@@ -72,12 +76,12 @@ struct Act {
     /// Where files from the learner are kept; `comic` in the user's cache directory unless given.
     #[arg(long, value_name = "DIR", env = "COMIC_CACHE")]
     cache: Option<PathBuf>,
-    /// Write episodes whose simulation diverged there, at most 16; see `comic-actor replay`.
+    /// Write episodes whose simulation diverged into this directory, at most 16; see `comic-actor replay`.
     #[arg(long, value_name = "DIR")]
     dump_diverged: Option<PathBuf>,
     /// Write this file while environments are stepped; see `comic-actor health`.
-    #[arg(long, value_name = "FILE", env = "COMIC_PULSE")]
-    pulse: Option<PathBuf>,
+    #[arg(long, value_name = "FILE", env = "COMIC_LIVENESS")]
+    liveness: Option<PathBuf>,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -112,13 +116,14 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
         Some(Command::Clips(clips)) => clips.run().map_err(anyhow::Error::from),
         Some(Command::Replay(replay)) => replay.run().context("cannot replay"),
         Some(Command::Health(health)) => health.run(),
+        Some(Command::Manual(manual)) => manual.write(Arguments::command()).context("cannot write the manual"),
         None => {
-            let Act { learner, access, name, threads, environments, cache, dump_diverged, pulse } = arguments.act;
+            let Act { learner, access, name, threads, environments, cache, dump_diverged, liveness } = arguments.act;
             let learner = learner.ok_or_else(|| {
                 Error::Usage("no learner: give its address with --learner http://host:7070, or see --help".into())
             })?;
             let (threads, environments) = (threads.map(usize::from), environments.map(usize::from));
-            run::run(&run::Options { learner, access, name, threads, environments, cache, dump_diverged, pulse })
+            run::run(&run::Options { learner, access, name, threads, environments, cache, dump_diverged, liveness })
                 .context("cannot act")
         }
     }

@@ -2,6 +2,7 @@
 
 use comic_experiment::{Experiment, InitialPose, TaskSpec};
 use comic_networks::{Policy, RecurrentState, Routing};
+use comic_proto::Field;
 use tch::nn::VarStore;
 use tch::{Device, Tensor};
 
@@ -78,23 +79,25 @@ impl ForwardPass for TorchPolicy {
 
     fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
         let environments = batch.environments() as i64;
-        let sizes = batch.sizes();
-        let matrix = |values: &[f32], width: usize| Tensor::f_from_slice(values)?.f_view([environments, width as i64]);
+        let matrix = |values: &[f32]| {
+            let width = values.len() as i64 / environments.max(1);
+            Tensor::f_from_slice(values)?.f_view([environments, width])
+        };
         tch::no_grad(|| {
-            let image = (sizes.image > 0)
-                .then(|| Tensor::f_from_slice(&batch.image)?.f_view([environments, sizes.image as i64]))
+            let image = (!batch.image.is_empty())
+                .then(|| Tensor::f_from_slice(&batch.image)?.f_view([environments, -1]))
                 .transpose()?;
             let observation = self.policy.normalise(
-                &matrix(&batch.proprioception, sizes.proprioception)?,
-                &matrix(&batch.task, sizes.task)?,
+                &matrix(&batch[Field::Proprioception])?,
+                &matrix(&batch[Field::Task])?,
                 image.as_ref(),
                 &Routing::grouped(&batch.tasks, self.tasks),
             );
             let acting = self.policy.act(
                 &observation,
-                &matrix(&batch.previous_latent, sizes.latent)?,
-                &matrix(&batch.latent_noise, sizes.latent)?,
-                RecurrentState { state: &matrix(&batch.state, sizes.state)?, first: None },
+                &matrix(&batch[Field::PreviousLatent])?,
+                &matrix(&batch[Field::LatentNoise])?,
+                RecurrentState { state: &matrix(&batch[Field::State])?, first: None },
             );
             let (mean, std, log_weights) = acting.action.to_rows();
             let read = |tensor: &Tensor, values: &mut [f32]| match values {
@@ -102,11 +105,11 @@ impl ForwardPass for TorchPolicy {
                 values => tensor.f_copy_data(values, values.len()),
             };
             read(&acting.latent, &mut batch.latent)?;
-            read(&mean, &mut batch.mean)?;
-            read(&std, &mut batch.std)?;
-            read(&acting.state, &mut batch.state)?;
+            read(&mean, &mut batch[Field::Mean])?;
+            read(&std, &mut batch[Field::Std])?;
+            read(&acting.state, &mut batch[Field::State])?;
             if let Some(log_weights) = log_weights {
-                read(&log_weights, &mut batch.log_weights)?;
+                read(&log_weights, &mut batch[Field::LogWeights])?;
             }
             Ok(())
         })

@@ -3,7 +3,9 @@
 //! A worker begins new unrolls only then. That is the back-pressure of the whole system: what waits at an actor is one
 //! round of unrolls a thread, and experience is no older than it has to be.
 
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::Arc;
+
+use parking_lot::{Condvar, Mutex};
 
 /// Counts the tickets that are out.
 #[derive(Debug, Default)]
@@ -26,22 +28,22 @@ pub struct Ticket {
 impl Round {
     /// A ticket of this round.
     pub fn ticket(&self) -> Arc<Ticket> {
-        *self.shared.out.lock().unwrap_or_else(PoisonError::into_inner) += 1;
+        *self.shared.out.lock() += 1;
         Arc::new(Ticket { shared: Arc::clone(&self.shared) })
     }
 
     /// Waits until every ticket is back.
     pub fn wait(&self) {
-        let mut out = self.shared.out.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut out = self.shared.out.lock();
         while *out > 0 {
-            out = self.shared.returned.wait(out).unwrap_or_else(PoisonError::into_inner);
+            self.shared.returned.wait(&mut out);
         }
     }
 }
 
 impl Drop for Ticket {
     fn drop(&mut self) {
-        *self.shared.out.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
+        *self.shared.out.lock() -= 1;
         self.shared.returned.notify_all();
     }
 }
@@ -57,6 +59,6 @@ mod tests {
         let dropper = std::thread::spawn(move || drop(tickets));
         round.wait();
         dropper.join().unwrap();
-        assert_eq!(*round.shared.out.lock().unwrap(), 0);
+        assert_eq!(*round.shared.out.lock(), 0);
     }
 }

@@ -1,4 +1,4 @@
-//! An actor process: join, build the environments, act until told to stop.
+//! An actor process: joins, builds the environments, and acts until the run is over or it is told to stop.
 
 use std::ops::Range;
 use std::path::PathBuf;
@@ -14,33 +14,33 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{mpsc, watch};
 
 use crate::Error;
-use crate::acting::{ActingSizes, ForwardPass, OneByOne};
+use crate::acting::{ForwardPass, OneByOne};
 use crate::dump::{Dumps, Watched};
+use crate::liveness::Liveness;
 use crate::mailbox::Mailbox;
 use crate::policy::TorchPolicy;
-use crate::pulse::Pulse;
 use crate::seeds::EnvironmentSeeds;
 use crate::session::{self, Joined, Limits};
 use crate::worker::{FinishedUnroll, Pace, Progress, Worker};
 
-/// A stopped actor delivers finished unrolls for so long: a second less than the five in which it promises to leave.
+/// How long a stopped actor sends finished unrolls. It promises to exit within five seconds; this is one second less.
 const FLUSH: Duration = Duration::from_secs(4);
 /// Unrolls that may wait between the workers and the connection, and how many the learner may still have to
 /// acknowledge: two for each environment, within these limits.
 const FEWEST_UNACKNOWLEDGED: usize = 4;
 const MOST_UNACKNOWLEDGED: usize = 256;
-/// Names, shapes and alignment of a safetensors document may differ a little from our own.
+/// Names, shapes and alignment may make the learner's safetensors document a little larger than this actor's.
 const PARAMETERS_SLACK: u64 = 1 << 16;
 const LOG_EVERY: Duration = Duration::from_secs(10);
 
-/// What `comic-actor` is told on its command line.
+/// The command line of `comic-actor` without a subcommand.
 #[derive(Clone, Debug)]
 pub struct Options {
     /// For instance `http://host:7070`.
     pub learner: String,
     /// Certificates and token.
     pub access: Access,
-    /// Who this actor is over its restarts, if anybody.
+    /// A name that stays the same over restarts, if this actor has one.
     pub name: Option<String>,
     /// Threads; the experiment's number when absent.
     pub threads: Option<usize>,
@@ -50,8 +50,8 @@ pub struct Options {
     pub cache: Option<PathBuf>,
     /// Directory for episodes that diverged, if they are to be kept.
     pub dump_diverged: Option<PathBuf>,
-    /// File that is written while environments are stepped, if somebody looks at it.
-    pub pulse: Option<PathBuf>,
+    /// File that is written while environments are stepped, for a health check.
+    pub liveness: Option<PathBuf>,
 }
 
 type TaskWorker = Worker<Watched, Box<dyn ForwardPass + Send>>;
@@ -59,8 +59,8 @@ type TaskWorker = Worker<Watched, Box<dyn ForwardPass + Send>>;
 /// Acts for a learner until the run is over.
 ///
 /// # Errors
-/// [`Error::Stopped`] when the process was told to stop before that (SIGTERM, SIGINT, SIGHUP) and has delivered what was
-/// finished; a lost connection is none.
+/// [`Error::Stopped`] when the process was told to stop before that (SIGTERM, SIGINT, SIGHUP) and has sent its finished
+/// unrolls. A lost connection is no error.
 pub fn run(options: &Options) -> Result<(), Error> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
@@ -69,13 +69,13 @@ pub fn run(options: &Options) -> Result<(), Error> {
         .build()
         .map_err(Error::Thread)?;
     let outcome = act(&runtime, options);
-    // A name that resolves slowly holds a thread of the runtime, and need not hold the process.
+    // A slow name resolution blocks a thread of the runtime. It must not block the exit.
     runtime.shutdown_background();
     outcome
 }
 
 fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
-    let pulse = options.pulse.as_deref().map(Pulse::new).transpose()?;
+    let liveness = options.liveness.as_deref().map(Liveness::new).transpose()?;
     let mailbox = Arc::new(Mailbox::default());
     let (stopping, stop) = watch::channel(false);
     let closing = Closing { mailbox: Arc::clone(&mailbox), stopping };
@@ -103,26 +103,26 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
 
     let unacknowledged = environments.saturating_mul(2).clamp(FEWEST_UNACKNOWLEDGED, MOST_UNACKNOWLEDGED);
     let limits = Limits { window: unacknowledged, parameters: parameters + PARAMETERS_SLACK, flush: FLUSH };
-    // One round of unrolls fits: then a worker goes on stepping while the connection takes what it made.
+    // One round of unrolls fits, so a worker continues to step while the connection takes its unrolls.
     let (sender, unrolls) = mpsc::channel(unacknowledged / 2);
     let progress = Arc::new(Progress::default());
     let session = runtime.spawn(joined.run(limits, unrolls, Arc::clone(&mailbox), stop));
     let reporter = runtime.spawn(report(Arc::clone(&progress)));
-    let pulse = pulse.map(|pulse| runtime.spawn(pulse.beat(Arc::clone(&progress))));
+    let liveness = liveness.map(|liveness| runtime.spawn(liveness.keep_up(Arc::clone(&progress))));
 
     let handles = start(workers, pace, &closing, sender, &progress)?;
     let settled = runtime.block_on(session);
     mailbox.close();
     reporter.abort();
-    if let Some(pulse) = pulse {
-        pulse.abort();
+    if let Some(liveness) = liveness {
+        liveness.abort();
     }
     for handle in handles {
         handle.join().map_err(|_| Error::WorkerPanicked)??;
     }
     let settled = settled.map_err(|_| Error::WorkerPanicked)??;
-    tracing::info!(steps = progress.steps.load(Ordering::Relaxed), ?settled, "leaving");
-    // Whoever counts what ends with 0 as done, as Kubernetes does with a Job, must not count this.
+    tracing::info!(steps = progress.steps.load(Ordering::Relaxed), ?settled, "exiting");
+    // Exit code 0 means that the run is over: a Kubernetes Job counts it as completed.
     if settled.over { Ok(()) } else { Err(Error::Stopped) }
 }
 
@@ -138,7 +138,7 @@ fn stop_on_signal(runtime: &Runtime, closing: Closing) -> Result<(), Error> {
             _ = interrupt.recv() => {}
             _ = hangup.recv() => {}
         }
-        tracing::info!("told to stop: delivering what is finished");
+        tracing::info!("told to stop: sending the finished unrolls");
         drop(closing);
     });
     Ok(())
@@ -169,12 +169,12 @@ fn build(
                 Ok(Watched::new(Arc::clone(&task).environment(seed)?, dumps.cloned(), seed))
             })
             .collect::<Result<_, comic_tasks::Error>>()?;
-        // The first parameters off the wire replace what it starts with.
+        // The first parameters from the learner replace the initial ones.
         let policy = TorchPolicy::untrained(spec, experiment, 0, || Ok([0.0; 56]))?;
         parameters = policy.to_parameters()?.len() as u64;
         let policy: Box<dyn ForwardPass + Send> = match pace {
             Pace::Free => Box::new(policy),
-            Pace::Lockstep => Box::new(OneByOne::new(policy, ActingSizes::from(joined.layout.shape()))),
+            Pace::Lockstep => Box::new(OneByOne::new(policy, joined.layout.shape())),
         };
         let noise = experiment.warm_start.noise as f32;
         workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), noise, first, joined.seed));
@@ -207,8 +207,8 @@ fn start(
         .collect()
 }
 
-/// Dropped, it stops the workers after their step and the session after its flush. Every worker holds one, so that
-/// none goes on alone when another ends by an error or a panic: half an actor is none.
+/// When it is dropped, it stops the workers after their current step and the session after its flush. Every worker holds
+/// one, so that an error or a panic of one worker stops all others.
 #[derive(Clone)]
 struct Closing {
     mailbox: Arc<Mailbox>,

@@ -1,21 +1,19 @@
-//! The hot path: one thread steps its environments and fills one unroll of each.
+//! The worker: one thread steps its environments and fills one unroll of each.
 //!
-//! Every environment writes exactly one row an iteration, so all unrolls of a thread begin and end together, and
-//! parameters change there and nowhere else. An iteration is observe → act → step:
+//! Every environment writes exactly one row an iteration of the [acting loop](crate::acting_loop). So all unrolls of a
+//! thread begin and end together, and parameters change only there. The iteration of row t copies the current observation
+//! into row t, makes one forward pass for all environments, samples the actions, writes them into row t, and steps every
+//! environment.
 //!
-//! - *observe* copies the current observation of every environment into row t;
-//! - *act* makes one forward pass for all of them;
-//! - *step* samples the actions, writes them into row t, and moves every environment on.
+//! An episode's last observation takes a row of its own, without an action (`Valid` 0). That iteration resets the
+//! environment and does not step it, so the next row is the next episode's first. Row T holds the observation after the
+//! last transition. Row 0 of the next unroll repeats it. Only where row T is an episode's last observation does the next
+//! unroll begin with a new episode.
 //!
-//! An episode's last observation takes a row of its own, in which nothing is done (`Valid` 0): that iteration resets
-//! the environment instead of stepping it, so the next row is the next episode's first. Row T is the observation that
-//! follows the last slot, and row 0 of the next unroll is the same observation again; only where row T is an episode's
-//! last, the next unroll starts with the fresh episode instead.
-//!
-//! An unroll is of one task. Where joint training draws another one for the next episode, that episode waits for the next
-//! unroll, and the rows up to there are padding: `Valid` 0, `First` 1, the last observation again.
+//! An unroll belongs to one task. In joint training the next episode may belong to another task. That episode waits for the
+//! next unroll, and the rows up to there are padding: `Valid` 0, `First` 1, the last observation again.
 
-mod lane;
+mod recorder;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -27,12 +25,13 @@ use comic_tasks::Environment;
 use tokio::sync::mpsc;
 
 use crate::Error;
-use crate::acting::{ActingBatch, ActingSizes, ForwardPass};
+use crate::acting::ForwardPass;
+use crate::acting_loop::{ActingLoop, Controller};
 use crate::mailbox::{Directive, Mailbox};
 use crate::round::{Round, Ticket};
-use lane::Lane;
+use recorder::{RecordedUnroll, UnrollRecorder};
 
-/// A full unroll, without what only the connection knows (actor, incarnation, sequence number).
+/// A full unroll. The connection adds actor, incarnation and sequence number.
 #[derive(Clone, Debug)]
 pub struct FinishedUnroll {
     /// Little-endian arrays in the layout's order.
@@ -49,7 +48,7 @@ pub struct FinishedUnroll {
     pub environment: u32,
     /// Index of the unroll's task among the tasks of the experiment.
     pub task: u32,
-    /// Held until the learner has answered for it, if somebody waits for that.
+    /// Held until the learner has answered, where the worker waits for that.
     pub ticket: Option<Arc<Ticket>>,
 }
 
@@ -58,12 +57,12 @@ pub struct FinishedUnroll {
 pub enum Pace {
     /// For as many unrolls as the learner takes.
     Free,
-    /// For one unroll of every environment: the next one waits for the next version, which the learner publishes when it
-    /// has learnt from all of them.
+    /// For one unroll of every environment. The next unroll waits for the next version, which the learner publishes after
+    /// it has trained on all of them.
     Lockstep,
 }
 
-/// What a process has done so far, for its log.
+/// Counts of a process since its start, for its log.
 #[derive(Debug, Default)]
 pub struct Progress {
     /// Transitions simulated.
@@ -72,13 +71,15 @@ pub struct Progress {
     pub episodes: AtomicU64,
 }
 
-/// E environments and the behaviour policy that moves them.
+/// E environments and the behaviour policy that controls them.
 #[derive(Debug)]
 pub struct Worker<E, F> {
-    lanes: Vec<Lane<E>>,
-    batch: ActingBatch,
+    acting: ActingLoop<E>,
+    recorder: UnrollRecorder,
     forward: F,
-    layout: Arc<UnrollLayout>,
+    length: usize,
+    /// The number of the first environment.
+    first: u32,
     demonstration_noise: f32,
     /// What the current unroll is made with; none before the first directive.
     directive: Option<Arc<Directive>>,
@@ -87,9 +88,8 @@ pub struct Worker<E, F> {
 impl<E: Environment, F: ForwardPass> Worker<E, F> {
     /// Resets every environment.
     ///
-    /// `demonstration_noise` is the standard deviation around the servo action when the learner asks for
-    /// demonstrations. The environments are numbered from `first` on; `seed` and its number are the source of the noise
-    /// of an environment's latents and actions.
+    /// `demonstration_noise` is the standard deviation around the servo action in demonstrations. The environments are
+    /// numbered from `first` on. `seed` and its number decide the noise of an environment's latents and actions.
     pub fn new(
         environments: Vec<E>,
         forward: F,
@@ -98,19 +98,19 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         first: u32,
         seed: u64,
     ) -> Self {
-        let mut batch = ActingBatch::new(environments.len(), ActingSizes::from(layout.shape()));
-        let lanes = environments
-            .into_iter()
-            .zip(first..)
-            .enumerate()
-            .map(|(index, (environment, number))| Lane::new(environment, number, seed, &layout, &mut batch.row(index)))
-            .collect();
-        Self { lanes, batch, forward, layout, demonstration_noise, directive: None }
+        let length = layout.shape().length;
+        let mut acting = ActingLoop::new(environments, layout.shape());
+        let recorder = UnrollRecorder::new(layout, (first..).take(acting.rollouts.len()), seed);
+        for (index, rollout) in acting.rollouts.iter_mut().enumerate() {
+            rollout.environment.reset();
+            rollout.begin_episode(&mut acting.batch.row(index));
+        }
+        Self { acting, recorder, forward, length, first, demonstration_noise, directive: None }
     }
 
-    /// Acts by the newest directive and hands every full unroll to `unrolls`, until the mailbox is closed or nobody
-    /// takes unrolls any more. The environments stand still until every unroll of the last round is answered for, and
-    /// then as `pace` says.
+    /// Acts by the newest directive and sends every full unroll to `unrolls`, until the mailbox or the channel is closed.
+    /// Between rounds the environments wait until the learner has answered for every unroll of the last round, and then
+    /// for parameters as `pace` says.
     ///
     /// # Errors
     /// Parameters that do not fit, or a failing forward pass.
@@ -124,7 +124,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         while let Some(directive) = mailbox.wait_from(self.oldest_wanted(pace)) {
             self.adopt(&directive)?;
             let finished =
-                tracing::debug_span!("rollout", environments = self.lanes.len(), version = directive.version)
+                tracing::debug_span!("rollout", environments = self.acting.rollouts.len(), version = directive.version)
                     .in_scope(|| self.unroll(&|| mailbox.is_closed(), progress))?;
             let Some(finished) = finished else { return Ok(()) };
             let round = Round::default();
@@ -147,7 +147,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         }
     }
 
-    /// Takes a directive for the next unroll.
+    /// Uses a directive from the next unroll on.
     ///
     /// # Errors
     /// Parameters that do not fit.
@@ -162,7 +162,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         Ok(())
     }
 
-    /// One unroll of every environment; `None`, and the unrolls' beginnings are lost, when `stopped` says so.
+    /// One unroll of every environment; `None` when `stopped` says so, and the unfinished unrolls are lost.
     ///
     /// # Errors
     /// A failing forward pass.
@@ -171,90 +171,53 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         stopped: &dyn Fn() -> bool,
         progress: &Progress,
     ) -> Result<Option<Vec<FinishedUnroll>>, Error> {
-        let length = self.layout.shape().length;
-        for t in 0..length {
+        let Self { acting, recorder, forward, length, demonstration_noise, directive, .. } = self;
+        let demonstrates = directive.as_ref().is_some_and(|directive| directive.behaviour == Behaviour::Demonstration);
+        let mut controller = match demonstrates {
+            true => Controller::Servo { std: *demonstration_noise },
+            false => Controller::Policy(forward),
+        };
+        for t in 0..*length {
             if stopped() {
                 return Ok(None);
             }
-            self.observe(t)?;
-            self.act()?;
-            self.step(t, progress);
+            (recorder.t, recorder.steps, recorder.episodes) = (t, 0, 0);
+            // The recorder never breaks.
+            let _ = acting.iterate(&mut controller, recorder)?;
+            progress.steps.fetch_add(recorder.steps, Ordering::Relaxed);
+            progress.episodes.fetch_add(recorder.episodes, Ordering::Relaxed);
         }
-        self.observe(length)?;
+        recorder.t = *length;
+        acting.observe(recorder)?;
         Ok(Some(self.finish()))
     }
 
-    fn observe(&mut self, t: usize) -> Result<(), Error> {
-        for (index, lane) in self.lanes.iter_mut().enumerate() {
-            lane.write_observation(t, &mut self.batch.row(index))?;
-        }
-        Ok(())
-    }
-
-    fn act(&mut self) -> Result<(), Error> {
-        for (index, lane) in self.lanes.iter_mut().enumerate() {
-            lane.draw_latent_noise(&mut self.batch.row(index));
-        }
-        if self.demonstrates() {
-            self.demonstrate();
-            return Ok(());
-        }
-        self.forward.forward(&mut self.batch)
-    }
-
-    fn step(&mut self, t: usize, progress: &Progress) {
-        let (mut steps, mut episodes) = (0, 0);
-        for (index, lane) in self.lanes.iter_mut().enumerate() {
-            let mut row = self.batch.row(index);
-            if lane.waits() {
-                // The row stays as empty as it was made.
-                row.forget();
-            } else if lane.at_episode_end() {
-                lane.pass(t, &row);
-                lane.begin_episode(&mut row);
-            } else {
-                lane.step(t, &mut row);
-                steps += 1;
-                episodes += u64::from(lane.at_episode_end());
-            }
-        }
-        progress.steps.fetch_add(steps, Ordering::Relaxed);
-        progress.episodes.fetch_add(episodes, Ordering::Relaxed);
-    }
-
     fn finish(&mut self) -> Vec<FinishedUnroll> {
-        let (learner_epoch, version, behaviour) =
-            self.directive.as_ref().map_or((0, 0, Behaviour::Policy), |directive| {
-                (directive.learner_epoch, directive.version, directive.behaviour)
+        let (learner_epoch, version, behaviour) = self
+            .directive
+            .as_ref()
+            .map_or((0, 0, Behaviour::Policy), |newest| (newest.learner_epoch, newest.version, newest.behaviour));
+        let ActingLoop { rollouts, batch } = &mut self.acting;
+        let mut unrolls = Vec::with_capacity(rollouts.len());
+        for ((index, rollout), environment) in rollouts.iter_mut().enumerate().zip(self.first..) {
+            let RecordedUnroll { payload, episodes, task } = self.recorder.take(index);
+            if rollout.ended {
+                rollout.environment.reset();
+                rollout.begin_episode(&mut batch.row(index));
+            }
+            let ticket = None;
+            unrolls.push(FinishedUnroll {
+                payload,
+                learner_epoch,
+                version,
+                behaviour,
+                episodes,
+                environment,
+                task,
+                ticket,
             });
-        let (lanes, batch, layout) = (&mut self.lanes, &mut self.batch, &self.layout);
-        lanes
-            .iter_mut()
-            .enumerate()
-            .map(|(index, lane)| {
-                let (payload, episodes) = lane.take_unroll(layout);
-                let task = lane.task();
-                if lane.at_episode_end() {
-                    lane.begin_episode(&mut batch.row(index));
-                }
-                let environment = lane.number();
-                FinishedUnroll { payload, learner_epoch, version, behaviour, episodes, environment, task, ticket: None }
-            })
-            .collect()
-    }
-
-    fn demonstrates(&self) -> bool {
-        self.directive.as_ref().is_some_and(|directive| directive.behaviour == Behaviour::Demonstration)
-    }
-
-    /// The servo action as the mean. It has neither latent nor memory: z stays 0, so z_{t−1} is 0 throughout.
-    fn demonstrate(&mut self) {
-        for (index, lane) in self.lanes.iter().enumerate() {
-            let mut row = self.batch.row(index);
-            row.decide(|mean| lane.servo_action(mean), self.demonstration_noise);
-            row.latent.fill(0.0);
-            row.forget();
         }
+        unrolls
     }
 }
 

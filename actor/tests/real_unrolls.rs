@@ -5,7 +5,7 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use comic_actor::acting::{ActingBatch, ActingSizes, ForwardPass as _};
+use comic_actor::acting::{ActingBatch, ForwardPass as _};
 use comic_actor::mailbox::Directive;
 use comic_actor::policy::TorchPolicy;
 use comic_actor::worker::{FinishedUnroll, Progress, Worker};
@@ -71,21 +71,20 @@ fn the_behaviour_policy_follows_from_what_is_recorded() {
     for round in record(&setup, Behaviour::Policy) {
         let mut unrolls: Vec<_> =
             round.iter().map(|unroll| UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap()).collect();
-        let mut batch = ActingBatch::new(ENVIRONMENTS, ActingSizes::new(setup.task.spec(), &setup.experiment));
+        let mut batch = ActingBatch::new(ENVIRONMENTS, setup.layout.shape());
         for t in 0..setup.layout.shape().length {
             for (index, unroll) in unrolls.iter().enumerate() {
-                let row = batch.row(index);
-                row.proprioception.copy_from_slice(unroll.row(Field::Proprioception, t));
-                row.task.copy_from_slice(unroll.row(Field::Task, t));
-                row.previous_latent.copy_from_slice(unroll.row(Field::PreviousLatent, t));
-                row.latent_noise.copy_from_slice(unroll.row(Field::LatentNoise, t));
+                let mut row = batch.row(index);
+                for field in [Field::Proprioception, Field::Task, Field::PreviousLatent, Field::LatentNoise] {
+                    row[field].copy_from_slice(unroll.row(field, t));
+                }
             }
             setup.policy.forward(&mut batch).unwrap();
             for (index, unroll) in unrolls.iter_mut().enumerate() {
                 let row = batch.row(index);
                 // Equal batch shapes give equal numbers, bit for bit.
-                assert_eq!(row.mean, unroll.row(Field::Mean, t));
-                assert_eq!(row.std, unroll.row(Field::Std, t));
+                assert_eq!(row[Field::Mean], *unroll.row(Field::Mean, t));
+                assert_eq!(row[Field::Std], *unroll.row(Field::Std, t));
             }
         }
     }

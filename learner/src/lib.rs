@@ -23,6 +23,7 @@ pub mod algorithm;
 pub mod checkpoint;
 pub mod commands;
 pub mod device;
+pub mod document;
 pub mod error;
 mod log_limiter;
 pub mod observe;

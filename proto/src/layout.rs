@@ -54,6 +54,11 @@ impl UnrollShape {
             state: experiment.network.state_size(),
         }
     }
+
+    /// Elements in a row of this field.
+    pub fn width(&self, field: Field) -> usize {
+        field.width(self)
+    }
 }
 
 /// One array of an unroll; the order here is the order in the payload.

@@ -1,11 +1,12 @@
 //! Where network tasks and the trainer meet.
 
 use std::fmt;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use comic_proto::v1::{Behaviour, UnrollHeader};
 use comic_proto::{Pieces, UnrollLayout};
+use parking_lot::{Condvar, Mutex, MutexGuard};
 use tokio::sync::Semaphore;
 
 use crate::batch::{Batch, Buffer};
@@ -237,7 +238,7 @@ impl Batcher {
             if left.is_zero() {
                 return Next::Elapsed;
             }
-            state = self.inner.filled.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+            self.inner.filled.wait_for(&mut state, left);
         }
     }
 
@@ -295,8 +296,7 @@ impl Batcher {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        // Nothing in here panics half-way through a change; a poisoned lock means a bug elsewhere, not broken accounting.
-        self.inner.state.lock().unwrap_or_else(PoisonError::into_inner)
+        self.inner.state.lock()
     }
 
     /// Applies every rule that keeps an unroll out of a batch. `None`, and nothing recorded, if there is none.

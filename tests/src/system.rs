@@ -20,7 +20,7 @@ use crate::repository::root;
 
 /// Environment variables of the user that would change how the programs reach the learner.
 const SETTINGS: [&str; 7] =
-    ["COMIC_PULSE", "COMIC_LEARNER", "COMIC_CA", "COMIC_CERT", "COMIC_KEY", "COMIC_TOKEN_FILE", "COMIC_TOKEN"];
+    ["COMIC_LIVENESS", "COMIC_LEARNER", "COMIC_CA", "COMIC_CERT", "COMIC_KEY", "COMIC_TOKEN_FILE", "COMIC_TOKEN"];
 /// Limit of a status call.
 const CALL_LIMIT: Duration = Duration::from_secs(5);
 

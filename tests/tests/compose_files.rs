@@ -109,7 +109,7 @@ fn images_are_built_with_the_workspaces_own_rust() -> Result<()> {
     let manifest = fs::read_to_string(root().join("Cargo.toml"))?;
     let version = manifest.lines().find_map(|line| line.strip_prefix("rust-version = \"")?.strip_suffix('"'));
     let image = format!("rust:{}-bookworm", version.context("no rust-version")?);
-    for file in ["Dockerfile", "compose.yaml", "xtask/src/images.rs"] {
+    for file in ["Dockerfile", "compose.yaml", "../xtask/src/images.rs"] {
         ensure!(text(file)?.contains(&image), "{file} names no {image}");
     }
     Ok(())

@@ -72,6 +72,7 @@ async fn actors(system: &mut System, wanted: u64) -> Result<()> {
 fn a_thousand_readers_that_stop_cost_less_than_60_mb_and_delay_no_one() -> Result<()> {
     let output = Command::new(program("comic-bench-learner")?)
         .args(["stalled", "--connections", "1000", "--parameters", "2000000"])
+        .env("RUST_LOG", "warn")
         .output()?;
     ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let figure: Value = serde_json::from_slice(&output.stdout).context("no figure")?;

@@ -65,15 +65,15 @@ fn probes_use_ports_and_commands_that_exist() -> Result<()> {
         let asked = actor.readiness_probe.as_ref().and_then(|probe: &Probe| probe.exec.as_ref()?.command.as_deref());
         ensure!(asked == Some(&["comic-actor".to_owned(), "health".to_owned()]), "{asked:?}");
         ensure!(actor.liveness_probe.is_none(), "an actor that waits for its learner would be restarted");
-        let pulse = dockerfile()?
+        let liveness = dockerfile()?
             .lines()
-            .find_map(|line| Some(line.split("COMIC_PULSE=").nth(1)?.split(' ').next()?.to_owned()));
-        let pulse = PathBuf::from(pulse.context("the image has no pulse")?);
+            .find_map(|line| Some(line.split("COMIC_LIVENESS=").nth(1)?.split(' ').next()?.to_owned()));
+        let liveness = PathBuf::from(liveness.context("the image names no liveness file")?);
         let mounts = actor.volume_mounts.iter().flatten();
         ensure!(
-            mounts.into_iter().any(|mount| pulse.starts_with(&mount.mount_path)),
+            mounts.into_iter().any(|mount| liveness.starts_with(&mount.mount_path)),
             "{} cannot be written",
-            pulse.display()
+            liveness.display()
         );
         Ok(())
     })

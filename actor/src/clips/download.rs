@@ -87,7 +87,7 @@ fn is_expected(path: &Path, expected: &Expected) -> Result<bool, Error> {
     }
     let mut hash = Sha256::new();
     std::io::copy(&mut file, &mut hash).map_err(Error::file(path))?;
-    Ok(hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect::<String>() == expected.sha256)
+    Ok(hex::encode(hash.finalize()) == expected.sha256)
 }
 
 struct Download<'a> {

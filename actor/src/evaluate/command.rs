@@ -8,13 +8,14 @@ use clap::Args;
 use comic_clips::Catalogue;
 use comic_experiment::Experiment;
 use comic_proto::Access;
+use comic_proto::UnrollShape;
 use comic_proto::v1::EvaluationReport;
 use comic_tasks::{Simulated, Task};
 
 use super::delivery::deliver;
-use super::{Audience, Evaluated, Options, Report, evaluate};
+use super::{Audience, Options, Report, evaluate};
 use crate::Error;
-use crate::acting::ActingSizes;
+use crate::acting_loop::Controller;
 use crate::checkpoint::{self, Checkpoint, Position};
 use crate::policy::TorchPolicy;
 use crate::render::encode::Format;
@@ -135,13 +136,13 @@ impl Evaluate {
             seed: self.seed,
             ..Options::default()
         };
-        let sizes = ActingSizes::new(task.spec(), &experiment);
+        let shape = UnrollShape::new(task.spec(), &experiment);
         let mut policy = self.policy(&experiment, task.as_ref(), own.as_ref(), parameters.as_deref())?;
-        let mut evaluated = policy.as_mut().map_or(Evaluated::Servo, Evaluated::Policy);
+        let mut controller = policy.as_mut().map_or(Controller::Servo { std: 0.0 }, Controller::Policy);
         let recorder =
             self.video.as_ref().map(|out| Recorder::new(&self.look, out, task.control_timestep())).transpose()?;
         let mut follower = Follower { recorder, failed: None };
-        let finished = evaluate(&mut evaluated, &task, sizes, &options, &mut follower)?;
+        let finished = evaluate(&mut controller, &task, &shape, &options, &mut follower)?;
         let report = Report::new(task.spec(), &finished, &options);
         if let Some(path) = &self.rewards {
             super::rewards::write(path, task.spec(), &finished)?;

@@ -6,7 +6,7 @@ use comic_experiment::{TaskPart, TaskSpec};
 use comic_tasks::MAX_REWARD_TERMS;
 use serde::{Deserialize, Serialize};
 
-use super::Options;
+use super::options::Options;
 
 /// An episode that is over.
 #[derive(Clone, Debug, PartialEq)]

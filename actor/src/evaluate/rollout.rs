@@ -1,43 +1,37 @@
 //! Rolling out a list of starts, many environments in one forward pass.
 
+use std::iter::Enumerate;
 use std::ops::ControlFlow;
+use std::slice::Iter;
 
-use comic_tasks::{Environment, MAX_REWARD_TERMS, Outcome};
+use comic_proto::UnrollShape;
+use comic_tasks::{Environment, Outcome};
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
 
-use super::{Finished, Options};
+use super::options::Options;
+use super::report::Finished;
 use crate::Error;
-use crate::acting::{ActingBatch, ActingSizes, ForwardPass, clip_action};
+use crate::acting::{ActingRow, ForwardPass};
+use crate::acting_loop::{ActingLoop, Controller, Recorder, Rollout};
 
-/// Whose actions are evaluated.
-#[derive(Debug)]
-pub enum Evaluated<'a, F> {
-    /// A policy's.
-    Policy(&'a mut F),
-    /// The servo action: the pose of the next reference frame, without noise.
-    Servo,
-    /// The zero action: every servo aims at the middle of its joint's range.
-    Zero,
-}
-
-/// Whoever follows a rollout: to show how far it is, or to film it.
+/// Watches a rollout, to show its progress or to film it.
 pub trait Audience<E> {
-    /// An episode has begun or gone a step, and has not diverged; `number` is the place of its start among all. To
-    /// break ends the rollout.
+    /// Called at an episode's begin and after each of its steps, except a step that diverged. `number` is the place of
+    /// the episode's start among all starts. `Break` ends the rollout.
     ///
     /// # Errors
-    /// Whatever ends the rollout with it.
+    /// An error ends the rollout.
     fn watch(&mut self, number: usize, environment: &mut E) -> Result<ControlFlow<()>, Error> {
         let _ = (number, environment);
         Ok(ControlFlow::Continue(()))
     }
 
-    /// So many episodes of so many are over.
+    /// Called when an episode has ended: `done` of `all` are over.
     fn count(&mut self, done: usize, all: usize);
 }
 
-/// One that only counts.
+/// An audience that only counts.
 impl<E, F: FnMut(usize, usize)> Audience<E> for F {
     fn count(&mut self, done: usize, all: usize) {
         self(done, all);
@@ -45,7 +39,7 @@ impl<E, F: FnMut(usize, usize)> Audience<E> for F {
 }
 
 /// Where an episode starts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Start {
     /// The clip's index.
     pub clip: usize,
@@ -53,154 +47,157 @@ pub struct Start {
     pub start: usize,
 }
 
-/// An environment, and the episode it is in.
-struct Lane<E> {
-    environment: E,
-    episode: Option<Finished>,
-    /// The place of the episode's start among all.
-    number: usize,
-}
-
-/// Rolls out every start, or until the audience has seen enough; episodes come back in the order they end.
+/// Rolls out every start, or until the audience breaks; episodes are in the order in which they end.
 pub(super) fn run<E: Environment, F: ForwardPass>(
-    evaluated: &mut Evaluated<'_, F>,
+    controller: &mut Controller<'_, F>,
     environments: Vec<E>,
-    sizes: ActingSizes,
+    shape: &UnrollShape,
     starts: &[Start],
     options: &Options,
     audience: &mut dyn Audience<E>,
 ) -> Result<Vec<Finished>, Error> {
-    let mut rng = Pcg64::seed_from_u64(options.seed);
-    let mut batch = ActingBatch::new(environments.len(), sizes);
-    let mut lanes: Vec<Lane<E>> =
-        environments.into_iter().map(|environment| Lane { environment, episode: None, number: 0 }).collect();
-    let mut queue = starts.iter().copied().enumerate();
-    let mut finished = Vec::with_capacity(starts.len());
-    let mut scratch = (vec![0.0; sizes.action], vec![0.0; sizes.action]);
-    for (index, lane) in lanes.iter_mut().enumerate() {
-        if lane.begin(queue.next(), &mut batch, index, audience)?.is_break() {
-            return Ok(finished);
+    let mut acting = ActingLoop::new(environments, shape);
+    let mut recorder = EpisodeRecorder {
+        running: vec![Running::default(); acting.rollouts.len()],
+        queue: starts.iter().enumerate(),
+        all: starts.len(),
+        finished: Vec::with_capacity(starts.len()),
+        deterministic: options.deterministic,
+        rng: Pcg64::seed_from_u64(options.seed),
+        action: vec![0.0; shape.action],
+        audience,
+    };
+    for (index, rollout) in acting.rollouts.iter_mut().enumerate() {
+        if recorder.begin_next(index, rollout, &mut acting.batch.row(index))?.is_break() {
+            return Ok(recorder.finished);
         }
     }
-    while lanes.iter().any(|lane| lane.episode.is_some()) {
-        for (index, lane) in lanes.iter_mut().enumerate().filter(|(_, lane)| lane.episode.is_some()) {
-            lane.environment.draw(batch.row(index).image)?;
-        }
-        act(evaluated, &lanes, &mut batch, options, &mut rng)?;
-        for (index, lane) in lanes.iter_mut().enumerate().filter(|(_, lane)| lane.episode.is_some()) {
-            let ended = lane.step(&mut batch, index, options, &mut rng, &mut scratch);
-            let mut seen = ControlFlow::Continue(());
-            if !ended.as_ref().is_some_and(|episode| episode.diverged) {
-                seen = audience.watch(lane.number, &mut lane.environment)?;
-            }
-            if let Some(episode) = ended {
-                finished.push(episode);
-                audience.count(finished.len(), starts.len());
-                if seen.is_continue() {
-                    seen = lane.begin(queue.next(), &mut batch, index, audience)?;
-                }
-            }
-            if seen.is_break() {
-                return Ok(finished);
-            }
+    while acting.rollouts.iter().any(|rollout| !rollout.ended) {
+        if acting.iterate(controller, &mut recorder)?.is_break() {
+            break;
         }
     }
-    Ok(finished)
+    Ok(recorder.finished)
 }
 
-fn act<E: Environment, F: ForwardPass>(
-    evaluated: &mut Evaluated<'_, F>,
-    lanes: &[Lane<E>],
-    batch: &mut ActingBatch,
-    options: &Options,
-    rng: &mut Pcg64,
-) -> Result<(), Error> {
-    // Without noise the latent is its mean.
-    if !options.deterministic {
-        batch.draw_latent_noise(rng);
-    }
-    match evaluated {
-        Evaluated::Policy(forward) => forward.forward(batch),
-        Evaluated::Servo => {
-            for (index, lane) in lanes.iter().enumerate().filter(|(_, lane)| lane.episode.is_some()) {
-                batch.row(index).decide(|mean| lane.environment.servo_action(mean), 0.0);
-            }
-            Ok(())
-        }
-        Evaluated::Zero => {
-            for index in 0..lanes.len() {
-                batch.row(index).decide(|mean| mean.fill(0.0), 0.0);
-            }
-            Ok(())
-        }
-    }
+/// Collects episodes, begins the next ones, and shows them to the audience.
+struct EpisodeRecorder<'a, E> {
+    running: Vec<Running>,
+    queue: Enumerate<Iter<'a, Start>>,
+    all: usize,
+    finished: Vec<Finished>,
+    deterministic: bool,
+    /// The noise of all environments.
+    rng: Pcg64,
+    /// Scratch: the sampled action.
+    action: Vec<f32>,
+    audience: &'a mut dyn Audience<E>,
 }
 
-impl<E: Environment> Lane<E> {
-    fn begin(
+/// The episode of one environment.
+#[derive(Clone, Default)]
+struct Running {
+    /// The place of its start among all starts.
+    number: usize,
+    start: Start,
+    /// The reward of each step so far.
+    rewards: Vec<f64>,
+}
+
+impl<E: Environment> EpisodeRecorder<'_, E> {
+    /// Begins the next start's episode; the environment stays idle when there is none.
+    fn begin_next(
         &mut self,
-        start: Option<(usize, Start)>,
-        batch: &mut ActingBatch,
         index: usize,
-        audience: &mut dyn Audience<E>,
+        rollout: &mut Rollout<E>,
+        row: &mut ActingRow<'_>,
     ) -> Result<ControlFlow<()>, Error> {
-        self.episode = None;
-        let Some((number, start)) = start else { return Ok(ControlFlow::Continue(())) };
-        self.number = number;
-        self.environment.reset_to(start.clip, start.start)?;
-        let mut row = batch.row(index);
-        self.environment.observe(row.proprioception, row.task);
-        row.forget();
-        let episode = self.environment.episode();
-        *row.of_task = episode.task;
-        let steps_left = episode.steps_left;
-        self.episode = Some(Finished {
+        let Some((number, start)) = self.queue.next() else { return Ok(ControlFlow::Continue(())) };
+        self.running[index] = Running { number, start: *start, rewards: Vec::new() };
+        rollout.environment.reset_to(start.clip, start.start)?;
+        rollout.begin_episode(row);
+        self.audience.watch(number, &mut rollout.environment)
+    }
+
+    fn finish(&mut self, index: usize, rollout: &Rollout<E>, outcome: Outcome) {
+        let Running { start, rewards, .. } = std::mem::take(&mut self.running[index]);
+        self.finished.push(Finished {
             clip: start.clip,
             start: start.start,
-            steps_left,
-            rewards: Vec::new(),
-            returns: [0.0; MAX_REWARD_TERMS],
-            head_heights: 0.0,
-            diverged: false,
+            steps_left: rollout.episode.steps_left,
+            rewards,
+            returns: rollout.returns,
+            head_heights: rollout.head_heights,
+            diverged: outcome == Outcome::Diverged,
         });
-        audience.watch(number, &mut self.environment)
+        self.audience.count(self.finished.len(), self.all);
+    }
+}
+
+impl<E: Environment> Recorder<E> for EpisodeRecorder<'_, E> {
+    fn observe(&mut self, _index: usize, rollout: &mut Rollout<E>, row: &mut ActingRow<'_>) -> Result<(), Error> {
+        if !rollout.ended {
+            rollout.environment.draw(row.image)?;
+        }
+        Ok(())
     }
 
-    /// One step; the episode if it is over.
+    fn draw_latent_noise(&mut self, _index: usize, row: &mut ActingRow<'_>) {
+        // Without noise the latent is its mean.
+        if !self.deterministic {
+            row.draw_latent_noise(&mut self.rng);
+        }
+    }
+
     fn step(
         &mut self,
-        batch: &mut ActingBatch,
         index: usize,
-        options: &Options,
-        rng: &mut Pcg64,
-        (sampled, clipped): &mut (Vec<f32>, Vec<f32>),
-    ) -> Option<Finished> {
-        let episode = self.episode.as_mut()?;
-        let row = batch.row(index);
-        if options.deterministic {
-            sampled.copy_from_slice(row.mode());
-        } else {
-            row.sample(sampled, rng);
+        rollout: &mut Rollout<E>,
+        row: &mut ActingRow<'_>,
+    ) -> Result<ControlFlow<()>, Error> {
+        if rollout.ended {
+            return Ok(ControlFlow::Continue(()));
         }
-        clip_action(sampled, clipped);
-        let step = self.environment.step(clipped);
-        episode.rewards.push(step.reward_terms.iter().sum());
-        for (sum, term) in episode.returns.iter_mut().zip(&step.reward_terms) {
-            *sum += term;
+        match self.deterministic {
+            true => self.action.copy_from_slice(row.mode()),
+            false => row.sample(&mut self.action, &mut self.rng),
         }
-        episode.head_heights += step.head_height;
-        episode.diverged = step.outcome == Outcome::Diverged;
-        row.previous_latent.copy_from_slice(row.latent);
-        self.environment.observe(row.proprioception, row.task);
-        if step.outcome == Outcome::Running { None } else { self.episode.take() }
+        let step = rollout.step(&self.action, row);
+        let Running { number, rewards, .. } = &mut self.running[index];
+        rewards.push(step.reward_terms.iter().sum());
+        let mut flow = ControlFlow::Continue(());
+        if step.outcome != Outcome::Diverged {
+            flow = self.audience.watch(*number, &mut rollout.environment)?;
+        }
+        if rollout.ended {
+            self.finish(index, rollout, step.outcome);
+            if flow.is_continue() {
+                flow = self.begin_next(index, rollout, row)?;
+            }
+        }
+        Ok(flow)
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use comic_tasks::{Episode, Step};
+    use comic_proto::Field;
+    use comic_tasks::{Episode, MAX_REWARD_TERMS, Step};
 
     use super::*;
+    use crate::acting::ActingBatch;
+
+    const SHAPE: UnrollShape = UnrollShape {
+        length: 1,
+        proprioception: 1,
+        task: 0,
+        latent: 1,
+        action: 2,
+        reward_terms: 1,
+        image: 0,
+        components: 1,
+        state: 0,
+    };
 
     /// Falls after three steps when it starts at an odd frame; pays 1 a step for an action of exactly 0.25.
     #[derive(Debug)]
@@ -247,26 +244,23 @@ mod tests {
             Ok(())
         }
         fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
-            assert!(batch.latent_noise.iter().all(|noise| *noise == 0.0), "the latent's mean has no noise");
-            let steps = batch.proprioception.clone();
-            for (previous, step) in batch.previous_latent.iter().zip(steps) {
-                assert_eq!(*previous, step, "the latent of the step before, 0 at the first");
-            }
-            for (latent, previous) in batch.latent.iter_mut().zip(&batch.previous_latent) {
+            assert!(batch[Field::LatentNoise].iter().all(|noise| *noise == 0.0), "the latent's mean has no noise");
+            let previous = batch[Field::PreviousLatent].to_vec();
+            assert_eq!(previous, batch[Field::Proprioception], "the latent of the step before, 0 at the first");
+            for (latent, previous) in batch.latent.iter_mut().zip(previous) {
                 *latent = previous + 1.0;
             }
-            batch.mean.fill(0.25);
-            batch.std.fill(9.0);
+            batch[Field::Mean].fill(0.25);
+            batch[Field::Std].fill(9.0);
             Ok(())
         }
     }
 
-    fn episodes(evaluated: &mut Evaluated<'_, Quarter>, environments: usize) -> Vec<(usize, usize, f64)> {
+    fn episodes(controller: &mut Controller<'_, Quarter>, environments: usize) -> Vec<(usize, usize, f64)> {
         let environments = (0..environments).map(|_| Fixed { start: 0, step: 0 }).collect();
         let starts: Vec<Start> = (0..7).map(|start| Start { clip: 0, start }).collect();
         let options = Options { deterministic: true, ..Options::default() };
-        let sizes = ActingSizes { proprioception: 1, task: 0, latent: 1, action: 2, image: 0, components: 1, state: 0 };
-        let finished = run(evaluated, environments, sizes, &starts, &options, &mut |_: usize, _: usize| ()).unwrap();
+        let finished = run(controller, environments, &SHAPE, &starts, &options, &mut |_: usize, _: usize| ()).unwrap();
         let mut found: Vec<_> = finished.iter().map(|e| (e.steps(), e.steps_left, e.returns[0])).collect();
         found.sort_by(|a, b| a.partial_cmp(b).unwrap());
         found
@@ -277,10 +271,10 @@ mod tests {
         let (fallen, whole) = ((3, 10, 3.0), (10, 10, 10.0));
         let expected = [fallen, fallen, fallen, whole, whole, whole, whole];
         for environments in [1, 2] {
-            assert_eq!(episodes(&mut Evaluated::Servo, environments), expected);
+            assert_eq!(episodes(&mut Controller::Servo { std: 0.0 }, environments), expected);
         }
         // One environment at a time, or the latents' law could not be read off the steps.
-        assert_eq!(episodes(&mut Evaluated::Policy(&mut Quarter), 1), expected);
+        assert_eq!(episodes(&mut Controller::Policy(&mut Quarter), 1), expected);
     }
 
     /// Notes what it sees, and leaves after so many looks.
@@ -301,14 +295,13 @@ mod tests {
     #[test]
     fn the_audience_sees_every_state_of_every_episode_and_may_leave_at_any() {
         let starts = [1, 3, 2].map(|start| Start { clip: 0, start });
-        let sizes = ActingSizes { proprioception: 1, task: 0, latent: 1, action: 2, image: 0, components: 1, state: 0 };
         let steps = |number, last| (0..=last).map(move |step| (number, step));
         let all: Vec<_> = steps(0, 3).chain(steps(1, 3)).chain(steps(2, 10)).collect();
         for (patience, episodes) in [(1, 0), (3, 0), (4, 1), (5, 1), (8, 2), (100, 3)] {
             let mut spectator = Spectator { seen: Vec::new(), patience };
             let (environments, options) = (vec![Fixed { start: 0, step: 0 }], Options::default());
             let finished =
-                run(&mut Evaluated::<Quarter>::Zero, environments, sizes, &starts, &options, &mut spectator).unwrap();
+                run(&mut Controller::<Quarter>::Zero, environments, &SHAPE, &starts, &options, &mut spectator).unwrap();
             assert_eq!(spectator.seen, all[..patience.min(all.len())]);
             assert_eq!(finished.len(), episodes, "{patience}");
             assert!(finished.iter().all(|episode| episode.returns[0] == 0.0), "the action was not 0");

@@ -6,12 +6,13 @@ use std::sync::Arc;
 use clap::Args;
 use comic_clips::Catalogue;
 use comic_experiment::{ClipSource, Experiment, TaskName};
+use comic_proto::UnrollShape;
 use comic_tasks::{Simulated, Task};
 
 use crate::Error;
-use crate::acting::ActingSizes;
+use crate::acting_loop::Controller;
 use crate::checkpoint::{self, Checkpoint};
-use crate::evaluate::{Audience, Evaluated, Finished, Options, Start, roll_out};
+use crate::evaluate::{Audience, Finished, Options, Start, roll_out};
 use crate::policy::TorchPolicy;
 
 /// The preset of tracking; every other task has one of its own name.
@@ -52,7 +53,7 @@ pub(super) struct Scene {
 pub(super) struct Cast {
     pub(super) task: Arc<dyn Task>,
     policy: Option<TorchPolicy>,
-    sizes: ActingSizes,
+    shape: UnrollShape,
     name: TaskName,
     starts: Vec<Start>,
     options: Options,
@@ -81,8 +82,8 @@ impl Scene {
         let name = self.task;
         let options =
             Options { deterministic: self.deterministic, seed: self.seed, environments: 1, ..Options::default() };
-        let sizes = ActingSizes::new(task.spec(), &experiment);
-        Ok(Cast { task, policy, sizes, name, starts, options })
+        let shape = UnrollShape::new(task.spec(), &experiment);
+        Ok(Cast { task, policy, shape, name, starts, options })
     }
 
     /// The experiment, and the parameters when there is a checkpoint.
@@ -136,11 +137,11 @@ impl Cast {
         audience: &mut dyn Audience<Box<dyn Simulated>>,
     ) -> Result<Vec<Finished>, Error> {
         let starts: Vec<Start> = self.starts.iter().copied().cycle().take(episodes).collect();
-        let mut evaluated = match &mut self.policy {
-            Some(policy) => Evaluated::Policy(policy),
-            None if self.name == TaskName::Tracking => Evaluated::Servo,
-            None => Evaluated::Zero,
+        let mut controller = match &mut self.policy {
+            Some(policy) => Controller::Policy(policy),
+            None if self.name == TaskName::Tracking => Controller::Servo { std: 0.0 },
+            None => Controller::Zero,
         };
-        roll_out(&mut evaluated, &self.task, self.sizes, &starts, &self.options, audience)
+        roll_out(&mut controller, &self.task, &self.shape, &starts, &self.options, audience)
     }
 }

@@ -1,7 +1,6 @@
 //! Files the experiment needs, fetched from the learner once and kept by their SHA-256.
 
 use std::collections::HashMap;
-use std::fmt::Write as _;
 use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -47,12 +46,7 @@ fn file_name(asset: &Asset) -> Result<String, Failure> {
     if asset.sha256.len() != 32 {
         return Err(broken(asset, format!("its SHA-256 has {} bytes", asset.sha256.len())));
     }
-    let mut name = String::with_capacity(64);
-    for byte in &asset.sha256 {
-        // Writing to a string cannot fail.
-        let _ = write!(name, "{byte:02x}");
-    }
-    Ok(name)
+    Ok(hex::encode(&asset.sha256))
 }
 
 fn broken(asset: &Asset, reason: String) -> Failure {

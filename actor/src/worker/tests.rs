@@ -1,10 +1,11 @@
 //! The law of the rows, with an environment and a policy that can be counted by hand.
 
-use comic_proto::UnrollShape;
+use comic_proto::{Field, UnrollShape};
 use comic_tasks::{Episode, MAX_REWARD_TERMS, Outcome, Step};
 use proptest::prelude::*;
 
 use super::*;
+use crate::acting::ActingBatch;
 
 mod running;
 
@@ -86,12 +87,13 @@ impl ForwardPass for Plain {
         Ok(())
     }
     fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
-        for (latent, previous) in batch.latent.iter_mut().zip(&batch.previous_latent) {
+        let previous = batch[Field::PreviousLatent].to_vec();
+        for (latent, previous) in batch.latent.iter_mut().zip(previous) {
             *latent = previous + 1.0;
         }
-        batch.state.iter_mut().for_each(|steps| *steps += 1.0);
-        batch.mean.fill(self.parameter);
-        batch.std.fill(0.5);
+        batch[Field::State].iter_mut().for_each(|steps| *steps += 1.0);
+        batch[Field::Mean].fill(self.parameter);
+        batch[Field::Std].fill(0.5);
         Ok(())
     }
 }
@@ -141,8 +143,6 @@ impl Rows<'_> {
         (row[0] as usize, row[1] as usize)
     }
 }
-
-use comic_proto::Field;
 
 /// `unrolls` unrolls of environments with these episode lengths; `[environment][unroll]`.
 fn record(length: usize, lanes: &[Vec<usize>], unrolls: usize) -> (Arc<UnrollLayout>, Vec<Vec<FinishedUnroll>>) {

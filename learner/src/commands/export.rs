@@ -5,9 +5,9 @@ use std::path::Path;
 use comic_experiment::Experiment;
 use comic_networks::export::{Exported, Part, Source};
 
+use crate::checkpoint::progress::Progress;
 use crate::checkpoint::{self, Snapshot};
 use crate::error::{Error, Result};
-use crate::train::trainer::Progress;
 
 /// What the file's extension says it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

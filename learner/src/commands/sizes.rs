@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use comic_experiment::{Experiment, TaskSpec};
 use tch::Device;
 
+use crate::document::DocumentArguments;
 use crate::error::{Error, Result};
-use crate::options::Document;
 use crate::vmpo::VmpoLearner;
 
 /// The paper's own, whose low levels are of similar size.
@@ -37,7 +37,7 @@ pub fn count(experiment: &Experiment) -> Result<BTreeMap<&'static str, usize>> {
 ///
 /// # Errors
 /// When there is no such experiment, or its networks cannot be built.
-pub fn table(document: &Document) -> Result<String> {
+pub fn table(document: &DocumentArguments) -> Result<String> {
     let mut table =
         String::from("| experiment | encoder | low level | value | all |\n| --- | --- | --- | --- | --- |\n");
     let named = document.preset.as_deref();

@@ -5,12 +5,11 @@
 
 use std::fmt::Write as _;
 use std::sync::atomic::Ordering;
-use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use anyhow::Context as _;
 use comic_experiment::TaskName;
 use comic_replay::AccountingByTask;
+use parking_lot::Mutex;
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
@@ -18,6 +17,7 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::{Metric, Registry};
 
+use crate::error::{Error, Result};
 use crate::observe::metrics::Rows;
 
 /// One label and its value.
@@ -329,7 +329,7 @@ impl Telemetry {
         }
         ages.sort_unstable();
         let at = |share: usize| ages.get(ages.len().saturating_sub(1) * share / 100).copied().unwrap_or_default();
-        *self.ages.lock().unwrap_or_else(PoisonError::into_inner) = Ages { median: at(50), p99: at(99), max: at(100) };
+        *self.ages.lock() = Ages { median: at(50), p99: at(99), max: at(100) };
     }
 
     /// Counts what was trained on of a task.
@@ -349,7 +349,7 @@ impl Telemetry {
 
     /// Of the newest update.
     pub(crate) fn ages(&self) -> Ages {
-        *self.ages.lock().unwrap_or_else(PoisonError::into_inner)
+        *self.ages.lock()
     }
 
     /// The page that Prometheus reads, in the OpenMetrics text format.
@@ -442,7 +442,8 @@ fn resident_bytes() -> u64 {
 ///
 /// # Errors
 /// When stdout refuses.
-pub fn print_reference() -> anyhow::Result<()> {
+pub fn print_reference() -> Result<()> {
     let page = Telemetry::default().reference();
-    std::io::Write::write_all(&mut std::io::stdout(), page.as_bytes()).context("cannot write to stdout")
+    let written = std::io::Write::write_all(&mut std::io::stdout(), page.as_bytes());
+    written.map_err(Error::system("cannot write to stdout"))
 }

@@ -6,8 +6,8 @@ use crate::support::{EPOCH, RUN, World, joining, parameters};
 use comic_experiment::{Experiment, TaskSpec};
 use comic_learner::publish::Publisher;
 use comic_learner::security::{ConnectionLimits, Security};
-use comic_learner::service::quarantine::QuarantineOptions;
-use comic_learner::service::{Setup, Shared};
+use comic_learner::service::quarantine::QuarantineArguments;
+use comic_learner::service::{Service, Setup};
 use comic_proto::v1::{Behaviour, Environments, JoinRequest, StatusRequest, Verdict, WatchRequest};
 use comic_proto::{PROTOCOL_VERSION, UnrollLayout, UnrollShape};
 use tonic::Code;
@@ -159,12 +159,12 @@ async fn a_service_whose_parts_disagree_does_not_start() {
         assets: Vec::new(),
         batcher: world.batcher.clone(),
         publisher: world.publisher.clone(),
-        quarantine: QuarantineOptions::default(),
+        quarantine: QuarantineArguments::default(),
     };
     let (mut longer, mut later) = (setup(), setup());
     longer.experiment.unroll.length += 1;
     later.publisher = Publisher::new(EPOCH + 1);
-    assert!(Shared::new(longer).unwrap_err().to_string().contains("length: 5"));
-    assert!(Shared::new(later).unwrap_err().to_string().contains("epoch 3"));
-    assert!(Shared::new(setup()).is_ok());
+    assert!(Service::new(longer).unwrap_err().to_string().contains("length: 5"));
+    assert!(Service::new(later).unwrap_err().to_string().contains("epoch 3"));
+    assert!(Service::new(setup()).is_ok());
 }

@@ -8,8 +8,8 @@ use std::time::Duration;
 use crate::support::{EPOCH, World, joining, within};
 use comic_learner::publish::Publisher;
 use comic_learner::security::{ConnectionLimits, Security};
-use comic_learner::service::quarantine::QuarantineOptions;
-use comic_learner::service::{Setup, Shared};
+use comic_learner::service::quarantine::QuarantineArguments;
+use comic_learner::service::{Service, Setup};
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{EvaluationReport, StatusRequest};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -120,9 +120,9 @@ async fn a_limit_through_which_no_unroll_fits_is_a_wrong_configuration() {
             assets: Vec::new(),
             batcher: world.batcher.clone(),
             publisher: Publisher::new(EPOCH),
-            quarantine: QuarantineOptions::default(),
+            quarantine: QuarantineArguments::default(),
         };
-        let refused = Shared::new(setup).unwrap_err();
+        let refused = Service::new(setup).unwrap_err();
         assert!(refused.exit_code() == 2 && refused.to_string().contains(option), "{refused}");
     }
 }

@@ -25,7 +25,7 @@ async fn get(address: &str, request: &str) -> (u16, String) {
 async fn observed(world: &World) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();
-    tokio::spawn(probes::serve(listener, world.shared.clone()));
+    tokio::spawn(probes::serve(listener, world.service.probed()));
     address
 }
 

@@ -40,7 +40,7 @@ async fn silent_after(world: &World, bytes: Bytes) -> JoinHandle<Code> {
 
 /// A metric.
 fn read(world: &World, name: &str) -> u64 {
-    let page = world.shared.metrics_page();
+    let page = world.metrics_page();
     let line = page.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
     line.expect("a metric of this name").parse().unwrap()
 }

@@ -27,10 +27,10 @@ async fn who_asks_while_the_learner_drains_is_told_to_come_back() {
     let mut health = HealthClient::new(world.channel().await);
     let mut watch = health.watch(HealthCheckRequest::default()).await.unwrap().into_inner();
     assert_eq!(watch.message().await.unwrap().unwrap().status(), ServingStatus::Serving);
-    world.shared.drain();
+    world.service.drain();
     drains(actor.client.join(joining(71)).await.unwrap_err());
     assert_eq!(within(LIMIT, watch.message()).await.unwrap().unwrap().status(), ServingStatus::NotServing);
-    assert!(world.shared.metrics_page().contains("comic_joins_total{result=\"draining\"} 1\n"));
+    assert!(world.metrics_page().contains("comic_joins_total{result=\"draining\"} 1\n"));
     assert!(actor.client.get_status(StatusRequest {}).await.is_ok(), "the accounting can still be read");
     // The update that was under way was the last one: who was sent away may come and hear that.
     world.publisher.end_run();

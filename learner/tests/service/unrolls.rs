@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use crate::support::{BATCH, EPOCH, World, within};
 use bytes::Bytes;
-use comic_learner::service::quarantine::QuarantineOptions;
+use comic_learner::service::quarantine::QuarantineArguments;
 use comic_proto::v1::{Behaviour, UnrollMessage, Verdict};
 use comic_proto::{Field, UnrollBuffer};
 use comic_replay::{Next, Phase};
@@ -56,7 +56,8 @@ async fn an_invalid_unroll_is_refused_by_name_and_the_next_one_is_welcome() {
 #[tokio::test]
 async fn an_invalid_unroll_goes_to_the_quarantine_and_no_other_one_does() {
     let directory = tempfile::tempdir().unwrap();
-    let quarantine = QuarantineOptions { quarantine: Some(directory.path().to_path_buf()), quarantine_bytes: 1 << 20 };
+    let quarantine =
+        QuarantineArguments { quarantine: Some(directory.path().to_path_buf()), quarantine_bytes: 1 << 20 };
     let world = World::quarantining(quarantine).await;
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;
@@ -66,7 +67,7 @@ async fn an_invalid_unroll_goes_to_the_quarantine_and_no_other_one_does() {
     assert_eq!(unrolls.verdict(short).await, Verdict::Duplicate);
     let kept = "comic_quarantined_total{result=\"kept\"} 1\n";
     within(Duration::from_secs(10), async {
-        while !world.shared.metrics_page().contains(kept) {
+        while !world.metrics_page().contains(kept) {
             tokio::task::yield_now().await;
         }
     })

@@ -10,10 +10,11 @@ use anyhow::Result;
 use bytes::Bytes;
 use comic_clips::Asset;
 use comic_experiment::{Experiment, TaskPart, TaskSpec, Unroll};
+use comic_learner::observe::probes::Probed as _;
 use comic_learner::publish::Publisher;
 use comic_learner::security::{ConnectionLimits, Security};
-use comic_learner::service::quarantine::QuarantineOptions;
-use comic_learner::service::{Setup, Shared, serve};
+use comic_learner::service::quarantine::QuarantineArguments;
+use comic_learner::service::{Service, Setup, serve};
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{
     Behaviour, JoinReply, JoinRequest, ParametersChunk, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict,
@@ -45,7 +46,7 @@ pub(crate) struct World {
     pub(crate) spec: TaskSpec,
     pub(crate) batcher: Batcher,
     pub(crate) publisher: Publisher,
-    pub(crate) shared: Arc<Shared>,
+    pub(crate) service: Service,
     pub(crate) address: String,
     shutdown: Option<oneshot::Sender<()>>,
     server: JoinHandle<comic_learner::error::Result<()>>,
@@ -72,7 +73,7 @@ impl World {
     }
 
     /// With a quarantine.
-    pub(crate) async fn quarantining(quarantine: QuarantineOptions) -> Self {
+    pub(crate) async fn quarantining(quarantine: QuarantineArguments) -> Self {
         Self::of(experiment(), 8, Vec::new(), Security::default(), ConnectionLimits::default(), quarantine).await
     }
 
@@ -81,12 +82,12 @@ impl World {
         let mut experiment = experiment();
         experiment.unroll = Unroll { lockstep: true, ahead: 0, batch: environments, ..experiment.unroll };
         let (security, limits, quarantine) =
-            (Security::default(), ConnectionLimits::default(), QuarantineOptions::default());
+            (Security::default(), ConnectionLimits::default(), QuarantineArguments::default());
         Self::of(experiment, 8, Vec::new(), security, limits, quarantine).await
     }
 
     async fn guarded(proprioception: usize, assets: Vec<Asset>, security: Security, limits: ConnectionLimits) -> Self {
-        Self::of(experiment(), proprioception, assets, security, limits, QuarantineOptions::default()).await
+        Self::of(experiment(), proprioception, assets, security, limits, QuarantineArguments::default()).await
     }
 
     async fn of(
@@ -95,7 +96,7 @@ impl World {
         assets: Vec<Asset>,
         security: Security,
         limits: ConnectionLimits,
-        quarantine: QuarantineOptions,
+        quarantine: QuarantineArguments,
     ) -> Self {
         let spec = TaskSpec {
             proprioception,
@@ -129,14 +130,14 @@ impl World {
             publisher: publisher.clone(),
             quarantine,
         };
-        let shared = Shared::new(setup).unwrap();
+        let service = Service::new(setup).unwrap();
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = format!("http://{}", listener.local_addr().unwrap());
         let (shutdown, signal) = oneshot::channel::<()>();
-        let server = tokio::spawn(serve(listener, shared.clone(), async move {
+        let server = tokio::spawn(serve(listener, service.clone(), async move {
             let _ = signal.await;
         }));
-        Self { experiment, spec, batcher, publisher, shared, address, shutdown: Some(shutdown), server }
+        Self { experiment, spec, batcher, publisher, service, address, shutdown: Some(shutdown), server }
     }
 
     /// A connection, for clients of other services than the learner's own.
@@ -181,6 +182,11 @@ impl World {
         let request = JoinRequest { name: name.into(), ..joining(incarnation) };
         let reply = client.join(request).await.unwrap().into_inner();
         Actor { client, reply, incarnation, layout: self.batcher.layout().clone() }
+    }
+
+    /// The metrics, as Prometheus reads them.
+    pub(crate) fn metrics_page(&self) -> String {
+        self.service.probed().metrics_page()
     }
 
     /// Gives the signal to end.

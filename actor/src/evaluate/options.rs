@@ -1,0 +1,20 @@
+//! How a policy is evaluated.
+
+/// How to evaluate.
+#[derive(Clone, Copy, Debug)]
+pub struct Options {
+    /// Episodes of each clip from random starts; every start once when absent.
+    pub episodes: Option<usize>,
+    /// The mean action and the latent's mean instead of samples.
+    pub deterministic: bool,
+    /// Seed of random starts and of the noise.
+    pub seed: u64,
+    /// Environments in one forward pass.
+    pub environments: usize,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { episodes: None, deterministic: false, seed: 1, environments: 16 }
+    }
+}
