@@ -1,4 +1,4 @@
-# TensorBoard over the runs in a volume, for compose's profile `tensorboard`. Nothing of ours is in it.
+# TensorBoard for the runs in a volume: the profile `tensorboard` of compose.yaml. It contains none of our programs.
 #
 #     docker build --file deploy/tensorboard.Dockerfile --tag comic-tensorboard:0.1.0 .
 ARG DEBIAN_IMAGE=debian:bookworm-slim
@@ -26,7 +26,7 @@ RUN find /etc/apt -name '*.sources' -o -name sources.list | xargs sed --in-place
     && useradd --uid 10001 --gid comic --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin comic \
     && install --directory --owner comic --group comic /runs
 COPY --from=wheels /opt/tensorboard /opt/tensorboard
-# It talks to its own reader through gRPC, which must not ask a proxy for this machine.
+# TensorBoard connects to its own reader process by gRPC, and must not use a proxy for that.
 ENV PYTHONPATH=/opt/tensorboard PYTHONDONTWRITEBYTECODE=1 no_grpc_proxy=localhost
 USER 10001:10001
 EXPOSE 6006

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Context as _;
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, CommandFactory as _, Parser, Subcommand, ValueEnum};
 use comic_actor::clips::Clips;
 use comic_actor::dump;
 use comic_actor::evaluate::command::Evaluate;
@@ -13,6 +13,7 @@ use comic_actor::liveness::Health;
 use comic_actor::render::command::Render;
 use comic_actor::render::view::View;
 use comic_actor::{Error, policy, run};
+use comic_manual::Manual;
 use comic_proto::Access;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
@@ -50,6 +51,9 @@ enum Command {
     Replay(dump::Command),
     /// Exits with 0 if an actor steps environments and with 1 if not, for a container's health check.
     Health(Health),
+    /// Write shell completions and man pages.
+    #[command(hide = true)]
+    Manual(Manual),
 }
 
 #[derive(Args, Debug)]
@@ -112,6 +116,7 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
         Some(Command::Clips(clips)) => clips.run().map_err(anyhow::Error::from),
         Some(Command::Replay(replay)) => replay.run().context("cannot replay"),
         Some(Command::Health(health)) => health.run(),
+        Some(Command::Manual(manual)) => manual.write(Arguments::command()).context("cannot write the manual"),
         None => {
             let Act { learner, access, name, threads, environments, cache, dump_diverged, liveness } = arguments.act;
             let learner = learner.ok_or_else(|| {

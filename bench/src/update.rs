@@ -130,7 +130,7 @@ impl Networks {
     fn refill(&mut self, backend: &Backend) -> Result<()> {
         self.minibatch = self.recorded.to_tensors(backend.device())?;
         backend.end_step()?;
-        backend.wait()
+        Ok(backend.wait()?)
     }
 
     /// Milliseconds of a gradient step.

@@ -8,6 +8,7 @@
 //!   servo action that aims at a pose.
 //! - [`import`] makes clips from CMU's ASF and AMC files, [`check`] finds defects, [`ClipWriter`] writes files that
 //!   dm_control reads, and [`merge()`] joins several files. They compute body positions by forward kinematics.
+//! - [`spatial`] has vectors, rotation matrices and quaternions.
 //! - [`subset`] lists dm_control's named subsets, [`builtin_names`] the names that can follow `builtin:`.
 //!
 //! A source is `builtin:NAME` (compiled in, or made by the program) or the path of an HDF5 file in the layout of
@@ -28,7 +29,7 @@ mod humanoid;
 pub mod import;
 mod merge;
 mod nearest;
-mod spatial;
+pub mod spatial;
 mod subsets;
 mod write;
 

@@ -4,10 +4,10 @@ mod support;
 
 use comic_clips::{Catalogue, Features, WalkerModel, pose_to_action};
 use comic_experiment::ClipSource;
-use support::{defects, names, refused, shared, tiny, wheel_clips, whole, with_ids};
+use support::{defects, golden, names, recordings, refused, tiny, wheel_clips, whole, with_ids};
 
 #[test]
-fn a_whole_file_is_all_its_clips_sorted_by_name() {
+fn a_whole_file_gives_all_its_clips_sorted_by_name() {
     let catalogue = Catalogue::open(&[whole(tiny())]).unwrap();
     assert_eq!(names(&catalogue), ["TINY_001_01", "TINY_001_02"]);
     let first = &catalogue.entries()[0];
@@ -45,11 +45,10 @@ fn a_clip_has_one_entry_per_frame_in_every_field() {
     assert_eq!([body_positions.len(), body_quaternions.len()], [9 * 31 * 3, 9 * 31 * 4]);
 }
 
-/// The recorded clips are frame after frame, files are feature after feature: only a right transpose makes them equal.
+/// A file stores an array as [feature, frame], a clip stores it as [frame, feature]; a wrong transpose breaks this relation.
 #[test]
 fn frames_of_a_file_are_its_columns() {
-    let Some(file) = shared("clips/cmu_dev.h5") else { return };
-    let clip = Catalogue::open(&[with_ids(file, &["CMU_007_01"])]).unwrap().load(0).unwrap();
+    let clip = Catalogue::open(&[with_ids(recordings("clips.h5"), &["CMU_007_01"])]).unwrap().load(0).unwrap();
     let features = clip.features.as_ref().unwrap();
     for step in 0..clip.steps() {
         // The first tracking body, lhipjoint, hangs rigidly on the root.
@@ -61,28 +60,26 @@ fn frames_of_a_file_are_its_columns() {
 }
 
 #[test]
-fn files_of_dm_control_itself_open() {
-    if let Some(file) = wheel_clips() {
-        let catalogue = Catalogue::open(&[whole(file)]).unwrap();
-        assert_eq!(names(&catalogue), ["cmuv2019_001", "cmuv2019_002"]);
-        for (index, entry) in catalogue.entries().iter().enumerate() {
-            assert_eq!((entry.model, entry.dt, entry.steps), (WalkerModel::Cmu2019, 0.05, 10));
-            let features = catalogue.load(index).unwrap().features.unwrap();
-            assert_eq!((features.body_positions.len(), features.body_quaternions.len()), (900, 1200));
-        }
-    }
-    if let Some(file) = shared("golden/synthetic_v2020.h5") {
-        let catalogue = Catalogue::open(&[whole(file)]).unwrap();
-        assert_eq!(names(&catalogue), ["SYN_001_01", "SYN_002_01", "SYN_003_01", "SYN_004_01"]);
-        for index in 0..4 {
-            assert_eq!(catalogue.load(index).unwrap().steps(), 120);
-        }
+fn the_test_clips_of_dm_control_open() {
+    let catalogue = Catalogue::open(&[whole(wheel_clips())]).unwrap();
+    assert_eq!(names(&catalogue), ["cmuv2019_001", "cmuv2019_002"]);
+    for (index, entry) in catalogue.entries().iter().enumerate() {
+        assert_eq!((entry.model, entry.dt, entry.steps), (WalkerModel::Cmu2019, 0.05, 10));
+        let features = catalogue.load(index).unwrap().features.unwrap();
+        assert_eq!((features.body_positions.len(), features.body_quaternions.len()), (900, 1200));
     }
 }
 
 #[test]
-fn opening_reads_the_chosen_clips_attributes_and_nothing_else() {
-    // Nearly every clip of this file is defective; what is not chosen, or not loaded, does not matter.
+fn clips_that_a_script_wrote_with_h5py_open() {
+    let catalogue = Catalogue::open(&[whole(golden("synthetic_v2020.h5"))]).unwrap();
+    assert_eq!(names(&catalogue), ["DRAWN_001_01", "DRAWN_002_01"]);
+    assert_eq!([0, 1].map(|index| catalogue.load(index).unwrap().steps()), [40, 40]);
+}
+
+#[test]
+fn opening_reads_only_the_attributes_of_the_chosen_clips() {
+    // Nearly every clip of this file is defective. Clips that are not chosen, or not loaded, give no error.
     let catalogue = Catalogue::open(&[with_ids(defects(), &["sound", "joints_missing", "sound_2019"])]).unwrap();
     assert_eq!(names(&catalogue), ["joints_missing", "sound", "sound_2019"]);
     assert!(catalogue.load(0).is_err());
@@ -91,7 +88,7 @@ fn opening_reads_the_chosen_clips_attributes_and_nothing_else() {
 }
 
 #[test]
-fn a_subset_is_picked_from_a_file_and_what_is_missing_is_counted() {
+fn a_subset_is_chosen_from_a_file_and_missing_clips_are_counted() {
     let source = ClipSource { subset: Some("get_up".into()), ..whole(tiny()) };
     assert_eq!(
         refused(source),
@@ -105,15 +102,15 @@ fn a_subset_is_picked_from_a_file_and_what_is_missing_is_counted() {
 
 #[test]
 fn ids_beside_a_subset_choose_from_it() {
-    let Some(file) = shared("clips/cmu_dev.h5") else { return };
-    let source = |subset: &str, id: &str| ClipSource { subset: Some(subset.into()), ..with_ids(&file, &[id]) };
-    assert_eq!(names(&Catalogue::open(&[source("all", "CMU_002_01")]).unwrap()), ["CMU_002_01"]);
-    let message = refused(source("get_up", "CMU_002_01"));
-    assert!(message.contains("clip `CMU_002_01` is not in subset `get_up`"), "{message}");
+    let source =
+        |subset: &str, id: &str| ClipSource { subset: Some(subset.into()), ..with_ids(recordings("clips.h5"), &[id]) };
+    assert_eq!(names(&Catalogue::open(&[source("all", "CMU_007_01")]).unwrap()), ["CMU_007_01"]);
+    let message = refused(source("get_up", "CMU_007_01"));
+    assert!(message.contains("clip `CMU_007_01` is not in subset `get_up`"), "{message}");
 }
 
 #[test]
-fn a_catalogue_finds_files_where_it_is_told() {
+fn a_catalogue_finds_files_through_the_callers_function() {
     let sources = [with_ids("motion.h5", &["TINY_001_01"]), ClipSource::whole("builtin:stand")];
     let catalogue = Catalogue::open_with(&sources, |source| (source == "motion.h5").then(|| tiny().into())).unwrap();
     assert_eq!(names(&catalogue), ["TINY_001_01", "stand"]);
@@ -123,7 +120,7 @@ fn a_catalogue_finds_files_where_it_is_told() {
 }
 
 #[test]
-fn assets_are_the_files_hashed_each_once() {
+fn assets_are_the_files_each_hashed_once() {
     let sources =
         [with_ids(tiny(), &["TINY_001_01"]), ClipSource::whole("builtin:walk"), with_ids(tiny(), &["TINY_001_02"])];
     let assets = Catalogue::open(&sources).unwrap().assets().unwrap();
@@ -144,7 +141,7 @@ fn the_mean_action_is_the_mean_over_frames_in_use_by_weight() {
     };
     let catalogue = Catalogue::open(&[source("TINY_001_01", 3.0, 5), source("TINY_001_02", 1.0, 9)]).unwrap();
     let mut expected = [0.0; 56];
-    // dm_control's slices: 2..=5 is four frames; 9 is the second clip's end, which leaves seven.
+    // dm_control's slices: 2..=5 are four frames. The end step 9 is the second clip's end, so seven frames are left.
     for (index, weight, frames) in [(0, 3.0, 2..6), (1, 1.0, 2..9)] {
         for pose in &catalogue.load(index).unwrap().motion.joints[frames] {
             for (sum, action) in expected.iter_mut().zip(pose_to_action(pose)) {

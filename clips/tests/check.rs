@@ -1,5 +1,5 @@
-//! Every defect at once, and none where there is none.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+//! The check finds every defect of a file, and none in a sound one.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
 mod support;
 
@@ -9,7 +9,7 @@ use comic_clips::check::{Checked, Kind, check};
 use comic_clips::import::import;
 use comic_clips::{Catalogue, Clip, ClipWriter, JOINTS, merge};
 use comic_experiment::ClipSource;
-use support::{defects, run_take, shared};
+use support::{defects, recordings, run_take};
 
 fn kinds(checked: &Checked) -> Vec<Kind> {
     let mut kinds: Vec<Kind> = checked.defects.iter().map(|defect| defect.kind).collect();
@@ -51,17 +51,16 @@ fn built_in_and_imported_clips_have_no_defect() {
 }
 
 #[test]
-fn the_clips_another_program_made_have_no_defect() {
-    let Some(file) = shared("clips/cmu_dev.h5") else { return };
-    let all = check(&file, &[]).unwrap();
-    assert_eq!(all.len(), 24);
+fn clips_that_another_program_made_have_no_defect() {
+    let all = check(&recordings("clips.h5"), &[]).unwrap();
+    assert_eq!(all.len(), 3);
     for checked in all {
         assert_eq!(checked.defects, [], "{}", checked.clip);
     }
 }
 
 #[test]
-fn each_defect_is_found_with_its_frames_and_its_size() {
+fn each_defect_is_found_with_its_frames_and_size() {
     let directory = tempfile::tempdir().unwrap();
     let mut clip = walk();
     let steps = clip.steps();
@@ -95,7 +94,7 @@ fn each_defect_is_found_with_its_frames_and_its_size() {
     assert_eq!(places, [("root", 2, 30), ("ltibiarx", 2, 20)]);
 }
 
-/// The file has a clip per defect, its name.
+/// The file has one clip for each defect, with the defect's name.
 #[test]
 fn a_defective_file_is_searched_to_its_end() {
     let all = check(defects().as_ref(), &[]).unwrap();
@@ -120,7 +119,7 @@ fn a_defective_file_is_searched_to_its_end() {
 }
 
 #[test]
-fn a_clip_that_is_not_there_is_named_with_the_nearest() {
+fn the_error_of_a_missing_clip_names_the_nearest() {
     let message = check(defects().as_ref(), &["sonud".into()]).unwrap_err().to_string();
     assert!(message.contains("no clip `sonud` (did you mean `sound`"), "{message}");
 }

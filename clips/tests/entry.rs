@@ -1,11 +1,11 @@
-//! Which frames of a clip are used, which can be starts, and which clips a task refuses.
+//! The frames of a clip in use, its start frames, and the clips that a task refuses.
 
 mod support;
 
 use comic_clips::{Catalogue, Entry, WalkerModel::*};
 use comic_experiment::ClipSource;
 use proptest::prelude::*;
-use support::{shared, with_ids};
+use support::{golden, recordings, with_ids};
 
 fn entry(steps: usize, start_step: usize, end_step: Option<usize>) -> Entry {
     Entry { name: "walk".into(), steps, dt: 0.03, model: Cmu2020, start_step, end_step, weight: 1.0 }
@@ -66,8 +66,7 @@ fn a_clip_too_short_for_its_look_ahead_is_refused() {
 
 #[test]
 fn a_sub_range_of_a_file_is_checked_like_any_other() {
-    let Some(file) = shared("clips/cmu_dev.h5") else { return };
-    let source = ClipSource { start_step: 80, ..with_ids(file, &["CMU_007_01"]) };
+    let source = ClipSource { start_step: 80, ..with_ids(recordings("clips.h5"), &["CMU_007_01"]) };
     let catalogue = Catalogue::open(&[source]).unwrap();
     let message = catalogue.entries()[0].check(Cmu2020, 0.03, 5, 10).unwrap_err().to_string();
     assert!(message.contains("frames 80 to 86 are 7 frames"), "{message}");
@@ -75,8 +74,8 @@ fn a_sub_range_of_a_file_is_checked_like_any_other() {
 
 #[test]
 fn starts_and_frames_equal_dm_controls() {
-    let Some(file) = shared("golden/start_sampling.json") else { return };
-    let golden: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
+    let text = std::fs::read_to_string(golden("start_sampling.json")).unwrap();
+    let golden: serde_json::Value = serde_json::from_str(&text).unwrap();
     let number = |value: &serde_json::Value| value.as_u64().unwrap() as usize;
     let entries: Vec<Entry> = (0..4)
         .map(|clip| entry(120, number(&golden["start_steps"][clip]), Some(number(&golden["end_steps"][clip]))))

@@ -1,12 +1,12 @@
-//! Clips from CMU's recordings, compared with clips that another program made of them.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+//! Compares imported recordings of the CMU database with the clips that MuJoCo and dm_control made of them.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
 mod support;
 
 use comic_clips::import::{Constants, Floor, Take, import, read_manifest};
 use comic_clips::{Catalogue, Clip, Features, Motion};
 use comic_experiment::ClipSource;
-use support::{run_take, shared, with_ids};
+use support::{recordings, run_take, with_ids};
 
 const TOLERANCE: f64 = 1e-6;
 
@@ -48,7 +48,7 @@ fn builtin(name: &str) -> Clip {
     Catalogue::open(&[ClipSource::whole(format!("builtin:{name}"))]).unwrap().load(0).unwrap()
 }
 
-/// `builtin:run` was made of the same recording, with MuJoCo and dm_control (`data/README.md`).
+/// MuJoCo and dm_control made `builtin:run` of the same recording (`data/README.md`).
 #[test]
 fn the_run_of_subject_2_is_the_built_in_one() {
     let (clip, taken) = import(&run_take()).unwrap();
@@ -57,25 +57,24 @@ fn the_run_of_subject_2_is_the_built_in_one() {
     assert_eq!((taken.frames, taken.notes), (0..173, vec![]));
 }
 
-/// Every field of every recording in the manifest, against the file that its constants belong to.
+/// Compares every field of every recording in the manifest.
 #[test]
-fn the_shared_recordings_become_the_shared_clips() {
-    let (Some(manifest), Some(file)) = (shared("clips/raw/manifest.json"), shared("clips/cmu_dev.h5")) else { return };
-    let takes = read_manifest(&manifest).unwrap();
-    assert_eq!(takes.len(), 6);
+fn recordings_become_the_clips_that_mujoco_and_dm_control_made_of_them() {
+    let takes = read_manifest(&recordings("manifest.json")).unwrap();
+    assert_eq!(takes.len(), 3);
     for take in takes {
         let (clip, _) = import(&take).unwrap();
-        let expected = Catalogue::open(&[with_ids(&file, &[&take.name])]).unwrap().load(0).unwrap();
+        let expected = Catalogue::open(&[with_ids(recordings("clips.h5"), &[&take.name])]).unwrap().load(0).unwrap();
         assert_near(&take.name, &motion_differences(&clip.motion, &expected.motion));
         assert_near(&take.name, &feature_differences(&clip.features.unwrap(), &expected.features.unwrap()));
     }
 }
 
 #[test]
-fn without_constants_soles_and_floor_are_found_and_told() {
+fn without_constants_soles_and_floor_are_found_and_reported() {
     let (clip, taken) = import(&Take { constants: Constants::default(), ..run_take() }).unwrap();
     println!("{taken}");
-    // What a person chose from several takes of this subject: 13.5, 12 and a drifting floor.
+    // A person chose these constants from several takes of this subject: 13.5, 12 and a drifting floor.
     for (found, chosen) in taken.sole_degrees.into_iter().zip([13.5, 12.0]) {
         assert!((found - chosen).abs() <= 4.0, "{found} degrees, chosen {chosen}");
     }
@@ -85,9 +84,8 @@ fn without_constants_soles_and_floor_are_found_and_told() {
 }
 
 #[test]
-fn what_was_found_for_shared_recordings_is_near_what_a_person_chose() {
-    let Some(manifest) = shared("clips/raw/manifest.json") else { return };
-    for take in read_manifest(&manifest).unwrap() {
+fn soles_and_floor_are_found_near_the_constants_that_a_person_chose() {
+    for take in read_manifest(&recordings("manifest.json")).unwrap() {
         let chosen = take.constants.clone();
         let (_, taken) = import(&Take { constants: Constants::default(), ..take.clone() }).unwrap();
         println!("{}: found {taken}", take.name);

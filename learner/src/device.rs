@@ -1,21 +1,20 @@
-//! Where the learner computes: the one place that knows what devices there are.
+//! The learner's devices; no other module knows which kinds exist.
 //!
-//! The update is written once, in [`vmpo`](crate::vmpo), for whatever [`Backend::device`] is. What differs is here: how a
-//! device is found, how a batch gets there, and that XLA is told where a gradient step ends.
+//! The update is written once, for any device. The differences are here: how a device is found, how a batch is copied to it,
+//! and that XLA is told where a gradient step ends.
 
 #[cfg(cuda)]
 mod cuda;
 #[cfg(feature = "xla")]
 mod xla;
 
-use anyhow::Result;
 use comic_experiment::{DeviceName, Learner};
 use tch::kind::Element;
 use tch::{Device, TchError, Tensor};
 
-use crate::error::Error;
+use crate::error::{Error, Result};
 
-/// A device that is there.
+/// A device that was found.
 #[derive(Debug)]
 pub struct Backend {
     name: DeviceName,
@@ -25,7 +24,7 @@ pub struct Backend {
 }
 
 impl Backend {
-    /// The device the experiment names, ready for tensors.
+    /// Opens the device that the experiment names.
     ///
     /// # Errors
     /// [`Error::Configuration`] with the remedy when the device was not built in or is not there.
@@ -37,7 +36,7 @@ impl Backend {
         }
     }
 
-    /// This machine's processors.
+    /// The processors of this machine.
     pub fn cpu() -> Self {
         Self::of(DeviceName::Cpu, Device::Cpu)
     }
@@ -56,12 +55,11 @@ impl Backend {
         if index < count {
             return Ok(Self::of(DeviceName::Cuda(index), Device::Cuda(index)));
         }
-        let found = if count == 0 { "no card" } else { "other cards only" };
+        let found = if count == 0 { "no GPU" } else { "other GPUs only" };
         Err(Error::configuration(format!(
-            "learner.device = \"cuda:{index}\": libtorch finds {found} ({count}). It takes an NVIDIA driver that lists the \
-             card (nvidia-smi), and a learner built with CUDA: `cargo xtask setup --cuda`, then build again"
-        ))
-        .into())
+            "learner.device = \"cuda:{index}\": libtorch finds {found} ({count}). This needs an NVIDIA driver that lists the \
+             GPU (nvidia-smi), and a learner built with CUDA: `cargo xtask setup --cuda`, then build again"
+        )))
     }
 
     #[cfg(feature = "xla")]
@@ -75,26 +73,25 @@ impl Backend {
         Err(Error::configuration(format!(
             "learner.device = \"xla:{index}\": this learner was built without XLA: `cargo xtask setup --xla`, then \
              `cargo build --release --package comic-learner --features xla`"
-        ))
-        .into())
+        )))
     }
 
-    /// As the experiment writes it.
+    /// The device's name in the experiment.
     pub fn name(&self) -> DeviceName {
         self.name
     }
 
-    /// As libtorch's bindings write it.
+    /// The device for libtorch's bindings.
     pub fn device(&self) -> Device {
         self.device
     }
 
-    /// Whether it works on while its caller does something else, so that asking for a result means to wait.
+    /// Whether it computes while its caller continues, so that reading a result means to wait.
     pub fn is_asynchronous(&self) -> bool {
         self.device != Device::Cpu
     }
 
-    /// Tells the device that the calling thread, if it is not the one that opened it, is the one that trains.
+    /// Tells the device that the calling thread trains. It may be another thread than the one that opened the device.
     ///
     /// # Errors
     /// When XLA refuses.
@@ -106,8 +103,8 @@ impl Backend {
         Ok(())
     }
 
-    /// Ends a gradient step. XLA compiles what was recorded since the last end, if it is new, and runs it; elsewhere
-    /// everything runs as it is written, and there is nothing to end. Does not wait for results.
+    /// Ends a gradient step. XLA compiles the operations since the last end, if they are new, and runs them. On other
+    /// devices this does nothing, because every operation runs at once. Does not wait for results.
     ///
     /// # Errors
     /// When XLA cannot compile or run it.
@@ -119,7 +116,7 @@ impl Backend {
         Ok(())
     }
 
-    /// Waits until the device has done what it was given.
+    /// Waits until the device has finished its work.
     ///
     /// # Errors
     /// When XLA cannot run it.
@@ -134,10 +131,10 @@ impl Backend {
         Ok(())
     }
 
-    /// Programs compiled so far; 0 where nothing is compiled.
+    /// Programs compiled so far; 0 on devices that do not compile.
     ///
     /// # Errors
-    /// When XLA does not say.
+    /// When XLA cannot tell.
     pub fn compilations(&self) -> Result<u64> {
         #[cfg(feature = "xla")]
         if let Some(xla) = &self.xla {
@@ -147,8 +144,8 @@ impl Backend {
     }
 }
 
-/// Values of a batch as a tensor of this size, one copy of them all. On a card it comes while earlier updates are still
-/// computed: from pinned memory, on a stream of its own.
+/// Copies values of a batch once, to a tensor of this size. The copy to a GPU runs during earlier updates: from pinned
+/// memory, on a separate stream.
 ///
 /// # Errors
 /// When there are not as many values as `size` says, or the device refuses.
@@ -165,18 +162,18 @@ mod tests {
     use super::*;
 
     fn open(device: DeviceName) -> Error {
-        Backend::open(&Learner { device, ..Learner::default() }).unwrap_err().into()
+        Backend::open(&Learner { device, ..Learner::default() }).unwrap_err()
     }
 
     #[test]
-    fn a_card_that_is_not_there_is_refused_with_its_remedy() {
+    fn a_missing_gpu_is_refused_with_its_remedy() {
         let error = open(DeviceName::Cuda(255));
         assert!(error.exit_code() == 2 && error.to_string().contains("setup --cuda"), "{error}");
     }
 
     #[cfg(not(feature = "xla"))]
     #[test]
-    fn a_learner_without_xla_says_how_it_gets_one() {
+    fn a_learner_without_xla_says_how_to_build_one_with_it() {
         let error = open(DeviceName::Xla(0));
         assert!(error.exit_code() == 2 && error.to_string().contains("--features xla"), "{error}");
     }

@@ -1,4 +1,4 @@
-//! A log that stays readable when a peer misbehaves at full speed.
+//! Limits log lines about a peer to one a minute, so that a faulty peer cannot flood the log.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -6,12 +6,12 @@ use std::time::{Duration, Instant};
 
 use parking_lot::Mutex;
 
-/// Silence after a complaint about a peer.
+/// The time between two lines about a peer.
 const QUIET: Duration = Duration::from_secs(60);
-/// Peers remembered. Were so many to misbehave within a minute, the log would have nothing more to tell.
-const REMEMBERED: usize = 1024;
+/// Peers that are remembered. If more peers cause lines within a minute, the further ones are not logged.
+const CAPACITY: usize = 1024;
 
-/// When each peer was last complained about, and how often it deserved it since.
+/// When each peer was last logged, and how many lines about it were left out since.
 #[derive(Debug)]
 pub(crate) struct LogLimiter<K> {
     peers: Mutex<HashMap<K, (Instant, u64)>>,
@@ -24,7 +24,7 @@ impl<K> Default for LogLimiter<K> {
 }
 
 impl<K: Eq + Hash> LogLimiter<K> {
-    /// How many log_limiter about this peer went unreported before this one, if it is to be reported: once a minute.
+    /// Whether to log a line about this peer now: `Some`, with the number of lines left out before it, once a minute.
     pub(crate) fn due(&self, peer: K) -> Option<u64> {
         self.due_at(peer, Instant::now())
     }
@@ -39,10 +39,10 @@ impl<K: Eq + Hash> LogLimiter<K> {
             *last = now;
             return Some(std::mem::take(unreported));
         }
-        if peers.len() >= REMEMBERED {
+        if peers.len() >= CAPACITY {
             peers.retain(|_, (last, _)| now.duration_since(*last) < QUIET);
         }
-        if peers.len() >= REMEMBERED {
+        if peers.len() >= CAPACITY {
             return None;
         }
         peers.insert(peer, (now, 0));
@@ -55,7 +55,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_peer_is_complained_about_once_a_minute_and_the_rest_is_counted() {
+    fn a_peer_is_logged_once_a_minute_and_the_other_lines_are_counted() {
         let (log_limiter, start) = (LogLimiter::default(), Instant::now());
         assert_eq!(log_limiter.due_at(7, start), Some(0));
         assert_eq!(log_limiter.due_at(7, start + QUIET / 2), None);
@@ -69,7 +69,7 @@ mod tests {
         for peer in 0..5000 {
             log_limiter.due_at(peer, start);
         }
-        assert_eq!(log_limiter.peers.lock().len(), REMEMBERED);
+        assert_eq!(log_limiter.peers.lock().len(), CAPACITY);
         assert_eq!(log_limiter.due_at(5000, start), None);
         assert_eq!(log_limiter.due_at(5000, start + QUIET), Some(0));
     }

@@ -3,7 +3,7 @@
 use std::io::{IsTerminal as _, Write as _};
 use std::process::ExitCode;
 
-use clap::Parser as _;
+use clap::{CommandFactory as _, Parser as _};
 use comic_learner::commands;
 use comic_learner::error::{Error, Result};
 use comic_learner::options::{Command, LogFormat, Options};
@@ -51,7 +51,10 @@ fn run(options: &Options) -> Result<()> {
         Some(Command::Status(status)) => status.run(),
         Some(Command::Health(_)) => Ok(()),
         Some(Command::Certs(certs)) => certs.run(),
-        Some(Command::Metrics) => Ok(comic_learner::observe::telemetry::print_reference()?),
+        Some(Command::Metrics) => comic_learner::observe::telemetry::print_reference(),
+        Some(Command::Manual(manual)) => manual
+            .write(Options::command())
+            .map_err(|source| Error::System { what: "cannot write the manual".into(), source }),
         None => comic_learner::run::run(options),
     }
 }

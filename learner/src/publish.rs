@@ -1,38 +1,39 @@
-//! Parameters down to the actors: always the newest version, encoded once and one copy in memory for all who read it.
+//! Sends parameters to the actors: the newest version, encoded once, with one copy in memory for all readers.
 //!
-//! An actor that reads on finishes the version it began, however many come meanwhile: if it started over with each of
-//! them, a slow one would never have any. An actor that stalls must not keep its version alive. So a few versions are
-//! *held* for their readers, readers themselves hold nothing, and the place of a version that nobody gets on with, or
-//! that takes too long, is given to a newer one when it is needed.
+//! A reader finishes the version that it began, even if newer versions are published meanwhile; a slow reader that started
+//! again with each of them would never finish one. But a reader that stalls must not keep its version in memory. Therefore a
+//! few versions are *held* for their readers, and the readers themselves hold nothing. When a newer version needs a place, it
+//! replaces a held version that is not read any more or that has been held for too long.
 
 use std::fmt;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use comic_proto::frame;
 use comic_proto::v1::{Behaviour, ParametersChunk};
+use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
-/// Bytes of parameters in a piece. Each piece is memory of its own, so a reader that stalls for ever holds one or two
-/// pieces, or where its network is stuck as many as hyper buffers, and never the version they are of. With 64 KiB a thousand
-/// readers cost a fifth more processor time at five sixths of the pace, and stalled ones the same memory.
+/// Bytes of parameters in a piece. Each piece is an allocation of its own, so a reader that stalls keeps one or two pieces,
+/// or as many as hyper buffers if its network is stuck, and never the whole version. With pieces of 64 KiB a thousand readers
+/// cost a fifth more processor time at five sixths of the throughput, and stalled readers cost the same memory.
 const PIECE: usize = 40 * 1024;
 const _: () = assert!(PIECE < comic_proto::FRAME_BYTES, "actors take a piece in one frame");
-/// Versions that readers can be in the middle of.
+/// Versions that are held for readers.
 const HELD: usize = 4;
-/// Versions in memory: those held, the newest, the one that is just being made, and what it is made of.
+/// Versions in memory: those held, the newest, the one that is being encoded, and the parameters that it is encoded from.
 pub(crate) const VERSIONS: usize = HELD + 3;
 
 /// How many versions are held for their readers, and how long.
 #[derive(Clone, Copy, Debug)]
 pub struct Holding {
-    /// Versions that readers can be in the middle of: what parameters take of memory, however many read.
+    /// Versions that are held. It bounds the memory of the parameters for any number of readers.
     pub versions: usize,
-    /// A version of which nobody took a piece for so long gives its place to a newer one.
+    /// A newer version may replace a held one of which no reader took a piece for this time.
     pub idle: Duration,
-    /// A version that was begun so long ago gives its place to a newer one, though somebody still reads it.
+    /// A newer version may replace a held one whose first reader began it this long ago, even if it is still read.
     pub longest: Duration,
 }
 
@@ -42,19 +43,19 @@ impl Default for Holding {
     }
 }
 
-/// One version of the parameters, encoded once for everybody.
+/// One version of the parameters, encoded once for all readers.
 #[derive(Debug)]
 pub struct Published {
-    /// Counts publications.
+    /// The number of the version.
     pub version: u64,
     /// How actors act with it; unspecified when the run is over.
     pub behaviour: Behaviour,
     /// Whether this is the end of the run.
     pub run_over: bool,
-    /// Grows with every publication, of the same version again too.
+    /// Grows with every publication, also when the same version is published again.
     serial: u64,
     frames: Vec<Bytes>,
-    /// Who is in the middle of it.
+    /// Readers that began this publication and have not finished it.
     readers: AtomicUsize,
 }
 
@@ -62,7 +63,7 @@ impl Published {
     /// `behaviour` is absent at the end of the run.
     fn new(learner_epoch: u64, version: u64, behaviour: Option<Behaviour>, serial: u64, payload: &Bytes) -> Self {
         let (behaviour, run_over) = (behaviour.unwrap_or_default(), behaviour.is_none());
-        // An empty payload has a piece too: it says how to act.
+        // An empty payload has a piece too, because the piece says how to act.
         let offsets = (0..payload.len().max(1)).step_by(PIECE);
         let frames = offsets.map(|offset| {
             frame(&ParametersChunk {
@@ -78,13 +79,13 @@ impl Published {
         Self { version, behaviour, run_over, serial, frames: frames.collect(), readers: AtomicUsize::new(0) }
     }
 
-    /// Every [`ParametersChunk`] as gRPC sends it, at least one.
+    /// Every [`ParametersChunk`] as gRPC sends it; there is at least one.
     pub fn frames(&self) -> &[Bytes] {
         &self.frames
     }
 }
 
-/// Where the trainer puts new parameters; a handle that can be cloned.
+/// Publishes the trainer's parameters; a handle that can be cloned.
 #[derive(Clone)]
 pub struct Publisher {
     inner: Arc<Inner>,
@@ -95,11 +96,11 @@ struct Inner {
     epoch: u64,
     holding: Holding,
     held: Mutex<Vec<Held>>,
-    /// A place among the held is free.
+    /// Notified when a held version is released.
     freed: Notify,
 }
 
-/// A version that somebody reads.
+/// A version that is held for its readers.
 struct Held {
     published: Arc<Published>,
     begun: Instant,
@@ -107,20 +108,13 @@ struct Held {
     touched: Instant,
 }
 
-impl Inner {
-    fn held(&self) -> MutexGuard<'_, Vec<Held>> {
-        // Nothing panics while it holds this lock.
-        self.held.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
 impl Publisher {
-    /// A publisher that has published nothing yet, in this life of the learner.
+    /// A publisher of this learner epoch that has published nothing yet.
     pub fn new(epoch: u64) -> Self {
         Self::holding(epoch, Holding::default())
     }
 
-    /// One that holds versions otherwise than by default.
+    /// A publisher that holds versions as `holding` says.
     pub fn holding(epoch: u64, holding: Holding) -> Self {
         let inner = Inner { epoch, holding, held: Mutex::default(), freed: Notify::new() };
         Self { inner: Arc::new(inner), newest: watch::Sender::new(None) }
@@ -153,25 +147,25 @@ impl Publisher {
         self.newest().map_or(0, |published| published.version)
     }
 
-    /// What was published last.
+    /// The last publication.
     pub fn newest(&self) -> Option<Arc<Published>> {
         self.newest.borrow().clone()
     }
 
-    /// Versions that are in memory because somebody reads them, or began to.
+    /// The number of versions that are held for readers.
     pub fn held(&self) -> usize {
-        self.inner.held().len()
+        self.inner.held.lock().len()
     }
 
-    /// The life of the learner it belongs to.
+    /// The learner epoch.
     pub fn epoch(&self) -> u64 {
         self.inner.epoch
     }
 
-    /// A reader that begins with the newest version.
+    /// A new reader, which begins with the newest version.
     pub fn subscribe(&self) -> Subscription {
         let (inner, newest) = (Arc::clone(&self.inner), self.newest.subscribe());
-        Subscription { inner, newest, finished: 0, reading: None, left: false }
+        Subscription { inner, newest, finished: 0, reading: None, run_over: false }
     }
 }
 
@@ -182,31 +176,32 @@ impl fmt::Debug for Publisher {
     }
 }
 
-/// A piece of a version, ready to be sent.
+/// A piece of a version, ready to send.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Piece {
-    /// The version it is of.
+    /// The version that it belongs to.
     pub version: u64,
     /// A [`ParametersChunk`], length-prefixed as gRPC sends it.
     pub frame: Bytes,
 }
 
-/// One actor's view of the parameters, in pieces. The versions that came and went while it read are skipped.
+/// One reader of the parameters. It reads a version piece by piece, and skips versions that were replaced meanwhile.
 pub struct Subscription {
     inner: Arc<Inner>,
     newest: watch::Receiver<Option<Arc<Published>>>,
-    /// The last publication it read to its end.
+    /// The serial number of the last publication that was read to its end.
     finished: u64,
     reading: Option<Reading>,
-    left: bool,
+    /// Whether the end of the run was read.
+    run_over: bool,
 }
 
-/// A version being read, counted among its readers.
+/// A version that a reader has begun. It counts among the version's readers until it is dropped.
 struct Reading {
     inner: Arc<Inner>,
-    /// Weak, so that a stalled reader keeps nothing alive.
+    /// Weak, so that a stalled reader does not keep the version in memory.
     published: Weak<Published>,
-    /// Of its next piece.
+    /// The index of the next piece.
     index: usize,
 }
 
@@ -214,37 +209,37 @@ impl Drop for Reading {
     fn drop(&mut self) {
         let Some(published) = self.published.upgrade() else { return };
         if published.readers.fetch_sub(1, Ordering::AcqRel) == 1 {
-            self.inner.held().retain(|held| held.published.readers.load(Ordering::Acquire) > 0);
+            self.inner.held.lock().retain(|held| held.published.readers.load(Ordering::Acquire) > 0);
             self.inner.freed.notify_waiters();
         }
     }
 }
 
-/// Whether a reader could begin.
+/// Whether a reader could begin a version.
 enum Begun {
     Yes,
     NothingNew,
-    NoRoom,
+    AllPlacesTaken,
 }
 
 impl Subscription {
-    /// The next piece: the rest of a version begun, then the newest one not seen yet, waiting for it if need be.
-    /// `None` after the end of the run, or when there is no publisher any more. Cancel-safe.
+    /// The next piece: of the version that was begun, and then of the newest version that was not read yet. Waits for a new
+    /// version. `None` after the end of the run, or when there is no publisher any more. Cancel-safe.
     pub async fn next(&mut self) -> Option<Piece> {
         loop {
             if let Some(piece) = self.piece() {
                 return Some(piece);
             }
-            if self.left {
+            if self.run_over {
                 return None;
             }
             let inner = Arc::clone(&self.inner);
-            // From here on, before looking: a place that becomes free in between is not missed.
+            // Made before `begin` looks for a place, so that a place that becomes free in between is not missed.
             let freed = inner.freed.notified();
             match self.begin() {
                 Begun::Yes => {}
                 Begun::NothingNew => self.newest.changed().await.ok()?,
-                Begun::NoRoom => tokio::select! {
+                Begun::AllPlacesTaken => tokio::select! {
                     () = freed => {}
                     () = tokio::time::sleep(inner.holding.idle) => {}
                 },
@@ -253,7 +248,7 @@ impl Subscription {
     }
 
     /// The message that the run is over, if that was published last. It is sent even when the server closes.
-    pub fn farewell(&mut self) -> Option<Piece> {
+    pub fn end_of_run(&mut self) -> Option<Piece> {
         if !self.newest.borrow().as_ref().is_some_and(|published| published.run_over) {
             return None;
         }
@@ -263,23 +258,23 @@ impl Subscription {
         self.piece()
     }
 
-    /// Begins the newest version if there is room to hold it, or else the newest that is held already.
+    /// Begins the newest version if it can be held, or else the newest version that is held already.
     fn begin(&mut self) -> Begun {
-        // Locked first: what is begun is the newest then, too.
-        let mut held = self.inner.held();
+        // The lock is taken before the newest version is read, so that no older version is begun.
+        let mut held = self.inner.held.lock();
         let Some(newest) = self.newest.borrow_and_update().clone() else { return Begun::NothingNew };
         if newest.serial == self.finished {
             return Begun::NothingNew;
         }
         let (now, holding) = (Instant::now(), self.inner.holding);
         if held.iter().all(|held| held.published.serial != newest.serial) {
-            // The last word is one piece, and heard by everybody.
+            // The end of the run is one piece, and every reader must get it.
             let small = newest.frames.len() == 1;
-            let given_up = |held: &Held| {
+            let replaceable = |held: &Held| {
                 now.duration_since(held.touched) >= holding.idle || now.duration_since(held.begun) >= holding.longest
             };
             if held.len() >= holding.versions
-                && let Some(place) = held.iter().position(given_up)
+                && let Some(place) = held.iter().position(replaceable)
             {
                 held.remove(place);
             }
@@ -288,8 +283,8 @@ impl Subscription {
             }
         }
         let unseen = held.iter_mut().filter(|held| held.published.serial > self.finished);
-        let Some(best) = unseen.max_by_key(|held| held.published.serial) else { return Begun::NoRoom };
-        // Under the lock: it is let go of when its last reader is done.
+        let Some(best) = unseen.max_by_key(|held| held.published.serial) else { return Begun::AllPlacesTaken };
+        // Under the lock, because a version without readers is released.
         best.published.readers.fetch_add(1, Ordering::AcqRel);
         let published = Arc::downgrade(&best.published);
         drop(held);
@@ -297,10 +292,11 @@ impl Subscription {
         Begun::Yes
     }
 
+    /// The next piece of the version that was begun, if it is still held.
     fn piece(&mut self) -> Option<Piece> {
         let reading = self.reading.as_mut()?;
         let Some(published) = reading.published.upgrade() else {
-            // It stalled, and its version had to make room.
+            // The reader stalled, and a newer version replaced this one.
             self.reading = None;
             return None;
         };
@@ -309,8 +305,10 @@ impl Subscription {
         if reading.index == published.frames.len() {
             self.reading = None;
             self.finished = published.serial;
-            self.left = published.run_over;
-        } else if let Some(held) = self.inner.held().iter_mut().find(|held| held.published.serial == published.serial) {
+            self.run_over = published.run_over;
+        } else if let Some(held) =
+            self.inner.held.lock().iter_mut().find(|held| held.published.serial == published.serial)
+        {
             held.touched = Instant::now();
         }
         Some(Piece { version: published.version, frame })

@@ -1,9 +1,24 @@
 //! Training: one OS thread that owns the device. Batches in, gradient steps, parameters out.
+//!
+//! # Layout
+//! - [`trainer`] is the loop; the other modules own its parts and know nothing of it.
+//! - [`setup`] is what it begins with, and how it ends.
+//! - `state` is what changes and is saved: the algorithm, [`statistics`] of the observations, and the progress.
+//! - `minibatches` puts a batch on the device and draws the unrolls of each gradient step.
+//! - `warm_start` gathers demonstrations and regresses on them.
+//! - `versions` publishes parameters; `reports` counts and writes metrics; `budget` is the clock.
+//! - `skipped_steps` counts gradient steps that were skipped, and decides how to recover.
+//! - `checkpoints` decides when one is written, [`writer`] is the thread that writes.
 
+mod budget;
+mod checkpoints;
 mod minibatches;
+mod reports;
+pub mod setup;
 mod skipped_steps;
 mod state;
 pub mod statistics;
 pub mod trainer;
-pub mod warm_start;
+mod versions;
+mod warm_start;
 pub mod writer;

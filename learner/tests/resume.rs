@@ -11,11 +11,13 @@ use comic_experiment::{Experiment, TaskSpec, resolve};
 use comic_learner::checkpoint::{Snapshot, Store, find, read};
 use comic_learner::device::Backend;
 use comic_learner::observe::evaluation::Evaluation;
+use comic_learner::observe::probes::Probed as _;
 use comic_learner::publish::{Published, Publisher};
 use comic_learner::security::{ConnectionLimits, Security};
-use comic_learner::service::quarantine::QuarantineOptions;
-use comic_learner::service::{self, Shared};
-use comic_learner::train::trainer::{Ending, Setup, Trainer};
+use comic_learner::service::quarantine::QuarantineArguments;
+use comic_learner::service::{self, Service};
+use comic_learner::train::setup::{Ending, Setup};
+use comic_learner::train::trainer::Trainer;
 use comic_proto::v1::{Behaviour, UnrollHeader};
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Outcome, Phase};
@@ -101,30 +103,30 @@ fn recorded(layout: &UnrollLayout, spec: &TaskSpec, sequence: u64) -> UnrollBuff
     unroll
 }
 
-/// libtorch's generator, which the networks' first values come from, is the process's.
+/// The whole process shares libtorch's generator, which makes the networks' first values.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
-/// A life of the learner that is over.
-struct Life {
-    ended: anyhow::Result<Ending>,
-    /// What actors would act with.
+/// An epoch of the learner that is over.
+struct Epoch {
+    ended: comic_learner::error::Result<Ending>,
+    /// The parameters that actors would act with.
     published: Arc<Published>,
     telemetry: String,
 }
 
-/// One life of the learner, fed with the recording from where its accounting say up to `unrolls`, altered.
-fn live(experiment: &Experiment, run: &Path, unrolls: u64, alter: fn(u64, &mut UnrollBuffer)) -> Life {
+/// One epoch of the learner, fed with the recording from the end of its accounting up to `unrolls`, altered.
+fn live(experiment: &Experiment, run: &Path, unrolls: u64, alter: fn(u64, &mut UnrollBuffer)) -> Epoch {
     live_evaluated(experiment, run, unrolls, alter, &[])
 }
 
-/// The same, and these evaluations are reported at its beginning.
+/// The same; these evaluations are reported at its beginning.
 fn live_evaluated(
     experiment: &Experiment,
     run: &Path,
     unrolls: u64,
     alter: fn(u64, &mut UnrollBuffer),
     evaluations: &[Evaluation],
-) -> Life {
+) -> Epoch {
     let experiment = experiment.clone();
     let spec = spec(&experiment);
     let store = Store::open(run, 3).unwrap();
@@ -138,7 +140,7 @@ fn live_evaluated(
     let config = Config { unrolls: experiment.unroll.batch, max_staleness: 1000, ahead: 1, order: BatchOrder::Arrival };
     let batcher = Batcher::new(layout.clone(), config, Phase::begin(epoch), ledger);
     let publisher = Publisher::new(epoch);
-    let shared = Shared::new(service::Setup {
+    let service = Service::new(service::Setup {
         run: run.to_path_buf(),
         id: store.run().unwrap(),
         security: Security::default(),
@@ -148,10 +150,10 @@ fn live_evaluated(
         assets: Vec::new(),
         batcher: batcher.clone(),
         publisher: publisher.clone(),
-        quarantine: QuarantineOptions::default(),
+        quarantine: QuarantineArguments::default(),
     })
     .unwrap();
-    assert!(evaluations.iter().all(|evaluation| shared.keep_evaluation(evaluation.clone())));
+    assert!(evaluations.iter().all(|evaluation| service.evaluations().add(evaluation.clone())));
     let pose = vec![0.1; spec.action];
     let run = run.to_path_buf();
     let joined = batcher.join(INCARNATION, None).unwrap();
@@ -176,7 +178,7 @@ fn live_evaluated(
                     Outcome::Closed => break,
                     other => panic!("{other:?}"),
                 }
-                // Batch by batch, so that none waits while the trainer changes the terms.
+                // Batch by batch, so that no unroll waits while the trainer changes the phase.
                 while (sequence + 1) % batch == 0 && batcher.accounting().in_flight > 0 && !batcher.is_closed() {
                     std::thread::yield_now();
                 }
@@ -193,16 +195,16 @@ fn live_evaluated(
         resume,
         batcher: batcher.clone(),
         publisher: publisher.clone(),
-        shared: shared.clone(),
+        service: service.trainer(),
     };
     let ended = Trainer::new(setup).unwrap().run();
     batcher.close();
     feeder.join().unwrap();
-    Life { ended, published: publisher.newest().unwrap(), telemetry: shared.metrics_page() }
+    Epoch { ended, published: publisher.newest().unwrap(), telemetry: service.probed().metrics_page() }
 }
 
-/// So many updates of a preset, with exactly the unrolls they need, so that the accounting are the same whoever feeds; the
-/// last checkpoint.
+/// The last checkpoint after so many updates of a preset. The feeder gives exactly the unrolls that they need, so that the
+/// accounting is the same in every run.
 fn trained(preset: &str, run: &Path, updates: u64) -> Snapshot {
     let experiment = experiment(preset, updates);
     let unrolls = (updates + 1) * experiment.unroll.batch as u64;
@@ -214,7 +216,7 @@ fn last_checkpoint(run: &Path) -> Snapshot {
     Store::open(run, 3).unwrap().newest().unwrap().unwrap().1
 }
 
-/// Everything but the clock, the count of lives, the run's number and the budget.
+/// Everything but the clock, the epoch, the run's number and the budget.
 fn comparable(snapshot: &Snapshot) -> Vec<(String, Vec<u8>)> {
     let mut parts: Vec<_> = snapshot.parts.clone().into_iter().filter(|(name, _)| name != "experiment.toml").collect();
     for (name, bytes) in &mut parts {
@@ -261,18 +263,18 @@ fn the_checkpoint_of_the_best_evaluation_outlives_the_newest_few() {
     let _alone = ONE_AT_A_TIME.lock();
     let run = tempfile::tempdir().unwrap();
     let checkpoints = run.path().join("checkpoints");
-    let life = |updates: u64, report: &str| {
+    let epoch = |updates: u64, report: &str| {
         let experiment = experiment("tracking-mlp", updates);
-        // One version in the first life, which begins with epoch 1.
+        // The first run of the learner is epoch 1.
         let number = Store::open(run.path(), 3).unwrap().run().unwrap();
         let evaluation = Evaluation { run: Some(number), epoch: 1, version: 2, updates: 1, json: report.into() };
         let unrolls = (updates + 1) * BATCH;
         live_evaluated(&experiment, run.path(), unrolls, |_, _| {}, &[evaluation]).ended.unwrap();
     };
-    life(1, "[]");
-    assert!(!checkpoints.join("best.json").exists(), "that report says nothing");
+    epoch(1, "[]");
+    assert!(!checkpoints.join("best.json").exists(), "that report has no mean");
     for updates in 2..6 {
-        life(updates, r#"{"overall": {"normalised_reward": 0.25}}"#);
+        epoch(updates, r#"{"overall": {"normalised_reward": 0.25}}"#);
     }
     let best = find(&checkpoints.join("best")).unwrap().1;
     assert_eq!(best, read(&checkpoints.join("checkpoint-0000000001")).unwrap());
@@ -287,8 +289,8 @@ fn poison(_: u64, unroll: &mut UnrollBuffer) {
     }
 }
 
-/// Without a normaliser, whose first batch is not learnt from: a step and a version each update, and four skipped steps
-/// lead back.
+/// Without a normaliser, so that the first batch is learnt from: one step and one version for each update. Four skipped
+/// steps restore the last good state.
 fn delicate(updates: u64) -> Experiment {
     let mut experiment = experiment("tracking-mlp", updates);
     experiment.network.normaliser_steps = 0;
@@ -299,12 +301,12 @@ fn delicate(updates: u64) -> Experiment {
 }
 
 #[test]
-fn after_too_many_skipped_steps_a_learner_is_back_where_it_was_last_good() {
+fn after_too_many_skipped_steps_the_last_good_state_is_restored() {
     let _alone = ONE_AT_A_TIME.lock();
     tch::set_num_threads(1);
     let run = tempfile::tempdir().unwrap();
     // Three batches as they were recorded, then nothing but poison.
-    let Life { ended, published, telemetry } = live(&delicate(3 + 4), run.path(), u64::MAX, |sequence, unroll| {
+    let Epoch { ended, published, telemetry } = live(&delicate(3 + 4), run.path(), u64::MAX, |sequence, unroll| {
         if sequence >= 3 * BATCH {
             poison(sequence, unroll);
         }
@@ -315,37 +317,37 @@ fn after_too_many_skipped_steps_a_learner_is_back_where_it_was_last_good() {
     for part in ["learner.safetensors", "policy.safetensors"] {
         assert!(last.part(part).unwrap() == initial.part(part).unwrap(), "{part} is not the last good one");
     }
-    // Three updates, and the one that turned back: none of the skipped ones published anything.
+    // Three updates, and the one that restored: none of the skipped ones published anything.
     assert_eq!(published.version, 1 + 3 + 1);
     assert!(published.frames() == frames_of(&published, &initial));
     assert!(telemetry.contains("comic_updates_skipped_total 4\n") && telemetry.contains("comic_restores_total 1\n"));
 }
 
 #[test]
-fn a_learner_that_the_last_good_state_does_not_help_ends_and_names_the_remedies() {
+fn if_the_last_good_state_does_not_help_training_ends_and_names_the_remedies() {
     let _alone = ONE_AT_A_TIME.lock();
     let run = tempfile::tempdir().unwrap();
-    let Life { ended, telemetry, .. } = live(&delicate(100), run.path(), u64::MAX, poison);
+    let Epoch { ended, telemetry, .. } = live(&delicate(100), run.path(), u64::MAX, poison);
     let said = format!("{:#}", ended.unwrap_err());
     assert!(said.contains("optimiser.learning_rate") && said.contains("update 7"), "{said}");
     assert!(telemetry.contains("comic_restores_total 1\n"), "{telemetry}");
 }
 
 #[test]
-fn a_learning_rate_that_ruins_the_parameters_is_not_tried_for_ever() {
+fn a_learning_rate_that_makes_parameters_infinite_ends_training() {
     let _alone = ONE_AT_A_TIME.lock();
     let run = tempfile::tempdir().unwrap();
     let mut experiment = delicate(1000);
     experiment.optimiser.learning_rate = 1e38;
-    let Life { ended, published, .. } = live(&experiment, run.path(), u64::MAX, |_, _| {});
+    let Epoch { ended, published, .. } = live(&experiment, run.path(), u64::MAX, |_, _| {});
     assert!(ended.is_err());
     let initial = read(&run.path().join("checkpoints/initial")).unwrap();
-    assert!(published.frames() == frames_of(&published, &initial), "ruins were published");
+    assert!(published.frames() == frames_of(&published, &initial), "infinite parameters were published");
 }
 
-/// The pieces that this version would have with a checkpoint's parameters.
+/// The frames of this version, if it had a checkpoint's parameters.
 fn frames_of(version: &Published, checkpoint: &Snapshot) -> Vec<Bytes> {
-    // The first life of a run.
+    // The first epoch of a run.
     let publisher = Publisher::new(1);
     let parameters = Bytes::copy_from_slice(checkpoint.part("policy.safetensors").unwrap());
     publisher.publish(version.version, version.behaviour, &parameters);

@@ -6,14 +6,15 @@ use crate::gaussian::DiagonalGaussian;
 
 /// π(a|s) over N rows: one diagonal Gaussian, or a mixture of K of them.
 ///
-/// Whoever acts or learns need not know which: every density, divergence and mean is asked for here.
+/// Actor and learner use only the methods, so they do not depend on the kind of distribution. Densities and divergences
+/// are in nats.
 #[derive(Debug)]
 pub enum ActionDistribution {
     /// One Gaussian over `[N, A]`.
     Gaussian(DiagonalGaussian),
-    /// Σ_k w_k N_k.
+    /// Σ_k w_k N_k, with weights w that add up to 1.
     Mixture {
-        /// ln w, `[N, K]`; the weights add up to 1.
+        /// ln w, `[N, K]`.
         log_weights: Tensor,
         /// The components, over `[N, K, A]`.
         components: DiagonalGaussian,
@@ -21,8 +22,8 @@ pub enum ActionDistribution {
 }
 
 impl ActionDistribution {
-    /// From the arrays that travel: `mean` and `std` `[N, K·A]`, `log_weights` `[N, K]`, which is `[N, 0]` where there is
-    /// one component.
+    /// From the arrays of an unroll: `mean` and `std` `[N, K·A]`, and `log_weights` `[N, K]`, which is `[N, 0]` for one
+    /// component.
     pub fn from_rows(mean: &Tensor, std: &Tensor, log_weights: &Tensor) -> Self {
         let (mean, std) = (mean.shallow_clone(), std.shallow_clone());
         match log_weights.size().last().copied().unwrap_or(0) {
@@ -35,7 +36,7 @@ impl ActionDistribution {
         }
     }
 
-    /// The arrays that travel: mean `[N, K·A]`, standard deviation `[N, K·A]`, and, of a mixture, ln w `[N, K]`.
+    /// The arrays of an unroll: mean `[N, K·A]`, standard deviation `[N, K·A]`, and for a mixture ln w `[N, K]`.
     pub fn to_rows(&self) -> (Tensor, Tensor, Option<Tensor>) {
         match self {
             Self::Gaussian(DiagonalGaussian { mean, std }) => (mean.shallow_clone(), std.shallow_clone(), None),
@@ -46,7 +47,7 @@ impl ActionDistribution {
         }
     }
 
-    /// ln π(a), `[N]`, of actions `[N, A]`. Of a mixture, by log-sum-exp.
+    /// ln π(a), `[N]`, of actions `[N, A]`.
     pub fn log_prob(&self, action: &Tensor) -> Tensor {
         match self {
             Self::Gaussian(gaussian) => gaussian.log_prob(action),
@@ -56,21 +57,24 @@ impl ActionDistribution {
         }
     }
 
-    /// KL_μ to the behaviour policy, `[N]`: of a mixture, each component's, averaged with the behaviour's weights.
+    /// KL_μ to the behaviour policy, `[N]`. For a mixture: the mean of the components' KL_μ, weighted by the behaviour
+    /// policy's weights.
     pub fn kl_mean(&self, behaviour: &Self) -> Tensor {
         self.averaged(behaviour, DiagonalGaussian::kl_mean)
     }
 
-    /// KL_Σ to the behaviour policy, `[N]`: of a mixture, each component's, averaged with the behaviour's weights.
+    /// KL_Σ to the behaviour policy, `[N]`. For a mixture: the mean of the components' KL_Σ, weighted by the behaviour
+    /// policy's weights.
     pub fn kl_std(&self, behaviour: &Self) -> Tensor {
         self.averaged(behaviour, DiagonalGaussian::kl_std)
     }
 
-    /// KL_discrete = KL(w_old ‖ w), `[N]`; none where there is one component.
+    /// KL_discrete = KL(w_old ‖ w), `[N]`; `None` for one component.
     ///
-    /// The three parts bound the mixture's own KL from above as they bound each component's, by the chain rule over
-    /// (component, action), of which the mixture is a marginal. They bound a Gaussian's where it grows no narrower, since
-    /// KL_μ is measured in the old deviation; beyond that V-MPO's limits are an approximation, as for one Gaussian.
+    /// The sum of the three parts is an upper bound of the mixture's KL wherever KL_μ + KL_Σ is an upper bound of each
+    /// component's KL. This follows from the chain rule over (component, action), because the mixture is a marginal of
+    /// this pair. For a Gaussian the bound holds if it does not become narrower, because KL_μ uses the old standard
+    /// deviation. Otherwise V-MPO's limits are an approximation, as for a single Gaussian.
     pub fn kl_weights(&self, behaviour: &Self) -> Option<Tensor> {
         match (self, behaviour) {
             (Self::Mixture { log_weights, .. }, Self::Mixture { log_weights: old, .. }) => {
@@ -80,8 +84,8 @@ impl ActionDistribution {
         }
     }
 
-    /// Σ ½ ((μ − target) / scale)², `[N]`, of targets `[N, A]`: of a mixture each component's, averaged with the weights, so
-    /// that whichever acts aims there.
+    /// Σ ½ ((μ − target) / scale)², `[N]`, for targets `[N, A]`. For a mixture: the mean over the components with their
+    /// weights, so every component that acts aims at the target.
     pub fn mean_error(&self, target: &Tensor, scale: f64) -> Tensor {
         let error = |mean: &Tensor, target: &Tensor| sum_last(&((mean - target) / scale).square()) * 0.5;
         match self {
@@ -92,8 +96,8 @@ impl ActionDistribution {
         }
     }
 
-    /// The differential entropy, `[N]`. A mixture has none in closed form: what is given bounds it from above, the
-    /// entropy of (component, action).
+    /// The differential entropy, `[N]`. A mixture's entropy has no closed form; for a mixture this is the entropy of
+    /// (component, action), which is an upper bound.
     pub fn entropy(&self) -> Tensor {
         match self {
             Self::Gaussian(gaussian) => gaussian.entropy(),
@@ -111,7 +115,7 @@ impl ActionDistribution {
         }
     }
 
-    /// The action without noise, `[N, A]`: the mean; of a mixture, that of the likeliest component.
+    /// The action without noise, `[N, A]`: the mean; for a mixture, the mean of the most likely component.
     pub fn mode(&self) -> Tensor {
         match self {
             Self::Gaussian(gaussian) => gaussian.mean.shallow_clone(),
@@ -123,7 +127,8 @@ impl ActionDistribution {
         }
     }
 
-    /// The standard deviation, `[N, A]`; of a mixture, the components' own, averaged with their weights.
+    /// The standard deviation, `[N, A]`; for a mixture, the mean of the components' standard deviations with their
+    /// weights.
     pub fn std(&self) -> Tensor {
         match self {
             Self::Gaussian(gaussian) => gaussian.std.shallow_clone(),
@@ -137,7 +142,7 @@ impl ActionDistribution {
             (Self::Mixture { components: new, .. }, Self::Mixture { log_weights, components: old }) => {
                 sum_last(&(log_weights.exp() * kl(new, old)))
             }
-            // The learner refuses a minibatch of another kind; beyond that, two kinds have no limit in common.
+            // The learner refuses a minibatch of another kind, so this is not reached; the KL is infinite.
             (Self::Gaussian(DiagonalGaussian { mean, .. }), _) | (_, Self::Gaussian(DiagonalGaussian { mean, .. })) => {
                 sum_last(&mean.full_like(f64::INFINITY))
             }
@@ -145,7 +150,7 @@ impl ActionDistribution {
     }
 }
 
-/// Σ_k w_k x_k: `[N, K]` and `[N, K, A]` to `[N, A]`.
+/// Σ_k w_k x_k: from `[N, K]` and `[N, K, A]` to `[N, A]`.
 fn weighted(log_weights: &Tensor, values: &Tensor) -> Tensor {
     (log_weights.exp().unsqueeze(-1) * values).sum_dim_intlist(-2i64, false, None::<Kind>)
 }

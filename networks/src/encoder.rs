@@ -7,11 +7,11 @@ use crate::gaussian::DiagonalGaussian;
 use crate::layers::{GaussianHeadConfig, Mlp, Torso, gaussian, linear};
 use crate::routing::{PerTask, Routing};
 
-/// q(z_t | x_t, s_t, z_{t−1}), one for each task: `[x, s, z_{t−1}]` → torso → mean and σ of z, with an optional linear path
-/// from input to output whose weights start at 0 (CoMic supplement 2.1).
+/// q(z_t | x_t, s_t, z_{t−1}), one network per task: `[x, s, z_{t−1}]` → torso → mean and σ of z. An optional linear
+/// path goes from input to output; its weights start at 0 (CoMic supplement 2.1).
 ///
-/// Without a bottleneck, which mixture and product may do without, it gives the K weights' logits in z's place and knows
-/// no chance.
+/// Mixture and product can work without a bottleneck. Then the output is not z but the logits of the K weights, and
+/// nothing is sampled.
 #[derive(Debug)]
 pub(crate) struct Encoder {
     networks: PerTask,
@@ -24,18 +24,18 @@ enum Head {
     Weights,
 }
 
-/// What the encoder gives, for N rows.
+/// The encoder's output for N rows.
 pub(crate) struct Encoded {
-    /// What the low level is told: z_t, or the weights' logits.
+    /// The input of the low level: z_t `[N, Z]`, or the logits of the weights `[N, K]`.
     pub(crate) intent: Tensor,
     /// z_t, `[N, Z]`; `[N, 0]` without a bottleneck.
     pub(crate) latent: Tensor,
-    /// Where z_t was drawn from; none without a bottleneck.
+    /// The distribution of z_t; `None` without a bottleneck.
     pub(crate) posterior: Option<DiagonalGaussian>,
 }
 
 impl Encoder {
-    /// `seen` is how wide the task observation grows by what is seen.
+    /// `image_features` is the number of image features that follow the task observation; 0 without an image.
     pub(crate) fn new(path: &nn::Path, spec: &TaskSpec, image_features: i64, config: &Network) -> Self {
         let latent = &config.latent;
         let networks = spec.tasks.iter().map(|task| {
@@ -53,7 +53,8 @@ impl Encoder {
                 scale: 1.0,
             };
             let head = start.linear(&(&path / "head"), torso.output());
-            // At zero: raw observations reach hundreds (contact forces), and must not decide where the latent starts.
+            // The linear path starts at 0: raw observations reach hundreds (contact forces) and would dominate the
+            // initial latent.
             let size = [2 * latent.size as i64, input];
             let linear_path = config.encoder_linear_path.then(|| path.var("linear_path", &size, nn::Init::Const(0.0)));
             Mlp::new(torso, head, linear_path)
@@ -62,7 +63,7 @@ impl Encoder {
         Self { networks: PerTask::new(networks.collect()), head }
     }
 
-    /// `input [N, X+P+Z]`, `noise [N, Z]`.
+    /// `input` is `[N, X+P+Z]`, `noise` `[N, Z]`.
     pub(crate) fn forward(&self, input: &Tensor, noise: &Tensor, routing: &Routing) -> Encoded {
         let output = self.networks.forward(input, routing);
         match self.head {

@@ -1,26 +1,26 @@
-//! What can go wrong with parameters that come from outside.
+//! The errors of parameters and files that come from outside.
 
 /// Errors of this crate.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The bytes are no safetensors document.
+    /// The bytes are not a safetensors document.
     #[error("parameters are not a valid safetensors document: {0}")]
     Malformed(#[from] safetensors::SafeTensorError),
-    /// A parameter that the network has is absent.
+    /// The document does not have a parameter of the network.
     #[error("parameter `{name}` is missing; both sides must use the same experiment and version")]
     Missing {
         /// The parameter's name.
         name: String,
     },
-    /// A parameter that the network does not have.
+    /// The network does not have a parameter of the document.
     #[error("parameter `{name}` is unknown to this network; both sides must use the same experiment and version")]
     Unknown {
         /// The parameter's name.
         name: String,
     },
-    /// A parameter of another shape.
-    #[error("parameter `{name}` has shape {found:?} where the network has {expected:?}")]
+    /// A parameter has another shape than the network's.
+    #[error("parameter `{name}` has shape {found:?}, but the network has {expected:?}")]
     Shape {
         /// The parameter's name.
         name: String,
@@ -29,7 +29,7 @@ pub enum Error {
         /// The document's shape.
         found: Vec<i64>,
     },
-    /// A parameter of another element type.
+    /// The element type of a parameter is not F32.
     #[error("parameter `{name}` has elements of type {found}; only F32 is accepted")]
     Kind {
         /// The parameter's name.
@@ -37,61 +37,63 @@ pub enum Error {
         /// The document's element type.
         found: String,
     },
-    /// A parameter that holds an infinity or a NaN, or a standard deviation that is not positive.
-    #[error("`{name}` holds {what}; these parameters are not taken")]
+    /// A parameter has an infinity or a NaN, or a standard deviation that is not positive.
+    #[error("`{name}` has {what}; the parameters are refused")]
     Number {
         /// The parameter's name.
         name: String,
         /// What is wrong with it.
         what: &'static str,
     },
-    /// A vector whose length does not fit the task.
-    #[error("`{name}` has {found} entries where the task has {expected}")]
+    /// The length of a vector does not fit the task.
+    #[error("`{name}` has {found} entries, but the task has {expected}")]
     Length {
-        /// What the vector is.
+        /// Name of the vector.
         name: &'static str,
-        /// Entries needed.
+        /// Number of entries of the task.
         expected: usize,
-        /// Entries given.
+        /// Number of entries given.
         found: usize,
     },
-    /// A file's description of itself cannot be used.
+    /// The metadata of a file cannot be used.
     #[error("`{field}` of its metadata {problem}")]
     Metadata {
-        /// Which part of it.
+        /// The field of the metadata.
         field: String,
-        /// What is wrong with it, and what helps.
+        /// What is wrong, and what to do.
         problem: String,
     },
-    /// A file's experiment cannot be used.
+    /// The experiment in a file's metadata cannot be used.
     #[error("`experiment` of its metadata: {0}")]
     Experiment(#[source] comic_experiment::Error),
-    /// A part of a task that the experiment does not have.
-    #[error("no task `{task}` was learnt; its tasks are {known}")]
+    /// The experiment does not have the task of a part.
+    #[error("task `{task}` was not learnt; the learnt tasks are {known}")]
     NoTask {
-        /// The task asked for.
+        /// The requested task.
         task: String,
-        /// The tasks there are.
+        /// The tasks of the experiment.
         known: String,
     },
-    /// TorchScript of what cannot act for itself.
-    #[error("TorchScript takes a policy of one task, not `{part}`: export policy:TASK, where TASK is one of {tasks}")]
+    /// The part cannot be exported as TorchScript, because it is not a policy of one task.
+    #[error(
+        "only a policy of one task can be exported as TorchScript, not `{part}`: export policy:TASK; tasks are {tasks}"
+    )]
     Script {
-        /// The part asked for.
+        /// The requested part.
         part: String,
-        /// The tasks there are.
+        /// The tasks of the experiment.
         tasks: String,
     },
-    /// A file that is longer than any policy.
-    #[error("it has more than {most} bytes: no policy is that long")]
+    /// The file is longer than any policy.
+    #[error("the file has more than {most} bytes, which is more than a policy can have")]
     Long {
-        /// Bytes there may be.
+        /// Greatest allowed length, bytes.
         most: u64,
     },
-    /// A file that cannot be read or written.
+    /// The file cannot be read or written.
     #[error("{0}")]
     File(#[source] std::io::Error),
-    /// libtorch refused an operation.
+    /// An operation of libtorch failed.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),
 }

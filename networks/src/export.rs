@@ -1,15 +1,15 @@
-//! A policy, or a part of one, as a file that says what it is.
+//! Policies, and parts of policies, as files that describe themselves.
 //!
 //! # Layout
-//! - [`Part`] is what a file holds: everything that acts, one task's share of it, an encoder, or the low level.
-//! - [`Spec`] is what it says of itself, as JSON under the key [`KEY`] of the safetensors metadata: inputs and outputs in
-//!   order with sizes, normalisation, the run it comes from, the experiment. `docs/export.md` shows one.
-//! - [`Exported`] is a file, written and read. Tensors keep the names they have in a checkpoint, so what reads a whole
-//!   policy reads a file of one, and a network that is made for transfer takes the low level by name.
-//! - [`Exported::save_script`] writes the same policy as TorchScript, for programs that know none of this.
+//! - [`Part`] is the content of a file: the whole policy, the policy of one task, an encoder, or the low level.
+//! - [`Spec`] is the description in a file, JSON under the key [`KEY`] of the safetensors metadata: inputs and outputs
+//!   in order with their sizes, normalisation, the run, the experiment. `docs/export.md` shows an example.
+//! - [`Exported`] writes and reads files. Tensors have the same names as in a checkpoint, so a program that reads a
+//!   policy from a checkpoint can read it from a file, and transfer learning can load the low level by name.
+//! - [`Exported::save_script`] writes the same policy as TorchScript, for programs that do not know this format.
 //!
-//! Files may come from anywhere: nothing is built before the file is known to hold as many numbers as its experiment
-//! wants, and nothing is given out before every name, shape and number was looked at.
+//! Files may come from anywhere. Networks are built only if the file has the number of weights that its experiment
+//! describes. A file is accepted only after every name, shape and number was checked.
 
 mod file;
 mod part;

@@ -1,13 +1,15 @@
-//! From an image to a few numbers.
+//! The image encoder: from a camera image to features.
 
 use comic_experiment::IMAGE_SIZE;
 use tch::{Kind, Tensor, nn};
 
 use crate::layers::linear;
 
-/// Two strided convolutions and a linear layer: 8×8 with stride 4 to 16 channels, 4×4 with stride 2 to 32, ELU after
-/// each; then Linear → LayerNorm → tanh like every first layer. Small enough for two cores; the supplement is silent on
-/// images under V-MPO (its ResNet is that of the off-policy transfer).
+/// Two convolutions, each followed by ELU (8×8 with stride 4 to 16 channels, 4×4 with stride 2 to 32 channels), then
+/// Linear → LayerNorm → tanh.
+///
+/// The sizes are this project's choice (D): small enough for two cores. The supplement does not specify images with
+/// V-MPO; its ResNet belongs to the off-policy transfer.
 #[derive(Debug)]
 pub(crate) struct ImageEncoder {
     first: nn::Conv2D,
@@ -17,9 +19,9 @@ pub(crate) struct ImageEncoder {
     features: i64,
 }
 
-/// Height and width of an image.
+/// Height and width of an image, pixels.
 const SIZE: i64 = IMAGE_SIZE as i64;
-/// What the second convolution gives: 32 channels of 6×6 from 64×64.
+/// Size of the second convolution's output: 32 channels of 6×6 from 64×64 pixels.
 const SECOND: i64 = 32 * 6 * 6;
 
 impl ImageEncoder {
@@ -43,18 +45,18 @@ impl ImageEncoder {
         }
     }
 
-    /// Width of what [`ImageEncoder::forward`] gives.
+    /// F, the number of features.
     pub(crate) fn output(&self) -> i64 {
         self.features
     }
 
-    /// `[.., 64·64·3]` uint8, pixels of red, green and blue row by row, to `[.., F]`.
+    /// From pixels `[.., 64·64·3]`, uint8, red, green and blue, row by row, to features `[.., F]` in [−1, 1].
     pub(crate) fn forward(&self, image: &Tensor) -> Tensor {
         let mut leading = image.size();
         leading.pop();
         let pixels = image.reshape([-1, SIZE, SIZE, 3]).permute([0, 3, 1, 2]).to_kind(Kind::Float) / 255.0 - 0.5;
-        let seen = pixels.apply(&self.first).elu_().apply(&self.second).elu_().flatten(1, -1);
+        let channels = pixels.apply(&self.first).elu_().apply(&self.second).elu_().flatten(1, -1);
         leading.push(self.features);
-        seen.apply(&self.output).apply(&self.norm).tanh_().reshape(leading)
+        channels.apply(&self.output).apply(&self.norm).tanh_().reshape(leading)
     }
 }

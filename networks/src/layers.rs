@@ -1,4 +1,4 @@
-//! The building blocks that encoder, low level and value share.
+//! Building blocks of encoder, low level and value.
 
 use comic_experiment::Network;
 use tch::{Tensor, nn};
@@ -17,11 +17,11 @@ pub(crate) fn linear(path: &nn::Path, input: i64, output: i64, scale: f64) -> nn
     )
 }
 
-/// `[.., D]` as rows `[N, D]`.
+/// Reshapes `[.., D]` to rows `[N, D]`.
 pub(crate) fn rows(tensor: &Tensor) -> Tensor {
     let size = tensor.size();
     let Some((width, leading)) = size.split_last() else { return tensor.reshape([1, 1]) };
-    // Not −1, which cannot be told where the width is 0.
+    // The number of rows is given explicitly: −1 is ambiguous if the width is 0.
     tensor.reshape([leading.iter().product(), *width])
 }
 
@@ -34,7 +34,7 @@ pub(crate) struct Torso {
 }
 
 impl Torso {
-    /// `sizes` holds at least one entry; the experiment file's check refuses an empty list.
+    /// `sizes` has at least one entry; the check of the experiment refuses an empty list.
     pub(crate) fn new(path: &nn::Path, input: i64, sizes: &[usize]) -> Self {
         let first = sizes.first().map_or(input, |size| *size as i64);
         let mut width = first;
@@ -55,10 +55,10 @@ impl Torso {
         self.output
     }
 
-    /// `[N, input]` to `[N, output]`.
+    /// From `[N, input]` to `[N, output]`.
     ///
-    /// The activations overwrite their inputs: neither the layer norm nor a linear layer needs its own output to
-    /// differentiate itself, and a fresh 16 MB tensor a layer costs more than the arithmetic.
+    /// The activations work in place. That is correct because the gradients of layer norm and linear layers do not need
+    /// their outputs. It saves a new 16 MB tensor per layer, which costs more than the arithmetic.
     pub(crate) fn forward(&self, input: &Tensor) -> Tensor {
         let mut hidden = self.normalise(&input.apply(&self.layers[0])).tanh_();
         for layer in &self.layers[1..] {
@@ -73,10 +73,10 @@ impl Torso {
     }
 }
 
-/// PyTorch's own.
+/// The default of PyTorch.
 const LAYER_NORM_EPSILON: f64 = 1e-5;
 
-/// Hidden layers and a linear output, perhaps with a linear path from input to output beside them.
+/// Hidden layers and a linear output, with an optional linear path from input to output.
 #[derive(Debug)]
 pub(crate) struct Mlp {
     torso: Torso,
@@ -95,7 +95,7 @@ impl Mlp {
         self.torso.layers.first().map_or(0, |layer| layer.ws.size()[1])
     }
 
-    /// `[N, input]` to `[N, output]`.
+    /// From `[N, input]` to `[N, output]`.
     pub(crate) fn forward(&self, input: &Tensor) -> Tensor {
         let output = self.torso.forward(input).apply(&self.head);
         match &self.linear_path {
@@ -105,17 +105,18 @@ impl Mlp {
     }
 }
 
-/// Of several networks of the same sizes but for their inputs, the one at `chosen`, int64 `[G]`, for each group of rows:
-/// `[G, N, input]` to `[G, N, output]`, where a network reads the last entries of the input, as many as it is wide.
+/// Runs each group of rows through its own network: from `[G, N, input]` to `[G, N, output]`. `chosen`, int64 `[G]`,
+/// has the index of each group's network. The networks have the same sizes except for their inputs; a network reads
+/// only the last entries of the input.
 ///
-/// Which network runs is data here, so a program compiled for one choice serves them all; the price is a copy of the
-/// parameters for every group.
+/// The choice of networks is data, so one compiled program works for every choice. The cost is a copy of the parameters
+/// for every group.
 pub(crate) fn forward_chosen(networks: &[Mlp], chosen: &Tensor, input: &Tensor) -> Tensor {
     let choose = |of: &dyn Fn(&Mlp) -> Tensor| {
         let all: Vec<Tensor> = networks.iter().map(of).collect();
         Tensor::stack(&all, 0).index_select(0, chosen)
     };
-    // Input that a network does not read meets weights of 0.
+    // The weights of entries that a network does not read are 0.
     let widened = |weights: &Tensor, width: i64| weights.constant_pad_nd([width - weights.size()[1], 0]);
     let linear = |input: &Tensor, of: &dyn Fn(&Mlp) -> &nn::Linear| {
         let weights = choose(&|network| widened(&of(network).ws, input.size()[2]));
@@ -128,7 +129,8 @@ pub(crate) fn forward_chosen(networks: &[Mlp], chosen: &Tensor, input: &Tensor) 
     let hidden = linear(input, &|network| &network.torso.layers[0]);
     let [weight, bias] = [0, 1].map(|part| choose(&|network| network.torso.norm[part].shallow_clone()).unsqueeze(1));
     let normalised = hidden.layer_norm([hidden.size()[2]], None::<Tensor>, None::<Tensor>, LAYER_NORM_EPSILON, true);
-    // In place, as everywhere: torch_xla 2.9 differentiates ELU by its output, which is right of `elu_` alone.
+    // The activation is in place: torch_xla 2.9 computes ELU's gradient from its output, which is correct only for
+    // `elu_`.
     let mut hidden = (normalised * weight + bias).tanh_();
     for layer in 1..networks.first().map_or(0, |network| network.torso.layers.len()) {
         hidden = linear(&hidden, &|network| &network.torso.layers[layer]).elu_();
@@ -143,20 +145,20 @@ pub(crate) fn forward_chosen(networks: &[Mlp], chosen: &Tensor, input: &Tensor) 
     }
 }
 
-/// What a Gaussian head starts as.
+/// Initial values of a Gaussian head.
 pub(crate) struct GaussianHeadConfig<'a> {
-    /// Where the mean's bias starts, one entry a dimension.
+    /// Initial bias of the mean, one entry per dimension.
     pub(crate) mean: &'a [f32],
-    /// The standard deviation where the head's weights contribute nothing.
+    /// Initial standard deviation, if the contribution of the weights is 0.
     pub(crate) initial_std: f64,
-    /// Floor of the standard deviation.
+    /// Least standard deviation.
     pub(crate) min_std: f64,
-    /// Scale of the initial weights, relative to the other layers'.
+    /// Factor of the initial weights, relative to other layers.
     pub(crate) scale: f64,
 }
 
 impl<'a> GaussianHeadConfig<'a> {
-    /// For actions whose mean starts at `pose`.
+    /// For actions whose initial mean is `pose`.
     pub(crate) fn of_actions(pose: &'a [f32], network: &Network) -> Self {
         Self {
             mean: pose,
@@ -166,8 +168,8 @@ impl<'a> GaussianHeadConfig<'a> {
         }
     }
 
-    /// The linear layer whose outputs are the mean and the raw standard deviation, side by side. The raw half's bias
-    /// starts at the c for which σ = initial_std.
+    /// The linear layer whose output is the mean, followed by the raw standard deviation. The initial bias of the raw
+    /// half gives σ = initial_std.
     pub(crate) fn linear(&self, path: &nn::Path, input: i64) -> nn::Linear {
         let layer = linear(path, input, 2 * self.mean.len() as i64, self.scale);
         let raw = inverse_softplus(self.initial_std - self.min_std) as f32;
@@ -179,14 +181,14 @@ impl<'a> GaussianHeadConfig<'a> {
     }
 }
 
-/// Mean and raw standard deviation side by side, `[N, 2·D]`, as Gaussians: σ = min_std + softplus(raw).
+/// Gaussians `[N, D]` from means, followed by raw standard deviations, `[N, 2·D]`: σ = min_std + softplus(raw).
 pub(crate) fn gaussian(output: &Tensor, min_std: f64) -> DiagonalGaussian {
     let size = output.size()[1] / 2;
     let std = output.narrow(1, size, size).softplus() + min_std;
     DiagonalGaussian { mean: output.narrow(1, 0, size), std }
 }
 
-/// A Gaussian as one linear layer gives it.
+/// A linear layer whose output is a Gaussian.
 #[derive(Debug)]
 pub(crate) struct GaussianHead {
     head: nn::Linear,
@@ -198,7 +200,7 @@ impl GaussianHead {
         Self { head: config.linear(&(path / "head"), input), min_std: config.min_std }
     }
 
-    /// `hidden [N, H]`.
+    /// From `hidden` `[N, H]` to Gaussians `[N, D]`.
     pub(crate) fn forward(&self, hidden: &Tensor) -> DiagonalGaussian {
         gaussian(&hidden.apply(&self.head), self.min_std)
     }
@@ -214,7 +216,7 @@ mod tests {
     use super::inverse_softplus;
 
     #[test]
-    pub(crate) fn inverse_softplus_undoes_softplus_from_tiny_to_large() {
+    fn inverse_softplus_inverts_softplus_from_tiny_to_large() {
         for y in [1e-6, 0.05, std::f64::consts::LN_2, 3.0, 50.0, 1000.0] {
             let raw = inverse_softplus(y);
             let softplus = if raw > 30.0 { raw } else { raw.exp().ln_1p() };

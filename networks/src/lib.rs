@@ -1,22 +1,26 @@
-//! The networks: what acts and what learns are the same functions, inside `tch::no_grad` or with gradient.
+//! The networks. Acting and learning use the same functions: acting inside `tch::no_grad`, learning with gradient.
 //!
 //! # Layout
-//! - [`Policy`] is everything acting needs: normaliser, reference encoder, low level. Its parameters travel.
-//! - Tasks that are learnt jointly have an encoder and a value function each ([`Routing`]) and share the low level.
-//! - The low level is one of several, a file each (`low_level`): MLP, LSTM, mixture and product of primitives.
-//! - An image, where the task has one, becomes a few numbers beside the task observation, for policy and value alike.
-//! - [`Value`] is what only the learner needs. It lives in a parameter store of its own.
-//! - [`ActionDistribution`] is what a policy acts by, one Gaussian or a mixture; [`DiagonalGaussian`] is what it and the
-//!   latent are made of.
-//! - [`to_safetensors`] and [`from_safetensors`] carry a parameter store over a wire or onto a disk; [`export`] is policies
-//!   and parts of them as files that others read.
+//! - [`Policy`] is everything that acting needs: normaliser, image encoder, reference encoder, low level. The learner
+//!   publishes its parameters.
+//! - In joint training each task has its own encoder and value function ([`Routing`]), and all tasks share the low
+//!   level.
+//! - `low_level` has one file per low level: MLP, LSTM, mixture and product of primitives.
+//! - If a task has a camera image, the image encoder turns it into a few numbers. They join the task observation, for
+//!   policy and value.
+//! - [`Value`] is the value function. Only the learner needs it; it has its own parameter store.
+//! - [`ActionDistribution`] is the distribution of actions, one Gaussian or a mixture. [`DiagonalGaussian`] is the
+//!   distribution of the latent and of each component.
+//! - [`to_safetensors`] and [`from_safetensors`] convert a parameter store to bytes and back; [`export`] writes
+//!   policies and parts of them as files for other programs.
 //!
-//! Networks take float32 tensors of rows, `[N, ·]`, where a learner's N is unrolls × steps; what remembers takes
-//! `[B, T, ·]`. Sums over N depend in their last bits on N and on the number of threads; with both equal, acting and
-//! learning give the same numbers bit for bit, an LSTM's to 1e-5, since the learner joins the products of all steps.
+//! Networks take float32 tensors of rows, `[N, ·]`. In the learner N is unrolls × steps. Recurrent layers take
+//! `[B, T, ·]`. The last bits of sums over N depend on N and on the number of threads. If both are equal, acting and
+//! learning give the same numbers bit for bit. An LSTM's numbers agree to 1e-5, because the learner computes the input
+//! products of all steps at once.
 //!
-//! Initial weights are uniform in ±1/√fan_in (variance scaling with scale ⅓) and biases 0 unless said otherwise.
-//! They come from libtorch's generator: call `tch::manual_seed` first to make them reproducible.
+//! By default initial weights are uniform in ±1/√fan_in (variance scaling with scale ⅓), and biases are 0. The random
+//! numbers are libtorch's: call `tch::manual_seed` first to make them reproducible.
 
 mod action;
 mod encoder;

@@ -1,8 +1,9 @@
-//! The low level: from latent and proprioception to an action.
+//! The low levels: from latent and proprioception to an action.
 //!
-//! Each is one file and one [`LowLevel`]; neither actor nor learner asks which it is. A new one is a new file, a line in
-//! [`build`] and one in [`low_level_layers`]; and in the experiment's `network.rs` a name, its sizes, and what is said of it
-//! there: components, numbers of state, whether it can do without a bottleneck and be taught by demonstrations.
+//! Each low level is one file with one [`LowLevel`]; actor and learner do not depend on which one is used. A new low
+//! level needs a file, a line in [`build`] and a line in [`low_level_layers`]. In the experiment's `network.rs` it
+//! needs a name, its sizes, its number of components, the size of its state, whether it works without a bottleneck, and
+//! whether it can learn from demonstrations.
 
 mod interface;
 mod lstm;
@@ -18,8 +19,8 @@ use tch::nn;
 pub(crate) use interface::{Config, Input, LowLevel, Output};
 pub use size::{Layer, Sizes};
 
-/// The layers of an experiment's low level, before it is built: a file is measured by them, and a benchmark. Of tensors with
-/// more than one dimension these are all but those whose names end in `biases`.
+/// The layers of an experiment's low level, without building it. They are all its tensors with more than one dimension,
+/// except those whose names end in `biases`. The check of exported files and a benchmark use them.
 pub fn low_level_layers(sizes: &Sizes<'_>) -> Vec<Layer> {
     match sizes.network.low_level {
         LowLevelName::Mlp => mlp::layers(sizes),
@@ -28,7 +29,7 @@ pub fn low_level_layers(sizes: &Sizes<'_>) -> Vec<Layer> {
     }
 }
 
-/// The low level of an experiment, its parameters in `path`.
+/// Builds the low level of an experiment, with its parameters in `path`.
 pub(crate) fn build(path: &nn::Path, config: &Config<'_>) -> Box<dyn LowLevel> {
     match config.network.low_level {
         LowLevelName::Mlp => Box::new(mlp::MlpLowLevel::new(path, config)),

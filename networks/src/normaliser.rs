@@ -1,4 +1,4 @@
-//! Observations brought to mean 0 and standard deviation 1 by fixed statistics.
+//! Normalises observations to mean 0 and standard deviation 1 with fixed statistics.
 
 use comic_experiment::TaskSpec;
 use tch::{Tensor, nn};
@@ -6,26 +6,27 @@ use tch::{Tensor, nn};
 use crate::error::Error;
 use crate::routing::Routing;
 
-/// Normalised observations are clamped to ± this many standard deviations (D).
+/// Normalised observations are clamped to ± this number of standard deviations (D).
 pub const NORMALISED_LIMIT: f64 = 10.0;
-/// Standard deviations are floored at this, so an observation that never moved is not blown up when it does (D).
+/// Least standard deviation, in the unit of the observation (D). Without it an observation that was constant during the
+/// measurement would become huge when it changes.
 pub const NORMALISER_MIN_STD: f32 = 1e-2;
 
-/// Mean and standard deviation of every observation entry, as measured on the first environment steps.
+/// Mean and standard deviation of every observation entry, measured on the first environment steps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NormaliserStatistics {
     /// Mean of proprioception, P entries.
     pub proprioception_mean: Vec<f32>,
     /// Standard deviation of proprioception, P entries.
     pub proprioception_std: Vec<f32>,
-    /// Mean of the task observation, task by task X entries.
+    /// Mean of the task observation, X entries for each task.
     pub task_mean: Vec<f32>,
-    /// Standard deviation of the task observation, task by task X entries.
+    /// Standard deviation of the task observation, X entries for each task.
     pub task_std: Vec<f32>,
 }
 
-/// Observations a policy has normalised, and whose they are; the only thing a [`crate::Value`] reads, so policy and value
-/// can never disagree about scale or task.
+/// Observations that a policy has normalised, with their routing. A [`Value`](crate::Value) reads only this type, so
+/// policy and value always use the same scale and the same task.
 #[derive(Debug)]
 pub struct NormalisedObservation {
     pub(crate) proprioception: Tensor,
@@ -44,10 +45,10 @@ impl NormalisedObservation {
     }
 }
 
-/// The statistics as parameters that travel but are not trained. The identity until they are set.
+/// The statistics as parameters that are published but not trained. Until they are set, normalisation is the identity.
 #[derive(Debug)]
 pub(crate) struct Normaliser {
-    /// Off when the experiment takes raw observations: then no arithmetic is done at all.
+    /// False if the experiment uses raw observations; then observations are not changed.
     active: bool,
     proprioception_mean: Tensor,
     proprioception_std: Tensor,
@@ -79,7 +80,7 @@ impl Normaliser {
                 routing: kept,
             };
         }
-        // Each unroll by its own task's statistics, every step of it.
+        // Each unroll uses the statistics of its task in every step.
         let of_task = |statistics: &Tensor| match routing.tasks() {
             None => statistics.select(0, 0),
             Some(tasks) if task.dim() > 2 => statistics.index_select(0, tasks).unsqueeze(1),
@@ -106,7 +107,10 @@ impl Normaliser {
                 return Err(Error::Length { name, expected, found: values.len() });
             }
             if !values.iter().all(|value| value.is_finite() && (!is_std || *value >= 0.0)) {
-                return Err(Error::Number { name: (*name).into(), what: "a number that is no mean or deviation" });
+                return Err(Error::Number {
+                    name: (*name).into(),
+                    what: "a number that is not a valid mean or standard deviation",
+                });
             }
         }
         for (_, values, buffer, is_std) in entries {

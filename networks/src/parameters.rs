@@ -1,4 +1,4 @@
-//! Parameters in and out, as safetensors documents of float32.
+//! Parameters as safetensors documents of float32.
 
 use std::collections::HashMap;
 
@@ -8,10 +8,10 @@ use tch::{Device, Kind, Tensor, nn};
 
 use crate::error::Error;
 
-/// Every parameter of `store`, the untrained ones included. The same parameters give the same bytes.
+/// All parameters of `store`, also those that are not trained, sorted by name. The same parameters give the same bytes.
 ///
 /// # Errors
-/// [`Error::Torch`] when a parameter cannot be read back from its device.
+/// [`Error::Torch`] if a parameter cannot be copied from its device.
 pub fn to_safetensors(store: &nn::VarStore) -> Result<Vec<u8>, Error> {
     let mut parameters = Vec::new();
     for (name, tensor) in store.variables() {
@@ -30,16 +30,16 @@ pub fn to_safetensors(store: &nn::VarStore) -> Result<Vec<u8>, Error> {
     Ok(safetensors::serialize(views, None)?)
 }
 
-/// Sets every parameter of `store` from `bytes`, which may come from anywhere: every name, shape and element type is
-/// checked and every number must be finite before the first parameter changes.
+/// Sets every parameter of `store` from `bytes`, which may come from anywhere. Before the first parameter changes, it
+/// checks every name, shape and element type, and that every number is finite.
 ///
 /// # Errors
-/// What is wrong with the document, by the parameter's name; `store` is untouched then.
+/// [`Error`] with the name of the invalid parameter; then `store` is unchanged.
 pub fn from_safetensors(store: &mut nn::VarStore, bytes: &[u8]) -> Result<(), Error> {
     set(&store.variables(), bytes)
 }
 
-/// As [`from_safetensors`], for these variables of a store.
+/// Like [`from_safetensors`], for these variables of a store.
 pub(crate) fn set(variables: &HashMap<String, Tensor>, bytes: &[u8]) -> Result<(), Error> {
     let document = SafeTensors::deserialize(bytes)?;
     if let Some(name) = document.names().into_iter().find(|name| !variables.contains_key(*name)) {
@@ -71,7 +71,7 @@ fn check(name: &str, expected: &[i64], view: &TensorView) -> Result<Tensor, Erro
     if !values.iter().all(|value| value.is_finite()) {
         return Err(Error::Number { name: name.to_string(), what: "an infinity or a NaN" });
     }
-    // A normaliser divides by its deviations.
+    // A normaliser divides by its standard deviations.
     if name.starts_with("normaliser.") && name.ends_with("_std") && !values.iter().all(|value| *value > 0.0) {
         return Err(Error::Number { name: name.to_string(), what: "a standard deviation that is not positive" });
     }

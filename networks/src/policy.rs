@@ -1,4 +1,4 @@
-//! Everything that acts: normaliser, reference encoder, low level.
+//! The policy: normaliser, image encoder, reference encoder, low level.
 
 use comic_experiment::{Network, TaskSpec};
 use tch::{Tensor, nn};
@@ -14,21 +14,21 @@ use crate::lstm::RecurrentState;
 use crate::normaliser::{NormalisedObservation, Normaliser, NormaliserStatistics};
 use crate::routing::Routing;
 
-/// What one pass of the policy gives, for N rows.
+/// The output of the policy for N rows.
 #[derive(Debug)]
 pub struct Acting {
     /// z_t = μ_θ + σ_θ·noise, `[N, Z]`; `[N, 0]` without a bottleneck.
     pub latent: Tensor,
     /// π(a_t | s_t, z_t), over N rows.
     pub action: ActionDistribution,
-    /// q(z_t | x_t, s_t, z_{t−1}), over `[N, Z]`; none without a bottleneck.
+    /// q(z_t | x_t, s_t, z_{t−1}), over `[N, Z]`; `None` without a bottleneck.
     pub latent_posterior: Option<DiagonalGaussian>,
-    /// What is remembered after each unroll's last row, `[B, S]`.
+    /// The recurrent state after the last row of each unroll, `[B, S]`.
     pub state: Tensor,
 }
 
-/// The policy: the reference encoders q(z_t | x_t, s_t, z_{t−1}) and the low level π(a_t | s_t, z_t)
-/// (CoMic supplement; sizes in [`Network`]). Tasks that are learnt jointly have an encoder each and share the low level.
+/// The policy: the reference encoders q(z_t | x_t, s_t, z_{t−1}) and the low level π(a_t | s_t, z_t) (CoMic supplement;
+/// sizes in [`Network`]). In joint training each task has its own encoder, and all share the low level.
 #[derive(Debug)]
 pub struct Policy {
     normaliser: Normaliser,
@@ -38,11 +38,11 @@ pub struct Policy {
 }
 
 impl Policy {
-    /// Creates the policy's parameters in `store`. `pose` is the action at which the mean starts, A entries in
-    /// [−1, 1]; zeros are the middle of every joint's range.
+    /// Creates the policy's parameters in `store`. `pose` is the initial mean of the action, A entries in [−1, 1]; 0 is
+    /// the middle of a joint's range.
     ///
     /// # Errors
-    /// [`Error::Length`] when `pose` is not an action of this task.
+    /// [`Error::Length`] if `pose` is not an action of this task.
     pub fn new(store: &nn::Path, spec: &TaskSpec, config: &Network, pose: &[f32]) -> Result<Self, Error> {
         if pose.len() != spec.action {
             return Err(Error::Length { name: "initial pose", expected: spec.action, found: pose.len() });
@@ -59,9 +59,9 @@ impl Policy {
         Ok(Self { normaliser, image_encoder, encoder, low_level })
     }
 
-    /// Normalises observations: proprioception `[.., P]`, task observation `[.., X]`, image `[.., I]` uint8, where the
-    /// leading dimensions are `[B]` or `[B, T]` and the B unrolls are of the tasks that `routing` says. What is seen in the
-    /// image joins the task observation, so policy and value share one pair of eyes; both learn it.
+    /// Normalises observations: proprioception `[.., P]`, task observation `[.., X]`, image `[.., I]` uint8. The
+    /// leading dimensions are `[B]` or `[B, T]`; `routing` has the tasks of the B unrolls. The image features join the
+    /// task observation, so policy and value share one image encoder, and both train it.
     pub fn normalise(
         &self,
         proprioception: &Tensor,
@@ -76,10 +76,9 @@ impl Policy {
         observation
     }
 
-    /// Acts, or learns, on normalised observations: `previous_latent` is the sampled z_{t−1} `[.., Z]` (zeros at an
-    /// episode's start), `latent_noise` the standard-normal noise that makes z_t `[.., Z]`. Leading dimensions are the same
-    /// ones for all: `[B, T]`, where B is the memory's, count as B·T rows; whoever acts has a step of B environments,
-    /// `[B]`.
+    /// Runs the policy on normalised observations, to act or to learn. `previous_latent` is the sampled z_{t−1}, `[..,
+    /// Z]` (zeros at the start of an episode). `latent_noise` is the standard-normal noise of z_t, `[.., Z]`. All
+    /// leading dimensions are equal: `[B, T]`, which are B·T rows, to learn; `[B]`, one step of B environments, to act.
     pub fn act(
         &self,
         observation: &NormalisedObservation,
@@ -95,10 +94,10 @@ impl Policy {
         Acting { latent: encoded.latent, action, latent_posterior: encoded.posterior, state }
     }
 
-    /// Fixes the normaliser's statistics. They belong to the parameters that travel, and are not trained.
+    /// Sets the statistics of the normaliser. They are published with the parameters, and are not trained.
     ///
     /// # Errors
-    /// [`Error::Length`] or [`Error::Number`] when the statistics do not fit the task; nothing is changed then.
+    /// [`Error::Length`] or [`Error::Number`] if the statistics do not fit the task; then nothing changes.
     pub fn set_normaliser(&self, statistics: &NormaliserStatistics) -> Result<(), Error> {
         self.normaliser.set(statistics)
     }

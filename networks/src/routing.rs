@@ -1,19 +1,21 @@
-//! Which network of several each unroll goes through.
+//! Routes each unroll through the network of its task.
 //!
-//! In joint training every task has an encoder and a value function of its own, and a batch holds unrolls of all of them.
-//! A [`Routing`] says which unroll is whose; [`PerTask`] is one network for each task.
+//! In joint training every task has its own encoder and value function, and a batch has unrolls of all tasks. A
+//! [`Routing`] has the task of each unroll; [`PerTask`] has one network per task.
 //!
-//! Whoever acts takes the rows of each task that is there, and leaves out the networks of those that are not
-//! ([`Routing::grouped`]). A learner's shapes must not depend on the mix, or memory would be cut anew for every one, and a
-//! compiler of graphs could not keep up ([`Routing::blocked`]): its unrolls are sorted by task into blocks of one task each,
-//! a few more than they would fill, and every block goes through its own task's network. With blocks of an eighth of the
-//! batch and two tasks this is nine eighths of the products, where every network over every unroll would be twice of them.
+//! To act, the rows are grouped by task, and networks of tasks without rows do not run ([`Routing::grouped`]).
+//!
+//! In the learner, shapes must not depend on the mix of tasks: other shapes need other memory, and a graph compiler
+//! would compile again ([`Routing::blocked`]). So unrolls are sorted by task into blocks of one task each, and each
+//! block goes through the network of its task. There are a few more blocks than full blocks would need. With two tasks
+//! and blocks of an eighth of the batch, this takes 9/8 of the products of one network. Running every network over
+//! every unroll would take twice the products.
 
 use tch::{Device, Tensor};
 
 use crate::layers::{Mlp, forward_chosen};
 
-/// Which task each unroll, or each environment, is of.
+/// The task of each unroll, or of each environment.
 #[derive(Debug)]
 pub struct Routing(Option<Routed>);
 
@@ -26,53 +28,53 @@ struct Routed {
 
 #[derive(Debug)]
 enum Plan {
-    /// Task by task, the places of its unrolls, int64.
+    /// For each task, the indices of its unrolls, int64.
     Groups(Vec<Tensor>),
     Blocks(Blocks),
 }
 
-/// Unrolls sorted by task, with slots left over where a task does not fill its last block.
+/// Unrolls sorted by task into slots. If a task does not fill its last block, the rest of its slots is padding.
 #[derive(Debug)]
 struct Blocks {
-    /// The unroll in each slot, `[blocks · size]` int64; any unroll in a slot left over, whose output nobody reads.
+    /// The unroll in each slot, `[blocks · size]` int64. A padding slot has unroll 0; its output is not read.
     slots: Tensor,
     /// The slot of each unroll, `[B]` int64.
     places: Tensor,
     /// The task of each block.
     tasks: BlockTasks,
-    /// Unrolls a block.
+    /// Number of unrolls per block.
     size: i64,
 }
 
-/// Where it is known which network a block goes through.
+/// The task of each block, in host memory or on the device.
 #[derive(Debug)]
 enum BlockTasks {
-    /// Here: each block runs through its own network, and no parameter is copied.
+    /// In host memory: each block runs through its own network, and no parameter is copied.
     Host(Vec<usize>),
-    /// On the device, int64: no program depends on the mix, so none has to be compiled for another one.
+    /// On the device, `[blocks]` int64: the compiled program does not depend on the mix of tasks.
     Device(Tensor),
 }
 
-/// A batch is cut into so many blocks, and one more for each further task.
+/// Number of blocks of a batch; each further task adds one block.
 const BLOCKS: usize = 8;
 
 impl Routing {
-    /// For one task; of several networks, everything goes through the first.
+    /// For one task. If there are several networks, all rows go through the first.
     pub fn single() -> Self {
         Self(None)
     }
 
-    /// For whoever acts: `tasks` holds each environment's task, below `count`.
+    /// To act: `tasks` has the task of each environment, below `count`.
     pub fn grouped(tasks: &[usize], count: usize) -> Self {
         if count < 2 {
             return Self::single();
         }
-        let groups = (0..count).map(|task| indices(places_of(tasks, task), Device::Cpu)).collect();
-        Self(Some(Routed { tasks: indices(tasks.iter().copied(), Device::Cpu), plan: Plan::Groups(groups) }))
+        let groups = (0..count).map(|task| index_tensor(indices_of(tasks, task), Device::Cpu)).collect();
+        Self(Some(Routed { tasks: index_tensor(tasks.iter().copied(), Device::Cpu), plan: Plan::Groups(groups) }))
     }
 
-    /// For a learner: `tasks` holds each unroll's task, below `count`. Every shape is decided by how many unrolls and how
-    /// many tasks there are; beyond the CPU every operation is, too.
+    /// To learn: `tasks` has the task of each unroll, below `count`. All shapes depend only on the number of unrolls
+    /// and the number of tasks. On devices other than the CPU, the operations do too.
     pub fn blocked(tasks: &[usize], count: usize, device: Device) -> Self {
         if count < 2 {
             return Self::single();
@@ -81,29 +83,29 @@ impl Routing {
         let blocks = tasks.len().div_ceil(size) + count - 1;
         let (mut slots, mut places, mut of_block) = (Vec::new(), vec![0; tasks.len()], Vec::new());
         for task in 0..count {
-            for unroll in places_of(tasks, task) {
+            for unroll in indices_of(tasks, task) {
                 places[unroll] = slots.len();
                 slots.push(unroll);
             }
-            // Up to the block's end.
+            // Padding up to the end of the block.
             slots.resize(slots.len().next_multiple_of(size), 0);
             of_block.resize(slots.len() / size, task);
         }
         slots.resize(blocks * size, 0);
         of_block.resize(blocks, 0);
         let blocks = Blocks {
-            slots: indices(slots, device),
-            places: indices(places, device),
+            slots: index_tensor(slots, device),
+            places: index_tensor(places, device),
             tasks: match device {
                 Device::Cpu => BlockTasks::Host(of_block),
-                _ => BlockTasks::Device(indices(of_block, device)),
+                _ => BlockTasks::Device(index_tensor(of_block, device)),
             },
             size: size as i64,
         };
-        Self(Some(Routed { tasks: indices(tasks.iter().copied(), device), plan: Plan::Blocks(blocks) }))
+        Self(Some(Routed { tasks: index_tensor(tasks.iter().copied(), device), plan: Plan::Blocks(blocks) }))
     }
 
-    /// The same one again; its tensors are shared.
+    /// A copy that shares the tensors.
     pub fn shallow_clone(&self) -> Self {
         Self(self.0.as_ref().map(|Routed { tasks, plan }| {
             let plan = match plan {
@@ -122,35 +124,37 @@ impl Routing {
         }))
     }
 
-    /// The task of each unroll, `[B]` int64; none where there is one task.
+    /// The task of each unroll, `[B]` int64; `None` for one task.
     pub fn tasks(&self) -> Option<&Tensor> {
         self.0.as_ref().map(|routed| &routed.tasks)
     }
 }
 
-fn places_of(tasks: &[usize], task: usize) -> impl Iterator<Item = usize> {
-    tasks.iter().enumerate().filter(move |(_, of)| **of == task).map(|(place, _)| place)
+/// The indices of the unrolls of `task`.
+fn indices_of(tasks: &[usize], task: usize) -> impl Iterator<Item = usize> {
+    tasks.iter().enumerate().filter(move |(_, of)| **of == task).map(|(index, _)| index)
 }
 
-fn indices(values: impl IntoIterator<Item = usize>, device: Device) -> Tensor {
+/// An int64 tensor of these indices.
+fn index_tensor(values: impl IntoIterator<Item = usize>, device: Device) -> Tensor {
     let values: Vec<i64> = values.into_iter().map(|value| value as i64).collect();
     Tensor::from_slice(&values).to_device(device)
 }
 
-/// One network for each task, of the same sizes but for the input: a task's network reads the last entries of it, as many
-/// as it is wide.
+/// One network per task. The networks have the same sizes except for their inputs; a network reads only the last
+/// entries of the input.
 #[derive(Debug)]
 pub(crate) struct PerTask {
     networks: Vec<Mlp>,
 }
 
 impl PerTask {
-    /// At least one network.
+    /// `networks` has at least one network.
     pub(crate) fn new(networks: Vec<Mlp>) -> Self {
         Self { networks }
     }
 
-    /// `[N, I]` to `[N, O]`, N rows unroll by unroll, I the widest input.
+    /// From `[N, I]` to `[N, O]`. The N rows are unroll by unroll; I is the width of the widest input.
     pub(crate) fn forward(&self, input: &Tensor, routing: &Routing) -> Tensor {
         match (&self.networks[..], &routing.0) {
             ([network], _) => network.forward(input),
@@ -163,23 +167,23 @@ impl PerTask {
     }
 }
 
-/// What the network reads of an input.
+/// The part of an input that the network reads.
 fn own(network: &Mlp, input: &Tensor) -> Tensor {
     let width = network.input();
     input.narrow(1, input.size()[1] - width, width)
 }
 
-/// Each task's rows through its own network.
+/// Runs the rows of each task through its network.
 fn by_group(networks: &[Mlp], groups: &[Tensor], input: &Tensor) -> Tensor {
     let present = || networks.iter().zip(groups).filter(|(_, rows)| rows.numel() > 0);
     let outputs: Vec<Tensor> =
         present().map(|(network, rows)| network.forward(&own(network, &input.index_select(0, rows)))).collect();
     let rows: Vec<&Tensor> = present().map(|(_, rows)| rows).collect();
-    // Sorted by task, and back.
+    // The outputs are sorted by task; this restores the order of the rows.
     Tensor::cat(&outputs, 0).index_select(0, &Tensor::cat(&rows, 0).argsort(0, false))
 }
 
-/// Each block through its task's network.
+/// Runs each block through the network of its task.
 fn by_block(networks: &[Mlp], blocks: &Blocks, input: &Tensor) -> Tensor {
     let (unrolls, width) = (blocks.places.size()[0], input.size()[1]);
     let count = blocks.slots.size()[0] / blocks.size;
@@ -216,7 +220,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn every_unroll_has_a_slot_of_its_own_in_a_block_of_its_task_and_no_shape_depends_on_the_mix(
+        fn every_unroll_has_its_own_slot_in_a_block_of_its_task_and_shapes_do_not_depend_on_the_mix(
             (count, tasks) in (2_usize..5).prop_flat_map(|count| (Just(count), prop::collection::vec(0..count, 1..40))),
         ) {
             let Blocks { slots, places, tasks: of_blocks, size } = blocks(&tasks, count);
@@ -236,15 +240,15 @@ mod tests {
     }
 
     #[test]
-    fn half_of_a_batch_of_128_each_costs_an_eighth_more() {
+    fn two_tasks_in_a_batch_of_128_cost_an_eighth_more() {
         let tasks: Vec<usize> = (0..128).map(|unroll| unroll % 2).collect();
         assert_eq!(blocks(&tasks, 2).slots.size(), [144]);
     }
 
-    /// libtorch's generator is the process's: tests that seed it take turns.
+    /// libtorch has one generator per process, so tests that seed it must not run at the same time.
     static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
-    /// Networks of different inputs, and what each makes of all rows.
+    /// Two networks with different inputs.
     fn networks(store: &tch::nn::VarStore) -> PerTask {
         let networks = [5_i64, 3].into_iter().enumerate().map(|(task, input)| {
             let path = store.root() / task;
@@ -257,14 +261,14 @@ mod tests {
     }
 
     #[test]
-    fn grouped_or_blocked_every_unroll_goes_through_its_own_tasks_network() {
+    fn grouped_and_blocked_unrolls_go_through_the_network_of_their_task() {
         let _guard = GENERATOR.lock().unwrap();
         tch::manual_seed(1);
         let store = tch::nn::VarStore::new(Device::Cpu);
         let per_task = networks(&store);
         let (tasks, steps) = ([0, 1, 1, 0, 1, 0, 0, 1, 1, 1, 0], 3);
         let input = Tensor::randn([11 * steps, 5], (Kind::Float, Device::Cpu));
-        // What is in front of a task's own width is zero in a batch.
+        // In a batch the entries before a task's own observation are 0.
         for (unroll, task) in tasks.iter().enumerate() {
             if *task == 1 {
                 let _ = input.narrow(0, unroll as i64 * steps, steps).narrow(1, 0, 2).zero_();
@@ -277,12 +281,12 @@ mod tests {
             let expected = network.forward(&super::own(network, &own(&input)));
             assert!((own(&blocked) - &expected).abs().max().double_value(&[]) < 1e-5, "unroll {unroll}");
         }
-        // As beyond the CPU.
-        let mut there = blocks(&tasks, 2);
-        if let BlockTasks::Host(tasks) = &there.tasks {
-            there.tasks = BlockTasks::Device(indices(tasks.iter().copied(), Device::Cpu));
+        // The method for devices other than the CPU.
+        let mut on_device = blocks(&tasks, 2);
+        if let BlockTasks::Host(tasks) = &on_device.tasks {
+            on_device.tasks = BlockTasks::Device(index_tensor(tasks.iter().copied(), Device::Cpu));
         }
-        let chosen = by_block(&per_task.networks, &there, &input);
+        let chosen = by_block(&per_task.networks, &on_device, &input);
         assert!((&chosen - &blocked).abs().max().double_value(&[]) < 1e-5);
         let parameters = store.trainable_variables();
         let gradients =
@@ -293,7 +297,7 @@ mod tests {
                     < 1e-4 * (1.0 + blocked.abs().max().double_value(&[]))
             );
         }
-        // Whoever acts has a row for each environment.
+        // To act there is one row per environment.
         let rows = input.reshape([11, steps, 5]).select(1, 0);
         let grouped = per_task.forward(&rows, &Routing::grouped(&tasks, 2));
         let same = blocked.reshape([11, steps, 4]).select(1, 0);
@@ -301,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn tasks_that_are_not_there_are_left_out() {
+    fn grouping_skips_tasks_without_rows() {
         let _guard = GENERATOR.lock().unwrap();
         tch::manual_seed(1);
         let store = tch::nn::VarStore::new(Device::Cpu);

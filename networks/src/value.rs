@@ -8,14 +8,16 @@ use crate::lstm::{LstmStack, RecurrentState};
 use crate::normaliser::NormalisedObservation;
 use crate::routing::PerTask;
 
-/// V(x_t, s_t, clip), one for each task: `[x, s, clip embedding]` → torso → one output per reward term (CoMic supplement).
-/// A recurrent one has LSTM layers after the torso, which begin empty at an unroll's first row and are emptied where an
-/// episode begins; joint training knows none.
+/// V(x_t, s_t, clip), one network per task: `[x, s, clip embedding]` → torso → one output per reward term (CoMic
+/// supplement).
 ///
-/// The clip embedding is learned; its entries start as N(0, 1/width), so a row's length is about 1.
+/// A recurrent value function has LSTM layers after the torso. Their state is 0 at the first row of an unroll, and is
+/// reset to 0 where an episode begins. Joint training has no recurrent value function.
+///
+/// The clip embedding is learned. Its initial entries are N(0, 1/width), so the length of a row is about 1.
 #[derive(Debug)]
 pub struct Value {
-    /// Task by task, `[clips, width]`.
+    /// One embedding per task, `[clips, width]`.
     embeddings: Vec<Tensor>,
     body: Body,
 }
@@ -55,11 +57,11 @@ impl Value {
         Self { embeddings, body: Body::FeedForward(PerTask::new(networks)) }
     }
 
-    /// Observations `[B, T, P]`, `[B, T, X]`, the clips' indices, `[B, T]` int64 below the number of clips, and where
-    /// episodes begin, `[B, T]`; `[B, T, R]` out.
+    /// The values `[B, T, R]` of observations `[B, T, ·]`. `clip` has the indices of the clips, `[B, T]` int64, below
+    /// the number of clips of all tasks. `first` is 1 where an episode begins, `[B, T]`.
     pub fn forward(&self, observation: &NormalisedObservation, clip: &Tensor, first: &Tensor) -> Tensor {
         let NormalisedObservation { proprioception, task, routing } = observation;
-        // Clips are numbered through, task by task.
+        // The indices of clips continue from task to task.
         let embedded = Tensor::embedding(&Tensor::cat(&self.embeddings, 0), clip, -1, false, false);
         let input = rows(&Tensor::cat(&[task, proprioception, &embedded], -1));
         let (unrolls, steps) = (clip.size()[0], clip.size()[1]);

@@ -1,6 +1,6 @@
-//! Policies as files: what is exported is what acts, and nothing hostile gets in.
+//! Policies as files: an exported policy acts like the original, and invalid files are refused.
 
-#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+#![allow(clippy::unwrap_used, reason = "helpers of tests may panic")]
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -13,10 +13,10 @@ use safetensors::tensor::{Dtype, TensorView};
 use serde_json::Value;
 use tch::{CModule, Device, Kind, Tensor, nn};
 
-/// libtorch's generator is the process's: tests that seed it take turns.
+/// libtorch has one generator per process, so tests that seed it must not run at the same time.
 static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
-/// A preset, with networks of a few numbers.
+/// A preset with small networks.
 fn small(preset: &str, more: &[&str]) -> Experiment {
     let sizes = [
         "network.encoder=[8]",
@@ -34,13 +34,13 @@ fn small(preset: &str, more: &[&str]) -> Experiment {
     resolve(preset, &overrides).unwrap()
 }
 
-/// A policy of the experiment in which no number is another's, its statistics included.
+/// A policy of the experiment with random parameters, statistics included.
 fn policy(experiment: &Experiment) -> (nn::VarStore, Policy, TaskSpec) {
     tch::manual_seed(1);
     let spec = TaskSpec::new(experiment, Vec::new()).unwrap();
     let store = nn::VarStore::new(Device::Cpu);
     let policy = Policy::new(&store.root(), &spec, &experiment.network, &vec![0.1; spec.action]).unwrap();
-    // In order, so that the same experiment has the same policy again.
+    // Sorted by name, so the same experiment gives the same policy.
     for (name, tensor) in store.variables().into_iter().collect::<BTreeMap<_, _>>() {
         let mut noise = tensor.detach().rand_like() * 0.5 - 0.25;
         if name.ends_with("_std") {
@@ -71,7 +71,7 @@ fn random(width: usize) -> Tensor {
 }
 
 #[test]
-fn every_part_comes_back_as_it_went_out_and_says_what_it_is() {
+fn every_part_is_read_as_it_was_written_and_describes_itself() {
     let joint = small("joint-get-up", &[]);
     for (part, inputs, outputs) in [
         ("policy", "proprioception observation:tracking observation:get-up recurrent_state", "action recurrent_state"),
@@ -97,7 +97,7 @@ fn every_part_comes_back_as_it_went_out_and_says_what_it_is() {
 }
 
 #[test]
-fn tensors_keep_the_names_they_have_in_a_checkpoint() {
+fn tensors_have_the_same_names_as_in_a_checkpoint() {
     let joint = small("joint-get-up", &[]);
     let all = names(&exported("policy", &joint).unwrap());
     let getting_up = names(&exported("encoder:get-up", &joint).unwrap());
@@ -114,7 +114,7 @@ fn tensors_keep_the_names_they_have_in_a_checkpoint() {
 }
 
 #[test]
-fn a_policy_of_one_task_acts_as_the_joint_policy_does_in_that_task() {
+fn a_policy_of_one_task_acts_like_the_joint_policy_in_that_task() {
     let joint = small("joint-get-up", &[]);
     let file = exported("policy:get-up", &joint).unwrap();
     let _guard = GENERATOR.lock().unwrap();
@@ -128,21 +128,21 @@ fn a_policy_of_one_task_acts_as_the_joint_policy_does_in_that_task() {
     let task = random(spec.task);
     let act = |policy: &Policy, task: &Tensor, routing: Routing| {
         let observation = policy.normalise(&proprioception, task, None, &routing);
-        let memory = RecurrentState { state: &state, first: None };
-        policy.act(&observation, &latent, &latent.zeros_like(), memory).action.mode()
+        let recurrent = RecurrentState { state: &state, first: None };
+        policy.act(&observation, &latent, &latent.zeros_like(), recurrent).action.mode()
     };
     let expected = act(&both, &task, Routing::grouped(&[1], 2));
-    // A shorter task's observation is at the end of the longest.
+    // A shorter task observation is at the end of the row.
     let own_task = task.narrow(1, (spec.task - own.task) as i64, own.task as i64);
     let found = act(&alone, &own_task, Routing::single());
     assert!((expected - found).abs().max().double_value(&[]) < 1e-6);
 }
 
 #[test]
-fn a_low_level_moves_into_another_policy_and_changes_nothing_else_there() {
+fn loading_a_low_level_into_another_policy_changes_nothing_else() {
     let file = exported("low-level", &small("joint-get-up", &[])).unwrap();
     let _guard = GENERATOR.lock().unwrap();
-    // Another task, with an encoder of another size.
+    // The other policy has another task and an encoder of another size.
     let (store, ..) = policy(&small("go-to-target", &["network.encoder=[9, 9]"]));
     let values = || {
         let values = |tensor: Tensor| Vec::<f32>::try_from(tensor.detach().flatten(0, -1)).unwrap();
@@ -161,7 +161,7 @@ fn a_low_level_moves_into_another_policy_and_changes_nothing_else_there() {
 }
 
 #[test]
-fn torch_script_acts_as_the_policy_does_whatever_its_low_level() {
+fn torch_script_acts_like_the_policy_with_every_low_level() {
     let directory = tempfile::tempdir().unwrap();
     for (name, bare) in LowLevelName::ALL.into_iter().map(|name| (name, false)).chain([(LowLevelName::Mixture, true)]) {
         let size = format!("network.latent.size={}", if bare { 0 } else { 4 });
@@ -174,25 +174,26 @@ fn torch_script_acts_as_the_policy_does_whatever_its_low_level() {
 
         let (_, policy, spec) = policy(&experiment);
         let (latent, state) = (experiment.network.latent.size, experiment.network.state_size());
-        let mut remembered = Tensor::zeros([1, (latent + state) as i64], (Kind::Float, Device::Cpu));
-        let mut memory = (remembered.narrow(1, 0, latent as i64), remembered.narrow(1, latent as i64, state as i64));
+        let mut input_state = Tensor::zeros([1, (latent + state) as i64], (Kind::Float, Device::Cpu));
+        let mut previous =
+            (input_state.narrow(1, 0, latent as i64), input_state.narrow(1, latent as i64, state as i64));
         for step in 0..4 {
             let (proprioception, task) = (random(spec.proprioception), random(spec.task));
-            let output = module.forward_ts(&[&proprioception, &task, &remembered]).unwrap();
+            let output = module.forward_ts(&[&proprioception, &task, &input_state]).unwrap();
             let observation = policy.normalise(&proprioception, &task, None, &Routing::single());
-            let before = RecurrentState { state: &memory.1, first: None };
-            let acting = tch::no_grad(|| policy.act(&observation, &memory.0, &memory.0.zeros_like(), before));
+            let recurrent = RecurrentState { state: &previous.1, first: None };
+            let acting = tch::no_grad(|| policy.act(&observation, &previous.0, &previous.0.zeros_like(), recurrent));
             let action = acting.action.mode().clamp(-1.0, 1.0);
             let expected = Tensor::cat(&[&action, &acting.latent, &acting.state], 1);
             assert_eq!(output, expected, "{name}, step {step}");
-            remembered = output.narrow(1, spec.action as i64, (latent + state) as i64);
-            memory = (acting.latent, acting.state);
+            input_state = output.narrow(1, spec.action as i64, (latent + state) as i64);
+            previous = (acting.latent, acting.state);
         }
     }
 }
 
 #[test]
-fn a_mixture_without_noise_acts_by_its_likeliest_component_row_by_row() {
+fn a_mixture_without_noise_acts_with_its_most_likely_component_in_each_row() {
     let weights = Tensor::from_slice(&[0.2f32, 0.8, 0.7, 0.3]).log().reshape([2, 2]);
     let mean = Tensor::from_slice(&[1.0f32, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]).reshape([2, 4]);
     let action = comic_networks::ActionDistribution::from_rows(&mean, &mean.ones_like(), &weights).mode();
@@ -200,7 +201,7 @@ fn a_mixture_without_noise_acts_by_its_likeliest_component_row_by_row() {
 }
 
 #[test]
-fn torch_script_is_of_one_task() {
+fn torch_script_needs_a_policy_of_one_task() {
     let directory = tempfile::tempdir().unwrap();
     let joint = small("joint-get-up", &[]);
     for part in ["policy", "low-level"] {
@@ -214,12 +215,12 @@ fn torch_script_is_of_one_task() {
 }
 
 #[test]
-fn a_task_that_was_not_learnt_is_named_beside_those_that_were() {
+fn the_error_for_a_task_that_was_not_learnt_names_the_learnt_tasks() {
     let refused = exported("encoder:ball-catch", &small("joint-get-up", &[])).unwrap_err().to_string();
     assert!(refused.contains("`ball-catch`") && refused.contains("tracking, get-up"), "{refused}");
 }
 
-/// A file whose description, or tensors, somebody altered.
+/// A file whose description or tensors were altered.
 fn altered(
     description: impl FnOnce(&mut Value),
     tensors: impl FnOnce(&mut HashMap<String, (Vec<usize>, Vec<u8>)>),
@@ -241,13 +242,13 @@ fn refused(bytes: Vec<u8>) -> String {
 }
 
 #[test]
-fn a_description_that_lies_is_refused_by_its_field() {
+fn a_wrong_description_is_refused_with_the_name_of_the_field() {
     type Alteration = fn(&mut Value);
     let cases: [(&str, Alteration); 11] = [
         ("`format`", |spec| spec["format"] = 2.into()),
         ("`format`", |spec| *spec = Value::Null),
         ("no part `value`", |spec| spec["part"] = "value".into()),
-        ("no task `ball-catch`", |spec| spec["part"] = "policy:ball-catch".into()),
+        ("task `ball-catch` was not learnt", |spec| spec["part"] = "policy:ball-catch".into()),
         ("`experiment`", |spec| spec["experiment"] = "seed = -".into()),
         ("network.encoder", |spec| spec["experiment"] = "[network]\nencoder = []".into()),
         ("`inputs`", |spec| spec["inputs"][0]["entries"][0]["name"] = "joints_vel".into()),
@@ -263,18 +264,18 @@ fn a_description_that_lies_is_refused_by_its_field() {
 }
 
 #[test]
-fn no_networks_are_built_that_the_file_cannot_fill() {
+fn a_description_of_larger_networks_than_the_file_is_refused() {
     let grow = |spec: &mut Value| {
         let experiment =
             spec["experiment"].as_str().unwrap().replace("encoder = [8]", "encoder = [16384, 16384, 16384]");
         spec["experiment"] = experiment.into();
     };
     let said = refused(altered(grow, |_| ()));
-    assert!(said.contains("`experiment`") && said.contains("weights where the file holds"), "{said}");
+    assert!(said.contains("`experiment`") && said.contains("weights, but the file has"), "{said}");
 }
 
 #[test]
-fn tensors_that_do_not_fit_are_refused_by_name() {
+fn tensors_that_do_not_fit_are_refused_with_their_name() {
     let name = "low_level.head.bias".to_string();
     let missing = altered(|_| (), |tensors| drop(tensors.remove("low_level.head.bias")));
     assert!(refused(missing).contains("`low_level.head.bias` is missing"));
@@ -293,7 +294,7 @@ fn tensors_that_do_not_fit_are_refused_by_name() {
 }
 
 #[test]
-fn a_file_without_a_description_says_who_writes_one() {
+fn the_error_for_a_missing_description_names_the_command_that_writes_it() {
     let _guard = GENERATOR.lock().unwrap();
     let (store, ..) = policy(&small("tracking-mlp", &[]));
     let said = refused(to_safetensors(&store).unwrap());
@@ -302,14 +303,14 @@ fn a_file_without_a_description_says_who_writes_one() {
 
 proptest! {
     #[test]
-    fn no_damage_panics(damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..4), cut in any::<prop::sample::Index>()) {
+    fn damaged_files_do_not_panic(damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..4), cut in any::<prop::sample::Index>()) {
         static FILE: std::sync::OnceLock<Vec<u8>> = std::sync::OnceLock::new();
         let whole = FILE.get_or_init(|| altered(|_| (), |_| ()));
         let mut bytes = whole.clone();
-        // The head, where the description is: numbers that change are still numbers.
+        // Only the head with the description is damaged: changed numbers of tensors are still numbers.
         let head = bytes.len().min(16_384);
-        for (place, value) in &damage {
-            bytes[place.index(head)] = *value;
+        for (position, value) in &damage {
+            bytes[position.index(head)] = *value;
         }
         drop(Exported::read(bytes));
         prop_assert!(Exported::read(whole[..cut.index(whole.len())].to_vec()).is_err());
@@ -317,6 +318,6 @@ proptest! {
 }
 
 #[test]
-fn parts_are_spelt_as_the_command_line_spells_them() {
+fn a_part_in_json_is_spelt_as_on_the_command_line() {
     assert_eq!(serde_json::to_string(&"encoder:get-up".parse::<Part>().unwrap()).unwrap(), "\"encoder:get-up\"");
 }

@@ -1,4 +1,4 @@
-//! Diagonal Gaussians: closed forms and laws.
+//! Diagonal Gaussians: closed forms and properties.
 
 use comic_experiment::Prior;
 use comic_networks::DiagonalGaussian;
@@ -19,21 +19,21 @@ fn close(left: f64, right: f64) -> bool {
 }
 
 #[test]
-fn log_prob_of_the_standard_normal_at_zero_is_minus_half_ln_tau_a_dimension() {
+fn log_prob_of_the_standard_normal_at_zero_is_minus_half_ln_tau_per_dimension() {
     let log_prob =
         gaussian(&[0.0; 3], &[1.0; 3]).log_prob(&Tensor::zeros([1, 3], (tch::Kind::Float, tch::Device::Cpu)));
     assert!(close(number(&log_prob), -1.5 * std::f64::consts::TAU.ln()));
 }
 
 #[test]
-fn the_covariance_limit_is_on_variances_not_on_standard_deviations() {
-    // ln 2 + ½ (1/4 − 1); with σ where σ² belongs it would be ln 2 + ½ (1/2 − 1).
+fn kl_std_uses_variances_and_not_standard_deviations() {
+    // ln 2 + ½ (1/4 − 1). With σ in place of σ² it would be ln 2 + ½ (1/2 − 1).
     let kl = gaussian(&[0.0], &[2.0]).kl_std(&gaussian(&[0.0], &[1.0]));
     assert!(close(number(&kl), std::f64::consts::LN_2 - 0.375));
 }
 
 #[test]
-fn the_mean_limit_is_measured_in_the_behaviour_policys_deviations() {
+fn kl_mean_uses_the_standard_deviation_of_the_behaviour_policy() {
     let kl = gaussian(&[1.0], &[7.0]).kl_mean(&gaussian(&[0.0], &[0.5]));
     assert!(close(number(&kl), 2.0));
 }
@@ -68,7 +68,7 @@ fn parameters() -> impl Strategy<Value = (Vec<f32>, Vec<f32>, Vec<f32>, Vec<f32>
 
 proptest! {
     #[test]
-    fn every_kl_is_zero_to_itself_and_the_limits_are_so_exactly((mean, std, _, _) in parameters()) {
+    fn the_kl_to_itself_is_zero_and_exactly_zero_for_mean_and_std((mean, std, _, _) in parameters()) {
         let policy = gaussian(&mean, &std);
         prop_assert_eq!(number(&policy.kl_mean(&policy)), 0.0);
         prop_assert_eq!(number(&policy.kl_std(&policy)), 0.0);
@@ -84,7 +84,7 @@ proptest! {
     }
 
     #[test]
-    fn kl_to_the_standard_normal_is_the_general_formula((mean, std, _, _) in parameters()) {
+    fn kl_to_the_standard_normal_equals_the_general_formula((mean, std, _, _) in parameters()) {
         let policy = gaussian(&mean, &std);
         let standard = gaussian(&[0.0; 4], &[1.0; 4]);
         prop_assert!(close(number(&policy.kl_to_standard_normal()), number(&policy.kl(&standard))));
@@ -92,7 +92,7 @@ proptest! {
 
     #[test]
     fn entropy_is_minus_the_expected_log_prob((mean, std, _, _) in parameters()) {
-        // E[ln p] over a Gaussian needs only its mean and one deviation to each side: ln p is quadratic.
+        // ln p is quadratic, so E[ln p] is the mean of its values at one standard deviation to each side.
         let policy = gaussian(&mean, &std);
         let at = |side: f64| number(&policy.log_prob(&(&policy.mean + &policy.std * side)));
         let expected = -(at(1.0) + at(-1.0)) / 2.0;
@@ -100,7 +100,7 @@ proptest! {
     }
 
     #[test]
-    fn the_two_limits_add_up_to_the_whole_kl_where_only_one_differs((mean, std, other_mean, other_std) in parameters()) {
+    fn kl_mean_or_kl_std_is_the_whole_kl_if_only_one_parameter_differs((mean, std, other_mean, other_std) in parameters()) {
         let policy = gaussian(&mean, &std);
         let moved = gaussian(&other_mean, &std);
         prop_assert!(close(number(&moved.kl_mean(&policy)), number(&policy.kl(&moved))));

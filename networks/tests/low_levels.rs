@@ -1,12 +1,12 @@
-//! What the low levels are made of, against libtorch's own and against their laws.
+//! The low levels, compared with libtorch's own layers and with the properties that they must have.
 
-#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+#![allow(clippy::unwrap_used, reason = "helpers of tests may panic")]
 
 use comic_experiment::{LowLevelName, Lstm, Network, Primitives, TaskPart, TaskSpec, resolve};
 use comic_networks::{ActionDistribution, DiagonalGaussian, Policy, RecurrentState, Routing};
 use tch::{Device, Kind, Tensor, nn};
 
-/// libtorch's generator is the process's: tests that seed it take turns.
+/// libtorch has one generator per process, so tests that seed it must not run at the same time.
 static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
 fn random(size: &[i64]) -> Tensor {
@@ -25,7 +25,7 @@ fn policy(network: &Network) -> (nn::VarStore, Policy) {
 }
 
 #[test]
-fn a_mixtures_limits_bound_its_kl_from_above() {
+fn the_sum_of_a_mixtures_kl_parts_is_an_upper_bound_of_its_kl() {
     let _guard = GENERATOR.lock().unwrap();
     tch::manual_seed(1);
     let (rows, count, actions, samples) = (6, 4, 3, 10_000);
@@ -34,16 +34,16 @@ fn a_mixtures_limits_bound_its_kl_from_above() {
     let std = (random(&[rows, count, actions]) * 0.3).exp();
     let moved = DiagonalGaussian {
         mean: &mean + random(&[rows, count, actions]) * 0.3,
-        // KL_μ is measured in the old deviation, so the parts bound a Gaussian's KL where the new one is not narrower.
+        // KL_μ uses the old standard deviation, so the bound holds only if the new standard deviation is not smaller.
         std: &std * (random(&[rows, count, actions]).abs() * 0.3).exp(),
     };
     let old = ActionDistribution::Mixture { log_weights: weights(), components: DiagonalGaussian { mean, std } };
     let new = ActionDistribution::Mixture { log_weights: weights(), components: moved };
     let ActionDistribution::Mixture { log_weights, components } = &old else { unreachable!() };
     let chosen = log_weights.exp().multinomial(samples, true);
-    let place = chosen.unsqueeze(-1).expand([rows, samples, actions], false);
+    let index = chosen.unsqueeze(-1).expand([rows, samples, actions], false);
     let noise = random(&[rows, samples, actions]);
-    let drawn = components.mean.gather(1, &place, false).addcmul(&components.std.gather(1, &place, false), &noise);
+    let drawn = components.mean.gather(1, &index, false).addcmul(&components.std.gather(1, &index, false), &noise);
     let by_sample = |sample: i64| {
         let action = drawn.select(1, sample);
         old.log_prob(&action) - new.log_prob(&action)
@@ -57,7 +57,7 @@ fn a_mixtures_limits_bound_its_kl_from_above() {
 }
 
 #[test]
-fn an_lstm_is_libtorchs_own() {
+fn the_lstm_low_level_equals_libtorchs_lstm() {
     let _guard = GENERATOR.lock().unwrap();
     tch::manual_seed(2);
     let network = Network {
@@ -90,7 +90,7 @@ fn an_lstm_is_libtorchs_own() {
 }
 
 #[test]
-fn fixed_biases_set_primitives_apart_and_are_not_trained() {
+fn fixed_biases_separate_the_primitives_and_are_not_trained() {
     let _guard = GENERATOR.lock().unwrap();
     let network = |biases| Network {
         low_level: LowLevelName::Mixture,
@@ -103,8 +103,8 @@ fn fixed_biases_set_primitives_apart_and_are_not_trained() {
         let zeros = |width: i64| Tensor::zeros([1, width], (Kind::Float, Device::Cpu));
         let latent = network.latent.size as i64;
         let observation = policy.normalise(&zeros(7), &zeros(11), None, &Routing::single());
-        let memory = RecurrentState { state: &zeros(0), first: None };
-        let (mean, ..) = policy.act(&observation, &zeros(latent), &zeros(latent), memory).action.to_rows();
+        let recurrent = RecurrentState { state: &zeros(0), first: None };
+        let (mean, ..) = policy.act(&observation, &zeros(latent), &zeros(latent), recurrent).action.to_rows();
         let parameters: usize = store.trainable_variables().iter().map(Tensor::numel).sum();
         (Vec::<f32>::try_from(mean.view(-1)).unwrap(), parameters)
     };
@@ -113,14 +113,14 @@ fn fixed_biases_set_primitives_apart_and_are_not_trained() {
     let pose = [0.1f32, -0.2, 0.3];
     for (component, bias) in [-0.66f32, -0.33, 0.0, 0.33, 0.66].into_iter().enumerate() {
         for (dimension, start) in pose.into_iter().enumerate() {
-            let place = component * 3 + dimension;
-            assert!((apart[place] - start - bias).abs() < 1e-6 && (together[place] - start).abs() < 1e-6, "{apart:?}");
+            let index = component * 3 + dimension;
+            assert!((apart[index] - start - bias).abs() < 1e-6 && (together[index] - start).abs() < 1e-6, "{apart:?}");
         }
     }
 }
 
 #[test]
-fn a_product_starts_as_wide_as_it_is_told() {
+fn a_product_starts_with_the_initial_std() {
     let _guard = GENERATOR.lock().unwrap();
     let network = Network {
         low_level: LowLevelName::Product,
@@ -134,16 +134,16 @@ fn a_product_starts_as_wide_as_it_is_told() {
     let _ = tch::no_grad(|| gate.zero_());
     let zeros = |width: i64| Tensor::zeros([1, width], (Kind::Float, Device::Cpu));
     let observation = policy.normalise(&zeros(7), &zeros(11), None, &Routing::single());
-    let memory = RecurrentState { state: &zeros(0), first: None };
-    let acting = policy.act(&observation, &zeros(60), &zeros(60), memory);
-    // The least exponent shifts a half by a two-thousandth.
+    let recurrent = RecurrentState { state: &zeros(0), first: None };
+    let acting = policy.act(&observation, &zeros(60), &zeros(60), recurrent);
+    // The least exponent moves the initial exponents from 0.5 by 0.0005.
     assert!((acting.action.std() - 0.2).abs().max().double_value(&[]) < 2e-4);
     let pose = Tensor::from_slice(&[0.1f32, -0.2, 0.3]);
     assert!((acting.action.mean() - pose).abs().max().double_value(&[]) < 1e-6);
 }
 
 #[test]
-fn a_product_of_next_to_nothing_is_finite_and_one_of_many_is_no_narrower_than_the_floor() {
+fn the_std_of_a_product_is_bounded_above_and_below() {
     let _guard = GENERATOR.lock().unwrap();
     let network = Network { low_level: LowLevelName::Product, min_std: 0.1, ..Network::default() };
     let (store, policy) = policy(&network);
@@ -154,8 +154,8 @@ fn a_product_of_next_to_nothing_is_finite_and_one_of_many_is_no_narrower_than_th
         let heads = variables.get_mut("low_level.primitives.head_biases").unwrap();
         let _ = tch::no_grad(|| heads.narrow(2, 3, 3).fill_(raw));
         let observation = policy.normalise(&zeros(7), &zeros(11), None, &Routing::single());
-        let memory = RecurrentState { state: &zeros(0), first: None };
-        policy.act(&observation, &zeros(60), &zeros(60), memory).action
+        let recurrent = RecurrentState { state: &zeros(0), first: None };
+        policy.act(&observation, &zeros(60), &zeros(60), recurrent).action
     };
     let wide = act(-200.0, 1.0);
     wide.log_prob(&zeros(3)).sum(Kind::Float).backward();
@@ -170,7 +170,7 @@ fn a_product_of_next_to_nothing_is_finite_and_one_of_many_is_no_narrower_than_th
 
 /// CoMic supplement 2.3: "low-level architectures with a similar number of parameters as the MLP low-level".
 #[test]
-fn the_papers_low_levels_are_of_similar_size() {
+fn the_papers_low_levels_have_similar_sizes() {
     let _guard = GENERATOR.lock().unwrap();
     let spec = TaskSpec { proprioception: 205, task: 620, action: 56, ..TaskSpec::default() };
     let size = |preset: &str| {

@@ -1,6 +1,6 @@
-//! Parameters over a wire: what goes in comes out, and nothing hostile gets in.
+//! Parameters as bytes: they are read as they were written, and invalid documents are refused.
 
-#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+#![allow(clippy::unwrap_used, reason = "helpers of tests may panic")]
 
 use std::collections::HashMap;
 
@@ -67,7 +67,7 @@ fn refused(bytes: &[u8]) -> Error {
 }
 
 #[test]
-fn what_goes_out_comes_in() {
+fn parameters_are_read_as_they_were_written() {
     let (from, mut to) = (store(), store());
     let bytes = to_safetensors(&from).unwrap();
     from_safetensors(&mut to, &bytes).unwrap();
@@ -75,13 +75,13 @@ fn what_goes_out_comes_in() {
 }
 
 #[test]
-fn a_missing_parameter_is_named() {
+fn the_error_names_a_missing_parameter() {
     let bytes = altered(|entries| drop(entries.remove("low_level.head.bias")));
     assert!(matches!(refused(&bytes), Error::Missing { name } if name == "low_level.head.bias"));
 }
 
 #[test]
-fn an_unknown_parameter_is_named() {
+fn the_error_names_an_unknown_parameter() {
     let bytes = altered(|entries| {
         let entry = entries.remove("low_level.head.bias").unwrap();
         let copy = Entry { kind: entry.kind, shape: entry.shape.clone(), bytes: entry.bytes.clone() };
@@ -92,13 +92,13 @@ fn an_unknown_parameter_is_named() {
 }
 
 #[test]
-fn a_shape_of_as_many_elements_is_still_another_shape() {
+fn another_shape_with_the_same_number_of_elements_is_refused() {
     let bytes = altered(|entries| entries.get_mut("low_level.layers.0.weight").unwrap().shape.reverse());
     assert!(matches!(refused(&bytes), Error::Shape { name, .. } if name == "low_level.layers.0.weight"));
 }
 
 #[test]
-fn integers_are_no_parameters() {
+fn integer_parameters_are_refused() {
     let bytes = altered(|entries| entries.get_mut("low_level.head.bias").unwrap().kind = Dtype::I32);
     assert!(matches!(refused(&bytes), Error::Kind { .. }));
 }
@@ -114,19 +114,19 @@ fn infinities_and_nans_are_refused() {
 }
 
 #[test]
-fn a_normaliser_that_divides_by_zero_is_refused() {
+fn a_normaliser_with_a_standard_deviation_of_zero_is_refused() {
     let bytes = altered(|entries| entries.get_mut("normaliser.task_std").unwrap().bytes.fill(0));
     assert!(matches!(refused(&bytes), Error::Number { .. }));
 }
 
 proptest! {
     #[test]
-    fn any_bytes_are_refused_without_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+    fn random_bytes_are_refused_without_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         prop_assert!(from_safetensors(&mut store(), &bytes).is_err());
     }
 
     #[test]
-    fn a_cut_document_is_refused(cut in 1usize..1000) {
+    fn a_truncated_document_is_refused(cut in 1usize..1000) {
         let bytes = to_safetensors(&store()).unwrap();
         let length = bytes.len().saturating_sub(cut);
         prop_assert!(from_safetensors(&mut store(), &bytes[..length]).is_err());

@@ -1,6 +1,6 @@
-//! The policy and the value function: where they start, and that acting and learning are one function.
+//! Policy and value function: their initial values, and that acting and learning give the same numbers.
 
-#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+#![allow(clippy::unwrap_used, reason = "helpers of tests may panic")]
 
 use comic_experiment::{Mlp, Network, TaskPart, TaskSpec};
 use comic_networks::{
@@ -44,7 +44,7 @@ fn policy(network: &Network, seed: i64, pose: &[f32]) -> (nn::VarStore, Policy) 
     (store, policy)
 }
 
-/// libtorch's generator is the process's: tests that seed it take turns.
+/// libtorch has one generator per process, so tests that seed it must not run at the same time.
 static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
 fn inputs() -> [Tensor; 4] {
@@ -54,7 +54,7 @@ fn inputs() -> [Tensor; 4] {
     })
 }
 
-/// Acts without memory; `B` rows, or unrolls of rows.
+/// Acts without a recurrent state, on `[B, ·]` or `[B, T, ·]`.
 fn pass(policy: &Policy, observation: &NormalisedObservation, previous: &Tensor, noise: &Tensor) -> Pass {
     let state = Tensor::zeros([previous.size()[0], 0], (Kind::Float, Device::Cpu));
     let acting = policy.act(observation, previous, noise, RecurrentState { state: &state, first: None });
@@ -63,7 +63,7 @@ fn pass(policy: &Policy, observation: &NormalisedObservation, previous: &Tensor,
     Pass { latent: acting.latent, posterior: acting.latent_posterior.unwrap(), action: DiagonalGaussian { mean, std } }
 }
 
-/// What the MLP gives: one Gaussian, and a latent.
+/// The output of a policy with the MLP: one Gaussian, and a latent.
 struct Pass {
     latent: Tensor,
     posterior: DiagonalGaussian,
@@ -87,7 +87,7 @@ fn acting_and_learning_give_the_same_numbers_bit_for_bit() {
 }
 
 #[test]
-fn rows_of_an_unroll_are_the_same_rows() {
+fn unrolls_and_rows_give_the_same_numbers() {
     let (_store, policy) = policy(&network(), 1, &[0.0; 3]);
     let [proprioception, task, previous, noise] = inputs();
     let unrolled = |tensor: &Tensor| tensor.reshape([4, 6, -1]);
@@ -97,7 +97,7 @@ fn rows_of_an_unroll_are_the_same_rows() {
 }
 
 #[test]
-fn the_latent_is_its_mean_plus_its_deviation_times_the_noise() {
+fn the_latent_is_its_mean_plus_its_standard_deviation_times_the_noise() {
     let (_store, policy) = policy(&network(), 1, &[0.0; 3]);
     let acting = act(&policy);
     let [.., noise] = inputs();
@@ -106,7 +106,7 @@ fn the_latent_is_its_mean_plus_its_deviation_times_the_noise() {
 }
 
 #[test]
-fn the_actions_log_probability_sends_its_gradient_into_the_encoder() {
+fn the_gradient_of_the_actions_log_probability_reaches_the_encoder() {
     let (store, policy) = policy(&network(), 1, &[0.0; 3]);
     let action = Tensor::ones([ROWS, 3], (Kind::Float, Device::Cpu));
     act(&policy).action.log_prob(&action).sum(Kind::Float).backward();
@@ -122,7 +122,7 @@ fn the_actions_log_probability_sends_its_gradient_into_the_encoder() {
 }
 
 #[test]
-fn the_mean_starts_at_the_pose_and_both_deviations_at_their_initial_values() {
+fn mean_and_standard_deviations_start_at_their_initial_values() {
     let mut network = Network { policy_head_scale: 0.0, initial_std: 0.1, ..network() };
     network.latent.initial_std = 0.3;
     let (mut store, policy) = policy(&network, 1, &[0.5, -0.25, 0.0]);
@@ -130,7 +130,8 @@ fn the_mean_starts_at_the_pose_and_both_deviations_at_their_initial_values() {
     let pose = Tensor::from_slice(&[0.5f32, -0.25, 0.0]).expand([ROWS, 3], false);
     assert_eq!(acting.action.mean, pose);
     assert!((&acting.action.std - 0.1).abs().max().double_value(&[]) < 1e-6);
-    // The encoder's head is not scaled down; without its weights the latent's deviation is the initial one too.
+    // The weights of the encoder's head are not scaled down. Without them the latent has its initial standard
+    // deviation.
     let mut weights = store.variables().remove("encoder.tracking.head.weight").unwrap();
     let _ = tch::no_grad(|| weights.zero_());
     assert!((act(&policy).posterior.std - 0.3).abs().max().double_value(&[]) < 1e-6);
@@ -138,7 +139,7 @@ fn the_mean_starts_at_the_pose_and_both_deviations_at_their_initial_values() {
 }
 
 #[test]
-fn deviations_never_fall_below_their_floor() {
+fn standard_deviations_are_never_below_their_minimum() {
     let mut network = network();
     (network.min_std, network.latent.min_std) = (0.02, 0.05);
     let (store, policy) = policy(&network, 1, &[0.0; 3]);
@@ -148,26 +149,26 @@ fn deviations_never_fall_below_their_floor() {
     }
     let acting = act(&policy);
     for (std, floor) in [(acting.action.std, 0.02), (acting.posterior.std, 0.05)] {
-        assert!((std - floor).abs().max().double_value(&[]) < 1e-8, "the floor is {floor}");
+        assert!((std - floor).abs().max().double_value(&[]) < 1e-8, "the minimum is {floor}");
     }
 }
 
 #[test]
-fn a_seed_decides_every_initial_parameter() {
+fn the_seed_determines_every_initial_parameter() {
     let bytes = |seed| comic_networks::to_safetensors(&policy(&network(), seed, &[0.0; 3]).0).unwrap();
     assert_eq!(bytes(3), bytes(3));
     assert_ne!(bytes(3), bytes(4));
 }
 
 #[test]
-fn a_pose_of_another_body_is_refused() {
+fn a_pose_with_the_wrong_length_is_refused() {
     let store = nn::VarStore::new(Device::Cpu);
     let error = Policy::new(&store.root(), &spec(), &network(), &[0.0; 4]).unwrap_err();
     assert!(matches!(error, Error::Length { expected: 3, found: 4, .. }));
 }
 
 #[test]
-fn the_normaliser_travels_is_not_trained_and_clamps() {
+fn the_normaliser_is_a_parameter_is_not_trained_and_clamps() {
     let network = Network { normaliser_steps: 1, ..network() };
     let (store, policy) = policy(&network, 1, &[0.0; 3]);
     let before = act(&policy).action.mean;
@@ -183,7 +184,7 @@ fn the_normaliser_travels_is_not_trained_and_clamps() {
     let trained: i64 = store.trainable_variables().iter().map(|tensor| tensor.numel() as i64).sum();
     let all: i64 = store.variables().values().map(|tensor| tensor.numel() as i64).sum();
     assert_eq!(all - trained, 2 * (7 + 11));
-    // Proprioception is now divided by the floor of the deviation; only the clamp keeps 1e3 and 1e6 the same.
+    // Proprioception is now divided by the least standard deviation; 1e3 and 1e6 are equal only because of the clamp.
     let [_, task, previous, noise] = inputs();
     let far = |value: f64| {
         let proprioception = Tensor::full([ROWS, 7], value, (Kind::Float, Device::Cpu));
@@ -215,7 +216,7 @@ fn statistics_that_do_not_fit_change_nothing() {
 }
 
 #[test]
-fn the_value_has_one_output_per_reward_term_and_sees_the_clip() {
+fn the_value_has_one_output_per_reward_term_and_depends_on_the_clip() {
     let (_store, policy) = policy(&network(), 1, &[0.0; 3]);
     let store = nn::VarStore::new(Device::Cpu);
     let value = {
@@ -234,7 +235,7 @@ fn the_value_has_one_output_per_reward_term_and_sees_the_clip() {
 }
 
 #[test]
-fn what_is_seen_changes_what_is_done_and_is_learnt_from() {
+fn the_image_changes_the_latent_and_its_encoder_gets_gradients() {
     let spec = TaskSpec { image: 64 * 64 * 3, ..spec() };
     let network = Network { image_features: 6, ..network() };
     let store = nn::VarStore::new(Device::Cpu);
@@ -255,15 +256,16 @@ fn what_is_seen_changes_what_is_done_and_is_learnt_from() {
     let (dark, bright) = (latent(0), latent(255));
     assert!((&dark - &bright).abs().max().double_value(&[]) > 1e-3);
     bright.sum(Kind::Float).backward();
-    let sight: Vec<_> = store.variables().into_iter().filter(|(name, _)| name.starts_with("image_encoder.")).collect();
-    assert_eq!(sight.len(), 8, "two convolutions, a linear layer and a norm, each with weight and bias");
-    for (name, parameter) in sight {
+    let encoder: Vec<_> =
+        store.variables().into_iter().filter(|(name, _)| name.starts_with("image_encoder.")).collect();
+    assert_eq!(encoder.len(), 8, "two convolutions, a linear layer and a norm, each with weight and bias");
+    for (name, parameter) in encoder {
         assert!(parameter.grad().abs().sum(Kind::Float).double_value(&[]) > 0.0, "{name} gets no gradient");
     }
 }
 
 #[test]
-fn an_image_is_seen_alike_in_a_batch_of_unrolls_and_as_a_row() {
+fn an_image_gives_the_same_numbers_in_unrolls_and_in_rows() {
     let spec = TaskSpec { image: 64 * 64 * 3, ..spec() };
     let store = nn::VarStore::new(Device::Cpu);
     let policy = {

@@ -1,4 +1,4 @@
-//! One wheel from the user's package index, by pip.
+//! Fetches one wheel from the user's package index with pip.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -9,9 +9,9 @@ use anyhow::{Context, Result, bail};
 
 use crate::interrupt::Interrupt;
 use crate::progress::Progress;
-use crate::wheels::Wheel;
+use crate::wheel::Wheel;
 
-/// What the pinned wheels are built for, whatever the user's own Python is.
+/// The platform of the pinned wheels. The user's own Python may be another one.
 const PLATFORM: [&str; 9] = [
     "--platform=manylinux_2_31_x86_64",
     "--platform=manylinux_2_28_x86_64",
@@ -40,7 +40,7 @@ pub(crate) fn require_pip() -> Result<()> {
     }
 }
 
-/// Fails with the remedy unless the Python that the learner embeds is the one torch_xla was built for.
+/// Fails with the remedy unless the Python that the learner embeds is the one for which torch_xla was built.
 pub(crate) fn require_embeddable() -> Result<()> {
     let python = std::env::var("PYO3_PYTHON").unwrap_or_else(|_| "python3".into());
     let question = "import os, sys, sysconfig; print(*sys.version_info[:2], \
@@ -52,14 +52,13 @@ pub(crate) fn require_embeddable() -> Result<()> {
         return Ok(());
     }
     bail!(
-        "XLA takes Python 3.11 with its shared library, and {python} is not that (version, and whether libpython3.11.so is \
-         there: {answer}); install one (Debian 12: apt install python3 libpython3.11-dev) and name it by PYO3_PYTHON"
+        "XLA needs Python 3.11 with its shared library; {python} is another one (its version, and whether libpython3.11.so \
+         exists: {answer}); install Python 3.11 (Debian 12: apt install python3 libpython3.11-dev) and name it by PYO3_PYTHON"
     )
 }
 
-/// Fetches `wheel` into `directory` under the user's own pip configuration; pip verifies the hash.
-///
-/// A wheel that lies there whole already is kept.
+/// Fetches `wheel` into `directory` with the user's own pip configuration. pip verifies the hash, and keeps a complete
+/// wheel that is already there.
 pub(crate) fn fetch(wheel: &Wheel, directory: &Path, interrupt: &Interrupt) -> Result<PathBuf> {
     let temporary = directory.join("unfinished");
     let _ = fs::remove_dir_all(&temporary);
@@ -91,8 +90,8 @@ fn pip(
         .arg(directory)
         .arg("--requirement")
         .arg(requirements)
-        // pip collects what it downloads in its temporary directory: there the bytes can be counted, and the disk
-        // that must have room for them is the one .deps lies on.
+        // pip downloads into its temporary directory. There the bytes can be counted, and they need space on the disk of
+        // .deps only.
         .env("TMPDIR", temporary)
         .stdin(Stdio::null())
         .stdout(output.try_clone()?)
@@ -106,7 +105,7 @@ fn pip(
         if interrupt.requested() {
             let _ = child.kill();
             let _ = child.wait();
-            bail!("interrupted; `cargo xtask setup` goes on at {}", wheel.name);
+            bail!("interrupted; `cargo xtask setup` continues at {}", wheel.name);
         }
         progress.set(size_below(temporary));
         std::thread::sleep(Duration::from_millis(100));
@@ -118,32 +117,32 @@ fn pip(
     Ok(())
 }
 
-/// pip's own words and what can be done about them.
+/// pip's message, and the remedy.
 fn explain(wheel: &Wheel, output: &str, log: &Path) -> String {
     let remedy = if output.contains("DO NOT MATCH THE HASHES") {
-        "the index serves another file than the pinned one: check which index pip is configured to use (python3 -m pip config list)"
+        "the index serves a file that differs from the pinned one: check which index pip is configured to use (python3 -m pip config list)"
     } else if output.contains("No space left on device") {
-        "the disk is full: set-up needs about 1.5 GB while it runs and 0.5 GB after it, 8 GB and 7 GB with --cuda or --xla"
+        "the disk is full: set-up needs about 1.5 GB while it runs and 0.5 GB afterwards; 8 GB and 7 GB with --cuda or --xla"
     } else if ["NewConnectionError", "ConnectTimeout", "NameResolution", "ProxyError", "Max retries", "ReadTimeout"]
         .iter()
         .any(|sign| output.contains(sign))
     {
         "the package index cannot be reached: check the network or pip's index and proxy settings (python3 -m pip config list); \
-         offline, PIP_FIND_LINKS=DIRECTORY PIP_NO_INDEX=1 takes the wheels from a directory. What is whole already is kept"
+         offline, PIP_FIND_LINKS=DIRECTORY PIP_NO_INDEX=1 takes the wheels from a directory. Complete wheels are kept"
     } else if output.contains("No matching distribution") || output.contains("Could not find a version") {
         "the package index cannot be reached or does not have this wheel: check the network and pip's configuration \
          (python3 -m pip config list); offline, PIP_FIND_LINKS=DIRECTORY PIP_NO_INDEX=1 takes the wheels from a directory"
     } else if output.contains("no such option") {
         "this pip is too old: python3 -m pip install --upgrade pip"
     } else {
-        "see the whole output in the file"
+        "the file has the whole output"
     };
     let last: Vec<&str> = output.lines().filter(|line| !line.trim().is_empty()).collect();
     let last = last[last.len().saturating_sub(6)..].join("\n  ");
     format!("cannot fetch {} {}: {remedy} ({})\n  {last}", wheel.name, wheel.version, log.display())
 }
 
-/// The file pip left for `wheel`.
+/// The file that pip wrote for `wheel`.
 fn find(wheel: &Wheel, directory: &Path) -> Result<PathBuf> {
     let prefix = format!("{}-{}-", wheel.name.replace('-', "_"), wheel.version);
     let files = fs::read_dir(directory).with_context(|| format!("cannot read {}", directory.display()))?;
@@ -154,10 +153,10 @@ fn find(wheel: &Wheel, directory: &Path) -> Result<PathBuf> {
             path.extension().is_some_and(|extension| extension == "whl")
                 && path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(&prefix))
         })
-        .with_context(|| format!("pip left no {prefix}*.whl in {}", directory.display()))
+        .with_context(|| format!("pip wrote no {prefix}*.whl into {}", directory.display()))
 }
 
-/// Bytes of all files below `directory`, as far as they can be seen while pip works there.
+/// Bytes of all files below `directory`. pip works there, so files may appear and disappear.
 fn size_below(directory: &Path) -> u64 {
     let Ok(entries) = fs::read_dir(directory) else { return 0 };
     entries
@@ -173,12 +172,12 @@ fn size_below(directory: &Path) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wheels::WHEELS;
+    use crate::wheels::wheels;
 
     #[test]
-    fn a_failed_download_names_the_wheel_the_remedy_and_pips_last_words() {
-        let message =
-            explain(&WHEELS[0], "Collecting mujoco\nERROR: No matching distribution found", Path::new("pip.log"));
+    fn a_failed_download_names_the_wheel_the_remedy_and_the_end_of_pips_output() {
+        let mujoco = wheels().next().unwrap();
+        let message = explain(mujoco, "Collecting mujoco\nERROR: No matching distribution found", Path::new("pip.log"));
         assert!(message.contains("mujoco 3.17.0"), "{message}");
         assert!(message.contains("PIP_FIND_LINKS"), "{message}");
         assert!(message.ends_with("No matching distribution found"), "{message}");

@@ -1,4 +1,4 @@
-//! From a wheel to files in `.deps`: first into a directory beside, then each into its place.
+//! Unpacks a wheel into `.deps`: first into a temporary directory, then every file to its path.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -10,11 +10,11 @@ use zip::ZipArchive;
 
 use crate::interrupt::Interrupt;
 use crate::progress::Progress;
-use crate::wheels::{Extent, Wheel};
+use crate::wheel::{Extent, Wheel};
 
-/// Takes what is wanted of `wheel`, lying at `archive`, into `dependencies`; returns the files with their sizes.
+/// Unpacks the wanted files of `wheel` from `archive` into `dependencies`, and returns them with their sizes.
 ///
-/// Until every file is written nothing in `dependencies` has changed except the directory `unfinished`.
+/// Until every file is written, only the directory `unfinished` changes in `dependencies`.
 pub(crate) fn extract(
     wheel: &Wheel,
     archive: &Path,
@@ -27,7 +27,7 @@ pub(crate) fn extract(
     let mut files = unpack(wheel, archive, &unfinished, extent, interrupt)?;
     for &(link, target) in wheel.links {
         make_link(&unfinished.join(link), target)?;
-        let size = fs::metadata(unfinished.join(link)).with_context(|| format!("{link} points nowhere"))?.len();
+        let size = fs::metadata(unfinished.join(link)).with_context(|| format!("{link} points to no file"))?.len();
         files.insert(link.into(), size);
     }
     for file in files.keys() {
@@ -48,7 +48,7 @@ fn unpack(
 ) -> Result<BTreeMap<PathBuf, u64>> {
     let file = File::open(archive).with_context(|| format!("cannot open {}", archive.display()))?;
     let mut zip = ZipArchive::new(std::io::BufReader::with_capacity(1 << 20, file))
-        .with_context(|| format!("{} is no wheel", archive.display()))?;
+        .with_context(|| format!("{} is not a wheel", archive.display()))?;
     let mut wanted = Vec::new();
     let mut total = 0;
     for index in 0..zip.len() {
@@ -62,7 +62,7 @@ fn unpack(
         }
     }
     if wanted.is_empty() {
-        bail!("{} holds nothing of what is wanted of {}", archive.display(), wheel.name);
+        bail!("{} contains none of the files wanted from {}", archive.display(), wheel.name);
     }
     let mut progress = Progress::start(format!("unpacking {} {}", wheel.name, wheel.version), total);
     let mut done = 0;
@@ -89,7 +89,7 @@ fn copy(from: &mut impl Read, to: &Path, interrupt: &Interrupt, mut copied: impl
         file.write_all(&buffer[..count]).with_context(|| format!("cannot write {}", to.display()))?;
         copied(count as u64);
         if interrupt.requested() {
-            bail!("interrupted; `cargo xtask setup` goes on where it was");
+            bail!("interrupted; `cargo xtask setup` continues with this wheel");
         }
     }
 }
@@ -109,9 +109,9 @@ fn make_link(link: &Path, target: &str) -> Result<()> {
     fs::copy(link.with_file_name(target), link).map(drop).with_context(|| format!("cannot copy {}", link.display()))
 }
 
-/// Moves a finished file into its place.
-// The workspace disallows bare renames because they are not durable. Here they need not be: after a power cut a stamp
-// that does not agree with the files makes set-up take the wheel again.
+/// Moves a complete file to its path.
+// The workspace disallows bare renames because they are not durable. Here they need not be: after a power cut the stamp
+// differs from the files, and set-up unpacks the wheel again.
 #[allow(clippy::disallowed_methods)]
 pub(crate) fn rename(from: &Path, to: &Path) -> Result<()> {
     fs::rename(from, to).with_context(|| format!("cannot move {} to {}", from.display(), to.display()))

@@ -1,4 +1,4 @@
-//! Ctrl-C, SIGTERM and a closed terminal, as a flag to look at.
+//! Ctrl-C, SIGTERM and a closed terminal as a counter.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -8,20 +8,20 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::emulate_default_handler;
 
-/// How often this program has been asked to stop. While one lives the signals count and do not kill; when the last
-/// clone is gone they kill again.
+/// How often this program has been asked to stop. While an `Interrupt` exists the signals are counted and do not kill.
+/// After the last clone is dropped they kill again.
 #[derive(Clone, Default)]
 pub struct Interrupt(Arc<AtomicUsize>);
 
 impl Interrupt {
-    /// Takes the signals over.
+    /// Installs the signal handlers.
     ///
     /// # Errors
     /// When the system refuses.
     pub fn install() -> Result<Self> {
         let count = Arc::new(AtomicUsize::new(0));
         let shared = Arc::downgrade(&count);
-        let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot take over signals")?;
+        let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot handle signals")?;
         std::thread::spawn(move || {
             for signal in signals.forever() {
                 match shared.upgrade() {
@@ -43,7 +43,7 @@ impl Interrupt {
         self.0.load(Ordering::Relaxed)
     }
 
-    /// Whether there was any.
+    /// Whether there was a request.
     pub fn requested(&self) -> bool {
         self.count() > 0
     }

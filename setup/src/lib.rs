@@ -1,18 +1,23 @@
-//! Set-up: the native libraries and the humanoid, from pinned wheels into a directory, `.deps` where nobody says otherwise.
+//! Set-up: copies the native libraries and the humanoid from pinned wheels into a directory, by default `.deps`.
 //!
-//! Each wheel is fetched, unpacked beside its place, moved into it, and stamped last; so set-up can be stopped at any
-//! moment and goes on at the first wheel that is not whole.
+//! Each wheel is fetched, unpacked into a temporary directory, moved to its place, and stamped last. So set-up can be
+//! stopped at any moment, and continues at the first incomplete wheel.
 //!
-//! It is a crate of its own, which `cargo xtask setup` calls, so that an image's layer with the libraries is made anew
-//! when a pin changes and not with every other change of this workspace.
+//! This is a crate of its own, which `cargo xtask setup` calls. So the Docker layer with the libraries is rebuilt when a
+//! pin changes, and not with every other change of the workspace.
+//!
+//! # Layout
+//! - `wheel` is what set-up knows of a wheel, `wheels` the pinned ones; `provided` are libraries that the user has.
+//! - `download` fetches a wheel, `extract` unpacks it, `stamp` records that it is complete.
+//! - `progress` and `interrupt` are the terminal's side.
 
-mod accelerators;
 mod download;
 mod extract;
 mod interrupt;
 mod progress;
 mod provided;
 mod stamp;
+mod wheel;
 mod wheels;
 
 use std::fs::{self, File};
@@ -21,24 +26,25 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 
 use stamp::Stamp;
-use wheels::{Extent, Part, Wheel, wheels};
+use wheel::{Extent, Part, Wheel};
+use wheels::wheels;
 
 pub use interrupt::Interrupt;
 pub use progress::on_terminal;
 
-/// What is taken.
+/// How much is set up.
 #[derive(clap::Args, Debug, Default)]
 pub struct Options {
-    /// All of libtorch and NVIDIA's libraries (3.7 GB to fetch, 6 GB on disk) instead of what a CPU needs (1 GB, 0.5 GB)
+    /// Fetch all of libtorch and NVIDIA's libraries (3.7 GB, 6 GB on disk), not only what a CPU needs (1 GB, 0.5 GB on disk)
     #[arg(long)]
     cuda: bool,
-    /// The same and torch_xla, for TPUs (4.0 GB to fetch, 7 GB on disk); it takes Python 3.11 with its shared library
+    /// Fetch the same and torch_xla, for TPUs (4.0 GB, 7 GB on disk); it needs Python 3.11 with its shared library
     #[arg(long)]
     xla: bool,
 }
 
 impl Options {
-    /// As much as the update on XLA takes.
+    /// What the update on XLA needs.
     pub fn xla() -> Self {
         Self { cuda: false, xla: true }
     }
@@ -52,10 +58,10 @@ impl Options {
     }
 }
 
-/// Brings the directory `dependencies` to what the pins say; under a second when it is already.
+/// Brings the directory `dependencies` to the state that the pins describe. Takes less than a second if it is already.
 ///
 /// # Errors
-/// A machine without wheels, an index that does not answer, a full disk, Ctrl-C: each with its remedy.
+/// A platform without wheels, an index that does not answer, a full disk, Ctrl-C: each with its remedy.
 pub fn run(options: &Options, dependencies: &Path) -> Result<()> {
     let extent = options.extent();
     if extent == Extent::Xla {
@@ -66,15 +72,15 @@ pub fn run(options: &Options, dependencies: &Path) -> Result<()> {
     if extent > Extent::Cpu {
         let variable = |name: &str| std::env::var_os(name).map(Into::into);
         if let (Extent::Xla, Some(own)) = (extent, provided::directory(Part::Libtorch, dependencies, variable)?) {
-            bail!("XLA takes the libtorch that set-up fetches, and LIBTORCH is {}: unset it", own.display());
+            bail!("XLA needs the libtorch that set-up fetches, but LIBTORCH is {}: unset it", own.display());
         }
-        join(dependencies)?;
+        link_packages(dependencies)?;
     }
     let mut missing = Vec::new();
     for wheel in wheels().filter(|wheel| wheel.from <= extent) {
         match provided::directory(wheel.part, dependencies, |name| std::env::var_os(name).map(Into::into))? {
             Some(own) => announce(wheel, &own),
-            None if !is_whole(wheel, dependencies, extent) => missing.push(wheel),
+            None if !is_complete(wheel, dependencies, extent) => missing.push(wheel),
             None => {}
         }
     }
@@ -85,7 +91,7 @@ pub fn run(options: &Options, dependencies: &Path) -> Result<()> {
     download::require_pip()?;
     let interrupt = Interrupt::install()?;
     for wheel in missing {
-        take(wheel, dependencies, extent, &interrupt)
+        fetch_and_extract(wheel, dependencies, extent, &interrupt)
             .with_context(|| format!("set-up of {} {} in {}", wheel.name, wheel.version, dependencies.display()))?;
     }
     let _ = fs::remove_dir_all(dependencies.join("wheels"));
@@ -93,10 +99,10 @@ pub fn run(options: &Options, dependencies: &Path) -> Result<()> {
     Ok(())
 }
 
-/// libtorch finds NVIDIA's libraries where a wheel of torch does, beside its directory; and Python imports the libtorch that
-/// programs link.
+/// Makes two links: libtorch looks for NVIDIA's libraries beside its own directory, as in an installed torch; and Python
+/// imports the libtorch that programs link.
 #[cfg(unix)]
-fn join(dependencies: &Path) -> Result<()> {
+fn link_packages(dependencies: &Path) -> Result<()> {
     fs::create_dir_all(dependencies.join("python")).context("cannot make the directory of Python's packages")?;
     for (link, target) in [("nvidia", "python/nvidia"), ("python/torch", "../libtorch")] {
         let link = dependencies.join(link);
@@ -109,13 +115,13 @@ fn join(dependencies: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Without links there is no set-up for more than a CPU; there are no wheels for such a platform either.
+/// A platform without symbolic links has no wheels for accelerators either.
 #[cfg(not(unix))]
-fn join(_dependencies: &Path) -> Result<()> {
+fn link_packages(_dependencies: &Path) -> Result<()> {
     Ok(())
 }
 
-/// One set-up at a time; a second one waits and then finds the work done.
+/// Allows one set-up at a time. A second one waits, and then finds the work done.
 fn lock(dependencies: &Path) -> Result<File> {
     let path = dependencies.join("lock");
     let file = File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
@@ -139,8 +145,8 @@ fn announce(wheel: &Wheel, own: &Path) {
     }
 }
 
-/// A CUDA libtorch serves CPU runs too, so it is not trimmed by a later set-up without the flag.
-fn is_whole(wheel: &Wheel, dependencies: &Path, extent: Extent) -> bool {
+/// A libtorch with CUDA also serves a CPU, so a later set-up without the flag keeps it.
+fn is_complete(wheel: &Wheel, dependencies: &Path, extent: Extent) -> bool {
     let enough = |stamp: &Stamp| stamp.cuda || extent == Extent::Cpu;
     Stamp::read(dependencies, wheel.name)
         .is_some_and(|stamp| stamp.sha256 == wheel.sha256 && enough(&stamp) && stamp.agrees(dependencies))
@@ -152,7 +158,7 @@ fn require_platform(missing: &[&Wheel]) -> Result<()> {
         return Ok(());
     }
     bail!(
-        "set-up knows wheels for Linux on x86_64 only, and this is {} on {} ({} missing); provide MuJoCo 3.17.0 and libtorch \
+        "set-up has wheels for Linux on x86_64 only, and this is {} on {} ({} missing); provide MuJoCo 3.17.0 and libtorch \
          2.9.0 yourself and name them by MUJOCO_DYNAMIC_LINK_DIR and LIBTORCH",
         std::env::consts::OS,
         std::env::consts::ARCH,
@@ -160,7 +166,7 @@ fn require_platform(missing: &[&Wheel]) -> Result<()> {
     )
 }
 
-fn take(wheel: &Wheel, dependencies: &Path, extent: Extent, interrupt: &Interrupt) -> Result<()> {
+fn fetch_and_extract(wheel: &Wheel, dependencies: &Path, extent: Extent, interrupt: &Interrupt) -> Result<()> {
     if let Some(old) = Stamp::read(dependencies, wheel.name) {
         old.remove(dependencies, wheel.name)?;
     }
@@ -175,39 +181,41 @@ fn take(wheel: &Wheel, dependencies: &Path, extent: Extent, interrupt: &Interrup
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wheels::WHEELS;
+    fn pinned(index: usize) -> &'static Wheel {
+        wheels().nth(index).unwrap()
+    }
 
     fn stamped(cuda: bool) -> tempfile::TempDir {
         let dependencies = tempfile::tempdir().unwrap();
         fs::create_dir_all(dependencies.path().join("mujoco")).unwrap();
         fs::write(dependencies.path().join("mujoco/a"), "abc").unwrap();
-        let stamp = Stamp { sha256: WHEELS[0].sha256.into(), cuda, files: [("mujoco/a".into(), 3)].into() };
-        stamp.write(dependencies.path(), WHEELS[0].name).unwrap();
+        let stamp = Stamp { sha256: pinned(0).sha256.into(), cuda, files: [("mujoco/a".into(), 3)].into() };
+        stamp.write(dependencies.path(), pinned(0).name).unwrap();
         dependencies
     }
 
     #[test]
-    fn a_wheel_is_whole_only_with_its_stamp_and_every_file_in_its_size() {
+    fn a_wheel_is_complete_only_with_its_stamp_and_every_file_in_its_size() {
         let dependencies = stamped(false);
-        assert!(is_whole(&WHEELS[0], dependencies.path(), Extent::Cpu));
-        assert!(!is_whole(&WHEELS[1], dependencies.path(), Extent::Cpu), "another wheel has no stamp");
+        assert!(is_complete(pinned(0), dependencies.path(), Extent::Cpu));
+        assert!(!is_complete(pinned(1), dependencies.path(), Extent::Cpu), "another wheel has no stamp");
         fs::write(dependencies.path().join("mujoco/a"), "ab").unwrap();
-        assert!(!is_whole(&WHEELS[0], dependencies.path(), Extent::Cpu), "a file was cut short");
+        assert!(!is_complete(pinned(0), dependencies.path(), Extent::Cpu), "a file was cut short");
         fs::remove_file(dependencies.path().join("mujoco/a")).unwrap();
-        assert!(!is_whole(&WHEELS[0], dependencies.path(), Extent::Cpu), "a file is gone");
+        assert!(!is_complete(pinned(0), dependencies.path(), Extent::Cpu), "a file is gone");
     }
 
     #[test]
-    fn asking_for_cuda_after_a_trimmed_set_up_takes_the_wheel_again_and_not_the_other_way_round() {
-        assert!(!is_whole(&WHEELS[0], stamped(false).path(), Extent::Cuda));
-        assert!(is_whole(&WHEELS[0], stamped(true).path(), Extent::Cpu));
+    fn a_set_up_with_cuda_replaces_one_for_a_cpu_and_not_the_other_way_round() {
+        assert!(!is_complete(pinned(0), stamped(false).path(), Extent::Cuda));
+        assert!(is_complete(pinned(0), stamped(true).path(), Extent::Cpu));
     }
 
     #[test]
-    fn what_was_stamped_goes_with_its_stamp() {
+    fn files_are_removed_with_their_stamp() {
         let dependencies = stamped(false);
-        Stamp::read(dependencies.path(), WHEELS[0].name).unwrap().remove(dependencies.path(), WHEELS[0].name).unwrap();
+        Stamp::read(dependencies.path(), pinned(0).name).unwrap().remove(dependencies.path(), pinned(0).name).unwrap();
         assert!(!dependencies.path().join("mujoco/a").exists());
-        assert!(Stamp::read(dependencies.path(), WHEELS[0].name).is_none());
+        assert!(Stamp::read(dependencies.path(), pinned(0).name).is_none());
     }
 }

@@ -1,16 +1,16 @@
-//! Set-up alone, for the image: `cargo run --package comic-setup` fills `.deps` as `cargo xtask setup` does.
+//! Set-up alone, for the Docker image: `cargo run --package comic-setup` fills `.deps` as `cargo xtask setup` does.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
 
-/// Fetches libmujoco, libtorch and the humanoid.
+/// Fetch libmujoco, libtorch and the humanoid
 #[derive(Parser)]
 struct Arguments {
     #[command(flatten)]
     options: comic_setup::Options,
-    /// Where they are put
+    /// Directory for them
     #[arg(long, value_name = "DIR", default_value = ".deps")]
     into: PathBuf,
 }

@@ -1,14 +1,14 @@
-//! How far a long step is: a bar on a terminal, a line now and then elsewhere.
+//! Progress of a long step: a bar on a terminal, a line every few seconds elsewhere.
 
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-/// Seconds between two lines where there is no terminal.
+/// Time between two lines where there is no terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
-/// Whether a person is watching.
+/// Whether standard error is a terminal.
 pub fn on_terminal() -> bool {
     std::io::stderr().is_terminal()
 }
@@ -41,7 +41,7 @@ impl Progress {
         Self { label, total, bar, last_line: Instant::now() }
     }
 
-    /// Says that `position` of the total bytes are done.
+    /// Shows that `position` of the total bytes are done.
     pub(crate) fn set(&mut self, position: u64) {
         let position = position.min(self.total);
         if let Some(bar) = &self.bar {
@@ -61,7 +61,7 @@ impl Progress {
     }
 }
 
-/// `bytes` for a person.
+/// `bytes` as text, in MiB.
 pub(crate) fn mebibytes(bytes: u64) -> String {
     let mebibyte = 1u64 << 20;
     format!("{:.1} MiB", bytes as f64 / mebibyte as f64)

@@ -1,16 +1,16 @@
-//! Native libraries the user has already, named by LIBTORCH, MUJOCO_DYNAMIC_LINK_DIR or COMIC_DM_CONTROL_DIR.
+//! Libraries that the user provides, named by LIBTORCH, MUJOCO_DYNAMIC_LINK_DIR or COMIC_DM_CONTROL_DIR.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
 
-use crate::wheels::Part;
+use crate::wheel::Part;
 
-/// The directory the user provides for `part`, checked; `None` when set-up must provide it.
+/// The directory that the user provides for `part`, checked. `None` when set-up must provide it.
 ///
-/// `.cargo/config.toml` sets the same variables to places inside `dependencies` unless they are set already, so only a
-/// value that points elsewhere is the user's.
+/// `.cargo/config.toml` sets the same variables to paths inside `dependencies` unless they are set. So only a path outside
+/// it is the user's.
 pub(crate) fn directory(
     part: Part,
     dependencies: &Path,
@@ -20,7 +20,7 @@ pub(crate) fn directory(
         Part::Mujoco => "MUJOCO_DYNAMIC_LINK_DIR",
         Part::Libtorch => "LIBTORCH",
         Part::DmControl => "COMIC_DM_CONTROL_DIR",
-        // It has to be the torch_xla that was built for this libtorch.
+        // Only the pinned torch_xla was built for the pinned libtorch.
         Part::Python => return Ok(None),
     };
     let Some(directory) = variable(name).filter(|directory| !directory.as_os_str().is_empty()) else { return Ok(None) };
@@ -33,7 +33,7 @@ pub(crate) fn directory(
         Part::DmControl => require(&directory, &["humanoid_CMU_V2020.xml", "humanoid_CMU_V2019.xml", "arena.xml"]),
         Part::Python => Ok(()),
     } {
-        bail!("{name}={}: {problem}; mend it, or unset {name} and set-up provides its own", directory.display());
+        bail!("{name}={}: {problem}; correct it, or unset {name} and set-up provides its own", directory.display());
     }
     Ok(Some(directory))
 }
@@ -44,7 +44,7 @@ fn absolute(path: &Path) -> PathBuf {
 
 fn require(directory: &Path, files: &[&str]) -> Result<(), String> {
     match files.iter().find(|file| !directory.join(file).exists()) {
-        Some(missing) => Err(format!("there is no {missing} in it")),
+        Some(missing) => Err(format!("it has no {missing}")),
         None => Ok(()),
     }
 }
@@ -54,14 +54,14 @@ fn check_mujoco(directory: &Path) -> Result<(), String> {
     let real = absolute(&directory.join("libmujoco.so"));
     let name = real.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     match name.strip_prefix("libmujoco.so.") {
-        Some(version) if version != "3.17.0" => Err(format!("it holds MuJoCo {version}, and 3.17.0 is needed")),
+        Some(version) if version != "3.17.0" => Err(format!("it has MuJoCo {version}; 3.17.0 is needed")),
         _ => Ok(()),
     }
 }
 
 fn check_libtorch(directory: &Path) -> Result<(), String> {
     require(directory, &["lib/libtorch_cpu.so", "lib/libc10.so", "lib/libtorch.so", "include/torch"])?;
-    // `build-version` is the zip's own record; a wheel's or an installed package's is `version.py`.
+    // The zip archive has `build-version`; a wheel and an installed package have `version.py`.
     let record = fs::read_to_string(directory.join("build-version"))
         .or_else(|_| fs::read_to_string(directory.join("version.py")))
         .unwrap_or_default();
@@ -70,7 +70,7 @@ fn check_libtorch(directory: &Path) -> Result<(), String> {
         None => line.starts_with(|first: char| first.is_ascii_digit()).then(|| line.to_owned()),
     });
     match version {
-        Some(version) if !version.starts_with("2.9.") => Err(format!("it holds libtorch {version}, and 2.9 is needed")),
+        Some(version) if !version.starts_with("2.9.") => Err(format!("it has libtorch {version}; 2.9 is needed")),
         _ => Ok(()),
     }
 }
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cargo_config_sets_is_not_the_users() {
+    fn a_directory_that_cargos_configuration_sets_is_not_the_users() {
         let root = tempfile::tempdir().unwrap();
         let dependencies = root.path().join(".deps");
         let set = dependencies.join("libtorch");
@@ -103,21 +103,21 @@ mod tests {
     }
 
     #[test]
-    fn a_users_libtorch_of_the_right_version_is_respected() {
+    fn a_users_libtorch_of_the_right_version_is_used() {
         let own = libtorch("2.9.0+cpu\n");
         let found = directory(Part::Libtorch, Path::new(".deps"), |_| Some(own.path().into())).unwrap();
         assert_eq!(found.as_deref(), Some(own.path()));
     }
 
     #[test]
-    fn a_users_libtorch_of_another_version_is_refused_by_name() {
+    fn a_users_libtorch_of_another_version_is_refused_with_its_variable() {
         let own = libtorch("2.4.1+cpu\n");
         let error = directory(Part::Libtorch, Path::new(".deps"), |_| Some(own.path().into())).unwrap_err().to_string();
         assert!(error.contains("LIBTORCH=") && error.contains("2.4.1"), "{error}");
     }
 
     #[test]
-    fn a_users_directory_without_the_library_is_refused_by_name() {
+    fn a_users_directory_without_the_library_is_refused_with_its_variable() {
         let own = tempfile::tempdir().unwrap();
         let error = directory(Part::Mujoco, Path::new(".deps"), |_| Some(own.path().into())).unwrap_err().to_string();
         assert!(error.contains("MUJOCO_DYNAMIC_LINK_DIR=") && error.contains("libmujoco.so"), "{error}");

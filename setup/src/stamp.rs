@@ -1,4 +1,4 @@
-//! What tells a wheel that was taken whole from one that was not.
+//! Stamps, which tell a complete wheel from an incomplete one.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -7,14 +7,15 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
 
-/// The record of one wheel: written after everything else, so that where it stands and agrees the wheel is whole.
+/// The record of one wheel, written after all of its files. A wheel is complete if its stamp exists and agrees with the
+/// files.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Stamp {
     /// SHA-256 of the wheel.
     pub(crate) sha256: String,
-    /// Whether all of it was kept (`--cuda`, `--xla`).
+    /// Whether all of its files were taken (`--cuda`, `--xla`).
     pub(crate) cuda: bool,
-    /// Every file taken, relative to `.deps`, with its size in bytes.
+    /// Every file, relative to `.deps`, with its size in bytes.
     pub(crate) files: BTreeMap<PathBuf, u64>,
 }
 
@@ -23,19 +24,19 @@ impl Stamp {
         dependencies.join("stamps").join(format!("{wheel}.json"))
     }
 
-    /// The stamp of `wheel`, if there is a readable one.
+    /// The stamp of `wheel`, if a readable one exists.
     pub(crate) fn read(dependencies: &Path, wheel: &str) -> Option<Self> {
         serde_json::from_str(&fs::read_to_string(Self::path(dependencies, wheel)).ok()?).ok()
     }
 
-    /// Whether every file still stands there with its size.
+    /// Whether every file exists with its size.
     pub(crate) fn agrees(&self, dependencies: &Path) -> bool {
         self.files
             .iter()
             .all(|(file, size)| fs::metadata(dependencies.join(file)).is_ok_and(|found| found.len() == *size))
     }
 
-    /// Writes the stamp; the wheel counts as whole from then on.
+    /// Writes the stamp, which makes the wheel complete.
     pub(crate) fn write(&self, dependencies: &Path, wheel: &str) -> Result<()> {
         let path = Self::path(dependencies, wheel);
         let unfinished = path.with_extension("unfinished");
@@ -45,7 +46,7 @@ impl Stamp {
         crate::extract::rename(&unfinished, &path)
     }
 
-    /// Takes the wheel's files away, its stamp first.
+    /// Removes the wheel's stamp, then its files.
     pub(crate) fn remove(self, dependencies: &Path, wheel: &str) -> Result<()> {
         let path = Self::path(dependencies, wheel);
         fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;

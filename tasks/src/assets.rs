@@ -1,4 +1,4 @@
-//! Where dm_control's XML files lie.
+//! Finds dm_control's XML files.
 
 use std::path::{Path, PathBuf};
 
@@ -6,8 +6,8 @@ use crate::error::Error;
 
 const VARIABLE: &str = "COMIC_DM_CONTROL_DIR";
 
-/// The directory of dm_control's XML files: the environment variable `COMIC_DM_CONTROL_DIR` when the program runs,
-/// else its value when the program was built, else `.deps/dm_control`.
+/// The directory of dm_control's XML files. It is the value of the environment variable `COMIC_DM_CONTROL_DIR` now, else its
+/// value when the program was built, else `.deps/dm_control`.
 pub(crate) fn directory() -> Result<PathBuf, Error> {
     let candidates = [
         std::env::var_os(VARIABLE).map(PathBuf::from),
@@ -25,7 +25,7 @@ pub(crate) fn directory() -> Result<PathBuf, Error> {
     Err(Error::Asset { file: "arena.xml".into(), tried: tried.join(", ") })
 }
 
-/// The path of one of its files.
+/// The path of a file in this directory.
 pub(crate) fn file(directory: &Path, name: &str) -> Result<PathBuf, Error> {
     let path = directory.join(name);
     if path.is_file() {

@@ -1,200 +1,206 @@
-//! One simulation of the tracking task.
+//! What actors, evaluation and rendering know of any task: [`Task`], [`Environment`] and [`Simulated`].
 
+use std::fmt::Debug;
+use std::ops::Range;
 use std::sync::Arc;
 
-use comic_clips::pose_to_action;
+use comic_experiment::TaskSpec;
 use mujoco_rs::prelude::MjModel;
-use rand::SeedableRng;
-use rand_pcg::Pcg64;
 
 use crate::error::Error;
-use crate::observation::{ALL, Body, Observation, View};
-use crate::physics::{Data, Simulation, is_healthy};
-use crate::reference::Reference;
-use crate::tracking::TrackingTask;
-use crate::{Environment, Episode, Outcome, Scenery, Simulated, Step, control, reward};
+use crate::physics::Simulation;
 
-/// An environment of a [`TrackingTask`]. Owns its simulation state and its random numbers, shares all else.
-#[derive(Debug)]
-pub struct TrackingEnvironment {
-    task: Arc<TrackingTask>,
-    data: Data,
-    random: Pcg64,
-    clip: usize,
-    /// Frames counted from the sub-range's first: where the episode started, where it is.
-    start: usize,
-    frame: usize,
-    /// `qpos` one control step ago.
-    previous: [f64; 63],
-    error: f64,
-    diverged: bool,
+/// The largest number of reward terms of any task.
+pub const MAX_REWARD_TERMS: usize = 5;
+
+/// What all environments of a task share. It never changes.
+pub trait Task: Debug + Send + Sync {
+    /// Sizes and names for networks, wire and learner.
+    fn spec(&self) -> &TaskSpec;
+
+    /// Where episodes can start: frames of clips. In a task without clips, a start is the seed of an episode.
+    fn starts(&self) -> &[ClipStarts];
+
+    /// Length of a control step, s.
+    fn control_timestep(&self) -> f64;
+
+    /// A new environment after its first reset. `seed` decides all its random numbers.
+    ///
+    /// # Errors
+    /// The arena cannot be built.
+    fn environment(self: Arc<Self>, seed: u64) -> Result<Box<dyn Simulated>, Error>;
 }
 
-impl TrackingEnvironment {
-    pub(crate) fn new(task: Arc<TrackingTask>, seed: u64) -> Self {
-        let data = task.models.data();
-        let random = Pcg64::seed_from_u64(seed);
-        let mut environment =
-            Self { task, data, random, clip: 0, start: 0, frame: 0, previous: [0.0; 63], error: 0.0, diverged: false };
-        environment.reset();
-        environment
-    }
-
-    /// dm_control's whole observation dictionary, in its order, in full precision; for comparisons.
-    pub fn dictionary(&self) -> Vec<(&'static str, Vec<f64>)> {
-        let (view, steps) = (self.view(), self.task.config.reference_steps.len());
-        let value = |one: Observation| {
-            let mut value = vec![0.0; one.size(&self.task.walker, steps)];
-            one.write(&view, &mut value);
-            (one.name(), value)
-        };
-        ALL.iter().map(|one| value(*one)).collect()
-    }
-
-    /// The current frame of the reference, counted from the first of the clip's range.
-    pub fn frame(&self) -> usize {
-        self.frame
-    }
-
-    /// ε after the last reset or step.
-    pub fn termination_error(&self) -> f64 {
-        self.error
-    }
-
-    fn place(&mut self, clip: usize, frame: usize) {
-        let Self { task, data, .. } = self;
-        let reference = &task.references[clip];
-        let preset = task.config.preset_actuators.then(|| pose_to_action(reference.joints(frame)));
-        let activation = preset.as_ref().map(<[f64; 56]>::as_slice).filter(|_| task.walker.activations == 56);
-        task.models.place(data, &reference.qpos(frame), &reference.qvel(frame), activation);
-        self.error = reward::termination_error(task.config.termination_error, &task.walker, data, reference, frame);
-        self.previous.copy_from_slice(data.qpos());
-        (self.clip, self.start, self.frame, self.diverged) = (clip, frame, frame, false);
-    }
-
-    fn diverge(&mut self) -> Step {
-        self.diverged = true;
-        Step::DIVERGED
-    }
-
-    fn reference(&self) -> &Reference {
-        &self.task.references[self.clip]
-    }
-
-    fn view(&self) -> View<'_> {
-        View {
-            body: Body { walker: &self.task.walker, data: &self.data },
-            reference: self.reference(),
-            steps: &self.task.config.reference_steps,
-            previous: &self.previous,
-            clip: self.clip,
-            start: self.start,
-            frame: self.frame,
-        }
-    }
+/// The start frames of one clip.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ClipStarts {
+    /// Index of the clip.
+    pub clip: usize,
+    /// Frames at which an episode can start, counted from the clip's first frame. All are equally likely.
+    pub frames: Range<usize>,
+    /// Probability that an episode starts at one of these frames.
+    pub probability: f64,
 }
 
-impl Environment for TrackingEnvironment {
+/// One environment of any task, as a policy uses it.
+pub trait Environment: Debug + Send {
+    /// Draws a start and begins an episode there. The first observation is then ready.
+    fn reset(&mut self);
+
+    /// Begins an episode at one of the task's [starts](Task::starts). In tracking `start` is a frame, counted from the clip's
+    /// first frame. In other tasks it is the seed of the episode.
+    ///
+    /// # Errors
+    /// [`Error::Start`]: the task does not have this start.
+    fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error>;
+
+    /// One control step. `action` is in control order; −1 … 1 is a joint's range, and MuJoCo clips larger values. The step
+    /// diverges when a value is not finite or the length is wrong.
+    fn step(&mut self, action: &[f32]) -> Step;
+
+    /// Writes the observation after the last reset or step; zeros after a step that diverged.
+    ///
+    /// # Panics
+    /// The slices are shorter than [`TaskSpec`] says.
+    fn observe(&self, proprioception: &mut [f32], task: &mut [f32]);
+
+    /// Draws the camera image after the last reset or step: [`TaskSpec::image`] bytes, rows from the top, red, green, blue.
+    /// The image is black after a step that diverged. A task without images does nothing.
+    ///
+    /// # Errors
+    /// [`Error::Graphics`]: there is no OpenGL.
+    fn draw(&mut self, image: &mut [u8]) -> Result<(), Error>;
+
+    /// The start of the current episode.
+    fn episode(&self) -> Episode;
+
+    /// Writes the servo action: the action whose servos aim at the pose of the next reference frame. It is a demonstration
+    /// and a baseline. In a task without a reference the servos aim at the current pose.
+    fn servo_action(&self, action: &mut [f32]);
+}
+
+impl<E: Environment + ?Sized> Environment for Box<E> {
     fn reset(&mut self) {
-        let (clip, start) = self.task.starts.draw(&mut self.random);
-        let first = self.task.references[clip].first;
-        self.place(clip, start.saturating_sub(first));
+        (**self).reset();
     }
 
     fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error> {
-        let (first, frames) = self
-            .task
-            .references
-            .get(clip)
-            .map_or((0, 0), |reference| (reference.first, reference.last_step(self.task.look_ahead)));
-        match start.checked_sub(first) {
-            Some(frame) if frame < frames => {
-                self.place(clip, frame);
-                Ok(())
-            }
-            _ => Err(Error::Start { clip, start, first, frames }),
-        }
+        (**self).reset_to(clip, start)
     }
 
     fn step(&mut self, action: &[f32]) -> Step {
-        self.step_control(&control(action))
+        (**self).step(action)
     }
 
     fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
-        if self.diverged {
-            proprioception.fill(0.0);
-            task.fill(0.0);
-            return;
-        }
-        let view = self.view();
-        view.body.write_proprioception(proprioception);
-        let (mut rest, steps) = (task, self.task.config.reference_steps.len());
-        for one in &self.task.observations {
-            let (place, after) = rest.split_at_mut(one.size(&self.task.walker, steps));
-            one.write(&view, place);
-            rest = after;
-        }
+        (**self).observe(proprioception, task);
     }
 
-    fn draw(&mut self, _: &mut [u8]) -> Result<(), Error> {
-        Ok(())
+    fn draw(&mut self, image: &mut [u8]) -> Result<(), Error> {
+        (**self).draw(image)
     }
 
     fn episode(&self) -> Episode {
-        let reference = self.reference();
-        let steps_left = reference.last_step(self.task.look_ahead).saturating_sub(self.start);
-        Episode { clip: self.clip, start: reference.first + self.start, steps_left, task: 0 }
+        (**self).episode()
     }
 
     fn servo_action(&self, action: &mut [f32]) {
-        let target = pose_to_action(self.reference().joints(self.frame + 1));
-        for (place, value) in action.iter_mut().zip(target) {
-            *place = value as f32;
+        (**self).servo_action(action);
+    }
+}
+
+/// An environment that is a MuJoCo simulation. Comparisons, benchmarks and rendering need more of it than acting does.
+pub trait Simulated: Environment {
+    /// One control step with the control in double precision; see [`Environment::step`].
+    ///
+    /// A caller may step after the episode's end; the physics continues. After a divergence every step reports a divergence
+    /// until the next reset.
+    fn step_control(&mut self, control: &[f64; 56]) -> Step;
+
+    /// The compiled model. Other simulations may share it.
+    fn model(&self) -> Arc<MjModel>;
+
+    /// The simulation.
+    fn simulation(&self) -> &Simulation;
+
+    /// The simulation, for drawing: MuJoCo computes some values when it draws.
+    fn simulation_mut(&mut self) -> &mut Simulation;
+
+    /// What a picture shows besides the simulation.
+    fn scenery(&self) -> Scenery;
+}
+
+/// What a picture shows besides the simulation. Only the task knows it.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Scenery {
+    /// The reference's generalised coordinates: position (m, world) and quaternion of the root, joints (rad).
+    pub reference: Option<Vec<f64>>,
+    /// Position of the target on the floor: x and y, m.
+    pub target: Option<[f64; 2]>,
+}
+
+impl Scenery {
+    /// Moves the target's mark to the target. MuJoCo moves it back in its next step. The mark has no contacts and no sensor
+    /// reads it, so this does not change the physics.
+    pub(crate) fn mark_target(&self, site: Option<usize>, simulation: &mut Simulation) {
+        let mark = site.and_then(|site| simulation.site_xpos_mut().get_mut(site));
+        if let (Some(mark), Some([x, y])) = (mark, self.target) {
+            *mark = [x, y, 0.0];
         }
     }
 }
 
-impl Simulated for TrackingEnvironment {
-    /// References stay at the clip's last frame when somebody steps on after its end.
-    fn step_control(&mut self, control: &[f64; 56]) -> Step {
-        if self.diverged || !control.iter().all(|value| value.is_finite()) {
-            return self.diverge();
-        }
-        self.previous.copy_from_slice(self.data.qpos());
-        self.task.models.step(&mut self.data, control);
-        self.frame += 1;
-        if !is_healthy(&self.data) {
-            return self.diverge();
-        }
-        let Self { task, data, frame, .. } = self;
-        let (reference, config) = (&task.references[self.clip], &task.config);
-        self.error = reward::termination_error(config.termination_error, &task.walker, data, reference, *frame);
-        let reward_terms =
-            reward::terms(&task.walker, data, reference, *frame, self.error, config.termination_threshold);
-        let outcome = if self.error > config.termination_threshold {
-            Outcome::Terminated
-        } else if *frame >= reference.last_step(task.look_ahead) || data.time() >= config.time_limit {
-            Outcome::Truncated
-        } else {
-            Outcome::Running
-        };
-        let discount = if outcome == Outcome::Terminated { 0.0 } else { 1.0 };
-        Step { reward_terms, discount, outcome, head_height: task.walker.head_height(data) }
-    }
+/// An action in double precision; NaN for an action of the wrong length.
+pub(crate) fn control(action: &[f32]) -> [f64; 56] {
+    <&[f32; 56]>::try_from(action).map_or([f64::NAN; 56], |action| action.map(f64::from))
+}
 
-    fn model(&self) -> Arc<MjModel> {
-        self.task.models.shared()
-    }
+/// The result of one control step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Step {
+    /// The reward's terms with their weights, in the order of the task's names. Their sum is the reward.
+    pub reward_terms: [f64; MAX_REWARD_TERMS],
+    /// 0 when the episode ended in failure, else 1.
+    pub discount: f64,
+    /// Whether the episode ended, and why.
+    pub outcome: Outcome,
+    /// Height of the head above the floor's plane, m; 0 after a divergence. Only people use it, no learner does.
+    pub head_height: f64,
+}
 
-    fn simulation(&self) -> &Simulation {
-        &self.data
-    }
+impl Step {
+    /// The result of a step that diverged.
+    pub(crate) const DIVERGED: Self =
+        Self { reward_terms: [0.0; MAX_REWARD_TERMS], discount: 0.0, outcome: Outcome::Diverged, head_height: 0.0 };
 
-    fn simulation_mut(&mut self) -> &mut Simulation {
-        &mut self.data
+    /// The reward: the sum of its terms.
+    pub fn reward(&self) -> f64 {
+        self.reward_terms.iter().sum()
     }
+}
 
-    fn scenery(&self) -> Scenery {
-        Scenery { reference: Some(self.reference().qpos(self.frame).to_vec()), target: None }
-    }
+/// The state of an episode after a step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// The episode continues.
+    Running,
+    /// The humanoid failed; in tracking the termination error is above the threshold. Discount 0.
+    Terminated,
+    /// The clip or the time limit ended the episode. Discount 1: later rewards still count.
+    Truncated,
+    /// MuJoCo gave a warning, or a number is not finite. Reward 0, discount 0.
+    Diverged,
+}
+
+/// The start of an episode.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Episode {
+    /// Index of the clip.
+    pub clip: usize,
+    /// The start frame, counted from the clip's first frame.
+    pub start: usize,
+    /// Control steps from the start to the clip's end: the longest possible episode without a time limit.
+    pub steps_left: usize,
+    /// The place of the task among the tasks of [`TaskSpec`].
+    pub task: usize,
 }

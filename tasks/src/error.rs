@@ -1,11 +1,13 @@
-//! What can go wrong in building a task.
+//! What can go wrong when a task is built or drawn.
 
-/// Errors of the tasks. Nothing that happens in an episode is an error: a diverged simulation is an
-/// [`Outcome`](crate::Outcome).
+use comic_experiment::TRACKING_OBSERVATIONS;
+use mujoco_rs::prelude::MjEditError;
+
+/// Errors of the tasks. Events of an episode are not errors: a divergence is an `Outcome`.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// One of dm_control's XML files is not where it should be.
+    /// One of dm_control's XML files is missing.
     #[error("{file}: not found in {tried}; run `cargo xtask setup`, or set COMIC_DM_CONTROL_DIR to its directory")]
     Asset {
         /// The file's name.
@@ -16,7 +18,7 @@ pub enum Error {
     /// MuJoCo refused the humanoid.
     #[error("{doing}: {reason}; the XML must be that of dm_control 1.0.49, run `cargo xtask setup`")]
     Model {
-        /// What was being done.
+        /// The step that failed.
         doing: &'static str,
         /// MuJoCo's reason.
         reason: String,
@@ -24,22 +26,22 @@ pub enum Error {
     /// A clip could not be read.
     #[error(transparent)]
     Clips(#[from] comic_clips::Error),
-    /// Nothing can be drawn.
+    /// There is no OpenGL.
     #[error(
-        "no OpenGL to draw with ({reason}); install Debian's libegl1 and libgl1-mesa-dri, which draw without a display, \
-         or leave images out with --set gaps.corridor.vision=off or walls.corridor.vision=off"
+        "no OpenGL to draw with ({reason}); install Debian's libegl1 and libgl1-mesa-dri, which need no display, \
+         or turn images off with --set gaps.corridor.vision=off or walls.corridor.vision=off"
     )]
     Graphics {
-        /// What MuJoCo or EGL said.
+        /// The message of MuJoCo or EGL.
         reason: String,
     },
     /// No window can be opened.
     #[error(
-        "no display to open a window on ({reason}); start it in a graphical session, or film with `comic-actor render`, \
-         which needs none"
+        "no display for a window ({reason}); start the program in a graphical session, or make a film with \
+         `comic-actor render`, which needs no display"
     )]
     Display {
-        /// What the window's library said.
+        /// The message of the window's library.
         reason: String,
     },
     /// There is nothing to track.
@@ -69,16 +71,35 @@ pub enum Error {
         /// `tracking.min_steps`.
         min_steps: usize,
     },
-    /// A start that is not in the clip.
-    #[error("clip {clip}, frame {start}: not a frame of the clip's range; {frames} frames from {first} on are")]
+    /// A start that the task does not have.
+    #[error(
+        "clip {clip}: no episode starts at frame {start}; the clip has {frames} start frames from frame {first} on"
+    )]
     Start {
         /// Index of the clip.
         clip: usize,
         /// The frame asked for.
         start: usize,
-        /// First frame of the range.
+        /// The first start frame.
         first: usize,
-        /// Frames in the range from which at least one step can be made.
+        /// Number of start frames.
         frames: usize,
     },
+}
+
+/// MuJoCo refused an edit of the model while `doing` this.
+pub(crate) fn refused(doing: &'static str) -> impl Fn(MjEditError) -> Error {
+    move |error| Error::Model { doing, reason: error.to_string() }
+}
+
+/// The XML does not have an element that the edits need.
+pub(crate) fn missing(kind: &'static str, name: &str) -> Error {
+    Error::Model { doing: "editing the humanoid", reason: format!("the XML has no {kind} `{name}`") }
+}
+
+/// The tracking task has no observation with this name.
+pub(crate) fn unknown_observation(name: String) -> Error {
+    let likeness = |known: &str| strsim::jaro_winkler(known, &name);
+    let nearest = TRACKING_OBSERVATIONS.into_iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)));
+    Error::Observation { nearest: nearest.unwrap_or_default().to_string(), name }
 }

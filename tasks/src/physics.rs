@@ -1,4 +1,4 @@
-//! Stepping MuJoCo the way dm_control does.
+//! Steps MuJoCo as dm_control does.
 
 use std::sync::Arc;
 
@@ -11,11 +11,14 @@ use crate::error::Error;
 pub type Simulation = MjData<Arc<MjModel>>;
 pub(crate) type Data = Simulation;
 
-/// Beyond this MuJoCo calls a number bad (`mjMAXVAL`).
+/// Length of one physics step, s (`DEFAULT_PHYSICS_TIMESTEP` of `reference_pose/tracking.py`).
+pub(crate) const PHYSICS_TIMESTEP: f64 = 0.005;
+
+/// MuJoCo calls a larger number bad (`mjMAXVAL`).
 const MAX_VALUE: f64 = 1e10;
 
-/// The compiled model, twice: as it is, and with the servos off, as dm_control computes an episode's first
-/// observation. Shared by all simulations.
+/// The compiled model, with the servos on and with the servos off. dm_control computes an episode's first observation with
+/// the servos off. All simulations share both.
 #[derive(Debug)]
 pub(crate) struct Models {
     active: Arc<MjModel>,
@@ -31,28 +34,28 @@ impl Models {
         Self { active: Arc::new(model), passive: Arc::new(passive), substeps }
     }
 
-    /// Seconds of a control step.
+    /// Length of a control step, s.
     pub(crate) fn control_timestep(&self) -> f64 {
         self.substeps as f64 * self.active.opt().timestep
     }
 
-    /// A new simulation state; its arena is 18 MB of which the operating system commits what is used.
+    /// A new simulation state. It reserves 18 MB, of which the operating system commits only the used part.
     pub(crate) fn data(&self) -> Data {
         Data::new(Arc::clone(&self.active))
     }
 
-    /// The model of the simulations.
+    /// The model with the servos on.
     pub(crate) fn shared(&self) -> Arc<MjModel> {
         Arc::clone(&self.active)
     }
 
-    /// Lets a simulation go on in this model; `false`, and it stays where it is, when the two are laid out differently.
+    /// Moves a simulation to this model. When the memory layouts differ, it returns `false` and changes nothing.
     pub(crate) fn take_over(&self, data: &mut Data) -> bool {
         data.try_swap_model(Arc::clone(&self.active)).is_ok()
     }
 
-    /// Puts everything into a state and computes everything that follows from it without servo forces.
-    /// Filter states are 0 unless given.
+    /// Sets the state and computes everything that follows from it without servo forces. The default of `activation`, the
+    /// filter states, is 0.
     pub(crate) fn place(&self, data: &mut Data, qpos: &[f64], qvel: &[f64], activation: Option<&[f64]>) {
         data.reset();
         data.qpos_mut().copy_from_slice(qpos);
@@ -60,16 +63,16 @@ impl Models {
         if let Some(activation) = activation {
             data.act_mut().copy_from_slice(activation);
         }
-        // The two models differ in one option, so the exchange cannot fail.
+        // The two models differ in one option only, so this cannot fail.
         if let Ok(active) = data.try_swap_model(Arc::clone(&self.passive)) {
             data.forward();
             let _ = data.try_swap_model(active);
         }
     }
 
-    /// One control step with the control held. Bitwise equal to dm_control's `mj_step2, mj_step1` loop, and cheaper
-    /// than `mj_step` alone: the first half of the first step is the `mj_forward` that ended the last control step.
-    /// That one is there for the accelerometer, touch and torque sensors.
+    /// One control step with a constant control. It is equal bit for bit to dm_control's loop of `mj_step2, mj_step1`, and
+    /// faster than `mj_step` alone: the `mj_forward` at the end of the last control step is the first half of the first
+    /// step. The accelerometer, touch and torque sensors need this `mj_forward`.
     pub(crate) fn step(&self, data: &mut Data, control: &[f64; 56]) {
         data.ctrl_mut().copy_from_slice(control);
         data.step2();
@@ -80,8 +83,8 @@ impl Models {
     }
 }
 
-/// Whether the simulation since its last reset is free of MuJoCo warnings, and every number is a sane one.
-/// MuJoCo looks at positions and velocities only before a step, hence the second look here.
+/// Whether MuJoCo gave no warning since the simulation's last reset, and all coordinates, velocities and accelerations are
+/// small enough. MuJoCo itself checks positions and velocities only before a step, so they are checked again here.
 pub(crate) fn is_healthy(data: &Data) -> bool {
     let sane = |values: &[f64]| values.iter().all(|value| value.abs() < MAX_VALUE);
     data.warning().iter().all(|warning| warning.number == 0)
@@ -90,16 +93,15 @@ pub(crate) fn is_healthy(data: &Data) -> bool {
         && sane(data.qacc())
 }
 
-/// Substeps in a control step of `dt` seconds.
+/// The number of physics steps in a control step of `dt` seconds.
 pub(crate) fn substeps(clip: &str, dt: f64) -> Result<usize, Error> {
-    use crate::humanoid::PHYSICS_TIMESTEP;
     let count = (dt / PHYSICS_TIMESTEP).round();
     if count >= 1.0 && (count * PHYSICS_TIMESTEP - dt).abs() < 1e-9 {
         return Ok(count as usize);
     }
     Err(Error::Clip {
         clip: clip.into(),
-        reason: format!("dt = {dt} s is no multiple of the physics step of {PHYSICS_TIMESTEP} s; resample the clip"),
+        reason: format!("dt = {dt} s is not a multiple of the physics step of {PHYSICS_TIMESTEP} s; resample the clip"),
     })
 }
 
@@ -118,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn a_simulation_that_explodes_is_unhealthy_until_it_is_placed_anew() {
+    fn a_diverged_simulation_is_unhealthy_until_its_state_is_set_again() {
         let models = Models::new(humanoid::build(WalkerModel::Cmu2020).unwrap(), 6);
         let mut data = models.data();
         for speed in [1e5, 1e8, 1e11, f64::NAN] {
@@ -133,23 +135,23 @@ mod tests {
     }
 
     #[test]
-    fn the_cheaper_sequence_gives_the_plain_ones_numbers() {
+    fn the_faster_sequence_gives_the_numbers_of_the_plain_one() {
         let models = Models::new(humanoid::build(WalkerModel::Cmu2020).unwrap(), 6);
-        let (mut cheap, mut plain) = (models.data(), models.data());
-        upright(&models, &mut cheap, 0.1);
+        let (mut fast, mut plain) = (models.data(), models.data());
+        upright(&models, &mut fast, 0.1);
         upright(&models, &mut plain, 0.1);
         for step in 0..50 {
             let control = std::array::from_fn(|servo| ((step * 56 + servo) as f64).sin());
-            models.step(&mut cheap, &control);
+            models.step(&mut fast, &control);
             plain.ctrl_mut().copy_from_slice(&control);
             for _ in 0..6 {
                 plain.step();
             }
             plain.forward();
-            assert_eq!(cheap.qpos(), plain.qpos());
-            assert_eq!(cheap.qvel(), plain.qvel());
-            assert_eq!(cheap.act(), plain.act());
-            assert_eq!(cheap.sensordata(), plain.sensordata());
+            assert_eq!(fast.qpos(), plain.qpos());
+            assert_eq!(fast.qvel(), plain.qvel());
+            assert_eq!(fast.act(), plain.act());
+            assert_eq!(fast.sensordata(), plain.sensordata());
         }
     }
 }

@@ -1,5 +1,5 @@
-//! MuJoCo's own messages. A diverging simulation is an everyday event in training: the environment reports and
-//! counts it, so MuJoCo's text about it would only fill a log file in the working directory.
+//! MuJoCo's own messages. Simulations often diverge in training. The environment reports and counts each divergence, so
+//! MuJoCo's warnings would only fill a log file in the working directory.
 
 use std::sync::Once;
 
@@ -7,11 +7,11 @@ use mujoco_rs::prelude::{MjLogMessage, MjtLogLevel, set_log_handler};
 
 static INSTALLED: Once = Once::new();
 
-/// Drops MuJoCo's warnings and keeps its errors, once per process.
+/// Drops MuJoCo's warnings and prints its errors. Only the first call in a process has an effect.
 #[allow(unsafe_code)]
 pub(crate) fn install() {
-    // SAFETY: the handler must not change while another thread is inside MuJoCo. Every use of MuJoCo in this crate
-    // goes through a model, and every model is built after this call has returned in some thread.
+    // SAFETY: the handler must not change while another thread runs MuJoCo. Every use of MuJoCo in this crate needs a model,
+    // and every model is built after this call has returned.
     INSTALLED.call_once(|| unsafe { set_log_handler(handle) });
 }
 

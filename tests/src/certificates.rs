@@ -1,4 +1,4 @@
-//! An authority and certificates of it, for tests that need more than `comic-learner certs` makes: expired ones.
+//! A certificate authority for tests. Unlike `comic-learner certs` it also makes expired certificates.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,17 +9,17 @@ use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
 use tempfile::TempDir;
 use time::{Duration, OffsetDateTime};
 
-/// An authority with a directory of its own.
+/// A certificate authority with its own directory.
 pub struct Authority {
     directory: TempDir,
     issuer: Issuer<'static, KeyPair>,
 }
 
 impl Authority {
-    /// A new one; `ca.pem` is its certificate.
+    /// Makes a new authority. Its certificate is `ca.pem`.
     ///
     /// # Errors
-    /// No directory to be had.
+    /// When no directory can be made.
     pub fn new() -> Result<Self> {
         let directory = tempfile::tempdir().context("cannot make a directory")?;
         let mut params = CertificateParams::default();
@@ -29,15 +29,15 @@ impl Authority {
         Ok(Self { directory, issuer: Issuer::new(params, key) })
     }
 
-    /// Where `name` lies.
+    /// The path of the file `name`.
     pub fn path(&self, name: &str) -> PathBuf {
         self.directory.path().join(name)
     }
 
-    /// Makes `NAME.pem` and `NAME-key.pem`, in place of older ones, that hold until so many minutes from now.
+    /// Makes `NAME.pem` and `NAME-key.pem`, which replace older ones. They are valid for this number of minutes from now.
     ///
     /// # Errors
-    /// A directory that cannot be written.
+    /// When the directory cannot be written.
     pub fn issue(&self, name: &str, minutes: i64) -> Result<()> {
         let mut params = CertificateParams::new(["localhost".to_owned(), "127.0.0.1".to_owned()])?;
         let now = OffsetDateTime::now_utc();
@@ -49,7 +49,7 @@ impl Authority {
         Ok(())
     }
 
-    /// A client that trusts this authority, and shows the certificate `name` of it.
+    /// Access for a client that trusts this authority and presents its certificate `name`.
     pub fn access(&self, name: Option<&str>) -> Access {
         Access {
             ca: Some(self.path("ca.pem")),

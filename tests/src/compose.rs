@@ -11,41 +11,41 @@ use serde_json::Value;
 use crate::repository::root;
 use crate::system::{SMALL, balance_of_json};
 
-/// How often a condition is looked at again: each look starts a process in a container.
+/// Time between two checks of a condition. Each check starts a process in a container.
 const POLL: Duration = Duration::from_millis(500);
 
-/// A project of its own; its containers, networks and volumes are gone when it is dropped, and the images stay.
+/// A Compose project of its own. Dropping it removes its containers, networks and volumes, and keeps the images.
 pub struct Project {
     name: String,
     files: &'static [&'static str],
-    /// What the learner is told beside what the file says.
+    /// Options of the learner in addition to those of the file.
     options: String,
 }
 
 impl Project {
-    /// Of these files in `deploy`; nothing runs yet.
+    /// Makes a project of these files in `deploy`. It starts nothing.
     pub fn new(purpose: &str, files: &'static [&'static str]) -> Self {
         // The files name the preset themselves.
         Self { name: format!("comic-{purpose}-{}", std::process::id()), files, options: SMALL[2..].join(" ") }
     }
 
-    /// Tells the learner something more when it starts the next time.
+    /// Adds an option for the next start of the learner.
     pub fn tell(&mut self, option: &str) {
         // Writing to a string cannot fail.
         let _ = write!(self.options, " {option}");
     }
 
-    /// Runs a command of Compose to its end and returns what it says.
+    /// Runs a command of Compose to its end and returns its output.
     ///
     /// # Errors
-    /// When it fails, with what it says.
+    /// When the command fails, with its output.
     pub fn compose(&self, arguments: &[&str]) -> Result<String> {
         let mut command = compose();
         for file in self.files {
             command.arg("--file").arg(root().join("deploy").join(file));
         }
         command.args(["--project-name", &self.name]).args(arguments);
-        // Nothing is taken from who runs the test, and everything fits on the smallest machine.
+        // The user's own settings do not count, and the limits fit the smallest machine.
         for (name, _) in env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with("COMIC_")) {
             command.env_remove(name);
         }
@@ -54,10 +54,10 @@ impl Project {
         run(&mut command)
     }
 
-    /// Starts what is not running yet, with so many actors.
+    /// Starts every service that does not run yet, with this number of actors.
     ///
     /// # Errors
-    /// When it cannot.
+    /// When a service cannot be started.
     pub fn up(&self, actors: usize) -> Result<()> {
         let scale = format!("actor={actors}");
         self.compose(&["up", "--detach", "--no-build", "--no-recreate", "--scale", &scale]).map(drop)
@@ -66,7 +66,7 @@ impl Project {
     /// Runs a program in the learner's container.
     ///
     /// # Errors
-    /// When it fails, with what it says.
+    /// When the command fails, with its output.
     pub fn in_learner(&self, command: &[&str]) -> Result<String> {
         self.compose(&[&["exec", "-T", "learner"], command].concat())
     }
@@ -74,7 +74,7 @@ impl Project {
     /// The containers of a service, running or not.
     ///
     /// # Errors
-    /// When the engine does not say.
+    /// When the engine gives no answer.
     pub fn containers(&self, service: &str) -> Result<Vec<Container>> {
         let filters = [("project", self.name.as_str()), ("service", service)];
         let [project, service] = filters.map(|(label, value)| format!("label=com.docker.compose.{label}={value}"));
@@ -85,30 +85,30 @@ impl Project {
     /// The one container of a service.
     ///
     /// # Errors
-    /// When there are others.
+    /// When the service has no container, or several.
     pub fn container(&self, service: &str) -> Result<Container> {
         let found = self.containers(service)?;
         ensure!(found.len() == 1, "not one {service}: {found:?}");
         found.into_iter().next().context("no container")
     }
 
-    /// The network that all of them share.
+    /// The network of all containers.
     pub fn network(&self) -> String {
         format!("{}_default", self.name)
     }
 
-    /// What `comic-learner status --json` says in the learner's container.
+    /// The output of `comic-learner status --json` in the learner's container.
     ///
     /// # Errors
-    /// When nothing answers.
+    /// When the learner does not answer.
     pub fn status(&self) -> Result<Value> {
         Ok(serde_json::from_str(&self.in_learner(&["comic-learner", "status", "--json"])?)?)
     }
 
-    /// Looks at the learner's status until `condition` holds; accounting that do not balance end the test at once.
+    /// Polls the learner's status until `condition` holds. Accounting that does not balance is an error at once.
     ///
     /// # Errors
-    /// After `limit`, with what was waited for, the last status, and all logs.
+    /// After `limit`, with `what` the test waits for, the last status, and all logs.
     pub async fn until(&self, what: &str, limit: Duration, condition: impl Fn(&Value) -> bool) -> Result<Value> {
         let begin = Instant::now();
         let mut last = String::from("none");
@@ -156,43 +156,43 @@ impl Drop for Project {
 pub struct Container(String);
 
 impl Container {
-    /// Runs a command of docker's with this container as its last argument.
+    /// Runs a docker command with this container as its last argument.
     ///
     /// # Errors
-    /// When it fails, with what it says.
+    /// When the command fails, with its output.
     pub fn docker(&self, arguments: &[&str]) -> Result<String> {
         docker(&[arguments, &[&self.0]].concat())
     }
 
-    /// Runs a program in it.
+    /// Runs a program in the container.
     ///
     /// # Errors
-    /// When it fails, with what it says.
+    /// When the command fails, with its output.
     pub fn exec(&self, command: &[&str]) -> Result<String> {
         docker(&[&["exec", &self.0], command].concat())
     }
 
-    /// What the engine knows of it, below the path `state`, for instance `.State.ExitCode`.
+    /// The field `state` of the engine's description of the container, for instance `.State.ExitCode`.
     ///
     /// # Errors
-    /// When it does not know.
+    /// When there is no such field.
     pub fn inspect(&self, state: &str) -> Result<String> {
         let format = format!("{{{{json {state}}}}}");
         Ok(self.docker(&["inspect", "--format", &format])?.trim().trim_matches('"').to_owned())
     }
 
-    /// What it has written.
+    /// The container's log.
     ///
     /// # Errors
-    /// When the engine does not say.
+    /// When the engine gives no answer.
     pub fn log(&self) -> Result<String> {
         self.docker(&["logs"])
     }
 
-    /// Waits until `state` is `wanted`.
+    /// Waits until the field `state` has the value `wanted`.
     ///
     /// # Errors
-    /// After `limit`, with what it is and the log.
+    /// After `limit`, with the value and the log.
     pub async fn until_is(&self, state: &str, wanted: &str, limit: Duration) -> Result<()> {
         let begin = Instant::now();
         loop {
@@ -205,7 +205,7 @@ impl Container {
         }
     }
 
-    /// Waits until its log holds `text`.
+    /// Waits until the log contains `text`.
     ///
     /// # Errors
     /// After `limit`, with the log.
@@ -227,15 +227,15 @@ fn compose() -> Command {
     if there.is_ok_and(|answer| answer.status.success()) { second } else { Command::new("docker-compose") }
 }
 
-/// Runs a command of docker's to its end and returns what it says.
+/// Runs a docker command to its end and returns its output.
 ///
 /// # Errors
-/// When it fails, with what it says.
+/// When the command fails, with its output.
 pub fn docker(arguments: &[&str]) -> Result<String> {
     run(Command::new("docker").args(arguments))
 }
 
-/// The programs in the containers write their logs to stderr, so both are what a command says.
+/// Standard output and standard error together: the programs in the containers write their logs to the latter.
 fn run(command: &mut Command) -> Result<String> {
     let output = command.output().with_context(|| format!("cannot start {command:?}"))?;
     let said = |stream: &[u8]| String::from_utf8_lossy(stream).into_owned();

@@ -1,4 +1,4 @@
-//! The Kubernetes manifests: overlays rendered as kustomize renders them, and read strictly.
+//! Renders the overlays of the Kubernetes manifests as kustomize does, and reads them strictly.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -20,15 +20,15 @@ use crate::repository::root;
 /// Manifests by kind and name.
 pub type Manifests = BTreeMap<(String, String), Value>;
 
-/// Where base and overlays lie.
+/// The folder of the base and the overlays.
 pub fn directory() -> PathBuf {
     root().join("deploy/kubernetes")
 }
 
-/// Every directory that a user may apply: the base, and each overlay.
+/// Every directory that a user may apply: the base and each overlay.
 ///
 /// # Errors
-/// When they are not there.
+/// When the directories cannot be listed.
 pub fn applicable() -> Result<Vec<PathBuf>> {
     let overlays = directory().join("overlays");
     let entries = fs::read_dir(&overlays).with_context(|| format!("cannot list {}", overlays.display()))?;
@@ -38,7 +38,7 @@ pub fn applicable() -> Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-/// As much of a kustomization as ours use.
+/// The fields of a kustomization that the overlays use.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "camelCase")]
 struct Kustomization {
@@ -51,7 +51,7 @@ struct Kustomization {
     patches: Vec<Patch>,
 }
 
-/// A file of JSON patches (RFC 6902) and the one manifest it is for.
+/// A file of JSON patches (RFC 6902) and the manifest that they change.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Patch {
@@ -66,10 +66,10 @@ struct Target {
     name: String,
 }
 
-/// What `kubectl apply --kustomize DIRECTORY` would apply.
+/// The manifests that `kubectl apply --kustomize DIRECTORY` applies.
 ///
 /// # Errors
-/// Files that are not there, fields of a kustomization that are not known here, patches that do not fit.
+/// Missing files, unknown fields of a kustomization, patches that do not apply.
 pub fn render(directory: &Path) -> Result<Manifests> {
     let file = directory.join("kustomization.yaml");
     let read = || anyhow::Ok(serde_yaml_ng::from_str::<Kustomization>(&fs::read_to_string(&file)?)?);
@@ -100,14 +100,14 @@ pub fn render(directory: &Path) -> Result<Manifests> {
     Ok(manifests)
 }
 
-/// The manifests of a file of several.
+/// The manifests of a file with several documents.
 ///
 /// # Errors
-/// What is no YAML, or no manifest.
+/// A document that is no YAML, or no manifest.
 pub fn manifests_in(text: &str) -> Result<Manifests> {
     let mut manifests = Manifests::new();
     for document in serde_yaml_ng::Deserializer::from_str(text) {
-        // By way of YAML's own type, which refuses a field that is there twice.
+        // YAML's own value type refuses a field that is given twice.
         let document = serde_json::to_value(serde_yaml_ng::Value::deserialize(document)?)?;
         let name = |value: &Value| value.as_str().map(str::to_owned);
         let kind = name(&document["kind"]).context("a manifest without a kind")?;
@@ -117,28 +117,28 @@ pub fn manifests_in(text: &str) -> Result<Manifests> {
     Ok(manifests)
 }
 
-/// A rendered overlay, read.
+/// A rendered overlay as Kubernetes' types.
 #[derive(Debug)]
 pub struct Cluster {
-    /// The one namespace.
+    /// The only namespace.
     pub namespace: Namespace,
     /// The learner's Service.
     pub service: Service,
-    /// The learner.
+    /// The learner's StatefulSet.
     pub learner: StatefulSet,
-    /// The actors.
+    /// The actors' Job.
     pub actors: Job,
-    /// The actors' protection.
+    /// The actors' PodDisruptionBudget.
     pub budget: PodDisruptionBudget,
-    /// Who reaches whom.
+    /// The network policies by name.
     pub policies: BTreeMap<String, NetworkPolicy>,
 }
 
 impl Cluster {
-    /// Reads what was rendered.
+    /// Reads the rendered manifests.
     ///
     /// # Errors
-    /// Fields that Kubernetes does not know, values it would not take, manifests that are missing or too many.
+    /// Fields or values that Kubernetes does not accept, and missing or additional manifests.
     pub fn read(mut manifests: Manifests) -> Result<Self> {
         let policies = manifests.extract_if(.., |(kind, _), _| kind == "NetworkPolicy");
         let policies = policies.map(|((_, name), manifest)| Ok((name, strictly(manifest)?))).collect::<Result<_>>()?;
@@ -150,11 +150,11 @@ impl Cluster {
             budget: take(&mut manifests, "PodDisruptionBudget", "comic-actor")?,
             policies,
         };
-        ensure!(manifests.is_empty(), "nobody looks at {:?}", manifests.keys());
+        ensure!(manifests.is_empty(), "no test reads {:?}", manifests.keys());
         Ok(cluster)
     }
 
-    /// The learner's pod, and the actors'.
+    /// The learner's pod and the actors' pod.
     ///
     /// # Errors
     /// When one is missing.
@@ -180,10 +180,10 @@ impl Cluster {
     }
 }
 
-/// Does the same with every overlay, and with the base.
+/// Calls `check` with every overlay and with the base.
 ///
 /// # Errors
-/// The first that cannot be read or does not pass.
+/// The first overlay that cannot be read or does not pass.
 pub fn each(check: impl Fn(&Cluster) -> Result<()>) -> Result<()> {
     for directory in applicable()? {
         let cluster = render(&directory).and_then(Cluster::read);
@@ -192,10 +192,10 @@ pub fn each(check: impl Fn(&Cluster) -> Result<()>) -> Result<()> {
     Ok(())
 }
 
-/// The one container of a pod.
+/// The only container of a pod.
 ///
 /// # Errors
-/// When there are others.
+/// When the pod has no container, or several.
 pub fn container(pod: &PodSpec) -> Result<&Container> {
     let [container] = &pod.containers[..] else { bail!("{} containers", pod.containers.len()) };
     ensure!(pod.init_containers.is_none() && pod.ephemeral_containers.is_none(), "other containers");
@@ -207,17 +207,17 @@ fn take<T: DeserializeOwned + Serialize>(manifests: &mut Manifests, kind: &str, 
     strictly(manifest.with_context(|| format!("no {kind} {name}"))?).with_context(|| format!("{kind} {name}"))
 }
 
-/// A manifest as its type; what the type does not know, it would lose.
+/// Reads a manifest as its type. A field that the type does not have would be lost.
 ///
 /// # Errors
-/// When something is lost, and where, or when it does not fit the type.
+/// When a field is lost, with its path, or when a value does not fit the type.
 pub fn strictly<T: DeserializeOwned + Serialize>(manifest: Value) -> Result<T> {
     let typed: T = serde_json::from_value(manifest.clone())?;
     keeps(&manifest, &serde_json::to_value(&typed)?, "")?;
     Ok(typed)
 }
 
-/// Whether everything that was written is in what was read.
+/// Checks that every written field is in the value that was read.
 fn keeps(written: &Value, read: &Value, at: &str) -> Result<()> {
     match (written, read) {
         (Value::Object(written), Value::Object(read)) => written.iter().try_for_each(|(name, value)| {
@@ -233,23 +233,23 @@ fn keeps(written: &Value, read: &Value, at: &str) -> Result<()> {
     }
 }
 
-/// The value behind an option of a container's program.
+/// The value of an option of a container's program.
 ///
 /// # Errors
-/// When it is not given.
+/// When the option is not given.
 pub fn option<'a>(container: &'a Container, name: &str) -> Result<&'a str> {
     let args = container.args.as_deref().unwrap_or_default();
     let at = args.iter().position(|arg| arg == name).with_context(|| format!("no {name} in {args:?}"))?;
-    Ok(args.get(at + 1).with_context(|| format!("nothing behind {name}"))?)
+    Ok(args.get(at + 1).with_context(|| format!("no value of {name}"))?)
 }
 
-/// The variables of a container that are given as they are.
+/// The environment variables of a container that have a literal value.
 pub fn environment(container: &Container) -> BTreeMap<&str, &str> {
     let variables = container.env.iter().flatten();
     variables.filter_map(|variable| Some((variable.name.as_str(), variable.value.as_deref()?))).collect()
 }
 
-/// What a quantity stands for, as far as ours are written.
+/// The number that a quantity stands for, in the units that the manifests use.
 ///
 /// # Errors
 /// Another unit.

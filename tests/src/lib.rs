@@ -1,16 +1,16 @@
-//! What the whole-system tests share.
+//! Helpers of the whole-system tests.
 //!
 //! # Layout
-//! - [`certificates`] makes certificates, expired ones too.
+//! - [`certificates`] makes certificates, also expired ones.
 //! - [`compose`] runs a learner and actors in containers.
 //! - [`kubernetes`] renders the manifests and reads them.
-//! - [`lockstep`] is runs of which the seed decides every parameter.
+//! - [`lockstep`] starts runs in which the seed decides every parameter.
 //! - [`modules`] finds circles among the modules of a crate.
-//! - [`process`] is one program that runs.
-//! - [`relay`] is a slow way to the learner.
-//! - [`repository`] looks at the workspace's own files and dependencies.
-//! - [`steps`] is what they make a learner and its actors go through.
-//! - [`system`] runs a learner and actors as a user would: real programs, real sockets, one directory for the run.
+//! - [`process`] is a running program.
+//! - [`relay`] is a slow line to the learner.
+//! - [`repository`] reads the workspace's own files and dependencies.
+//! - [`steps`] are the steps that several tests take with a learner and its actors.
+//! - [`system`] runs a learner and actors as a user does: real programs, real sockets, one directory for the run.
 //! - [`tensorboard`] reads curves as TensorBoard does.
 
 pub mod certificates;

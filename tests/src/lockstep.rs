@@ -1,4 +1,4 @@
-//! Runs in lockstep, of which the seed decides every parameter: what a fault changes can be seen in what was learnt.
+//! Runs in lockstep: the seed decides every parameter, so the parameters show whether a fault changed anything.
 
 use std::fs;
 use std::path::Path;
@@ -9,25 +9,25 @@ use crate::process::Process;
 use crate::steps::LIMIT;
 use crate::system::{SMALL, System};
 
-/// Environments in all: one for each unroll of a batch.
+/// All environments: one for each unroll of a batch.
 pub const ALL: u32 = 8;
-/// Updates of such a run.
+/// Updates of a run.
 pub const UPDATES: u64 = 6;
-/// A version of so small a policy takes seconds at this pace, and the run long enough for a fault to come in the middle.
+/// At this rate a version of the small policy takes seconds, so a fault can come in the middle of the run.
 pub const SLOW_BYTES_PER_SECOND: f64 = 500_000.0;
 
-/// A run in lockstep with a warm start, a normaliser that is set twice, and updates that publish nothing new.
+/// A run in lockstep with a warm start, a normaliser that is set twice, and updates that publish no new version.
 ///
 /// # Errors
-/// No directory or port to be had.
+/// When there is no directory or port.
 pub fn lockstep(overrides: &[&str]) -> Result<System> {
     lockstep_with(&[], overrides)
 }
 
-/// The same, of a learner with these options.
+/// The same run of a learner with these options.
 ///
 /// # Errors
-/// No directory or port to be had.
+/// When there is no directory or port.
 pub fn lockstep_with(options: &[&str], overrides: &[&str]) -> Result<System> {
     let updates = format!("budget.updates={UPDATES}");
     let fields = [
@@ -47,7 +47,7 @@ pub fn lockstep_with(options: &[&str], overrides: &[&str]) -> Result<System> {
 /// Trains with an actor for each number of environments, until the budget is used up.
 ///
 /// # Errors
-/// When anybody ends in another way.
+/// When a program does not end with 0.
 pub async fn train(system: &mut System, actors: &[u32]) -> Result<()> {
     system.start_learner(LIMIT).await?;
     let url = system.url();
@@ -57,10 +57,10 @@ pub async fn train(system: &mut System, actors: &[u32]) -> Result<()> {
     Ok(())
 }
 
-/// Waits until the budget is used up, and everybody has left; the learner's log.
+/// Waits until the budget is used up and every program has ended. Returns the learner's log.
 ///
 /// # Errors
-/// When anybody ends in another way.
+/// When a program does not end with 0.
 pub async fn is_over(system: &mut System, actors: &mut [Process]) -> Result<String> {
     for actor in actors {
         let status = actor.until_it_ends(LIMIT).await?;
@@ -72,30 +72,30 @@ pub async fn is_over(system: &mut System, actors: &mut [Process]) -> Result<Stri
     Ok(learner.log())
 }
 
-/// What the run's last checkpoint says of networks, optimiser and statistics.
+/// Networks, optimiser and statistics of the run's last checkpoint.
 ///
 /// # Errors
-/// When it is not there.
-pub fn learnt(system: &System) -> Result<[Vec<u8>; 3]> {
-    learnt_in(&system.run())
+/// When there is no checkpoint.
+pub fn final_state(system: &System) -> Result<[Vec<u8>; 3]> {
+    final_state_in(&system.run())
 }
 
-/// The same of the run in a directory.
+/// The same for the run in a directory.
 ///
 /// # Errors
-/// When it is not there.
-pub fn learnt_in(run: &Path) -> Result<[Vec<u8>; 3]> {
+/// When there is no checkpoint.
+pub fn final_state_in(run: &Path) -> Result<[Vec<u8>; 3]> {
     let checkpoint = run.join(format!("checkpoints/checkpoint-{UPDATES:010}"));
     let part = |name: &str| fs::read(checkpoint.join(name)).with_context(|| format!("no {name}"));
     Ok([part("policy.safetensors")?, part("target.safetensors")?, part("learner.safetensors")?])
 }
 
-/// What is learnt by an actor for each number of environments, undisturbed.
+/// The result of an undisturbed run with one actor for each number of environments.
 ///
 /// # Errors
-/// When anybody does not end as at a run's end.
-pub async fn learnt_by(actors: &[u32], overrides: &[&str]) -> Result<[Vec<u8>; 3]> {
+/// When a program does not end with 0.
+pub async fn final_state_of(actors: &[u32], overrides: &[&str]) -> Result<[Vec<u8>; 3]> {
     let mut system = lockstep(overrides)?;
     train(&mut system, actors).await?;
-    learnt(&system)
+    final_state(&system)
 }

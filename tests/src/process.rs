@@ -1,4 +1,4 @@
-//! A process on this machine, and what a test does to it.
+//! A process on this machine, and the signals that a test sends it.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -8,17 +8,17 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use rustix::process::{Pid, Signal, kill_process};
 
-/// How often a condition is looked at again.
+/// Time between two checks of a condition.
 pub(crate) const POLL: Duration = Duration::from_millis(50);
 
-/// A process with a log, killed when dropped.
+/// A process with a log. Dropping it kills the process.
 pub struct Process {
     pub(crate) child: Child,
     pub(crate) log: PathBuf,
 }
 
 impl Process {
-    /// Ends it on the spot (SIGKILL), as a power cut would.
+    /// Kills the process at once (SIGKILL), as a power cut would.
     ///
     /// # Errors
     /// When the system refuses.
@@ -28,10 +28,10 @@ impl Process {
         Ok(())
     }
 
-    /// Bytes of memory it has for itself, without the files it maps.
+    /// Bytes of its own memory, without mapped files.
     ///
     /// # Errors
-    /// When the system does not say.
+    /// When the system gives no answer.
     pub fn resident(&self) -> Result<u64> {
         let status = fs::read_to_string(format!("/proc/{}/status", self.child.id())).context("no such process")?;
         let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).context("no RssAnon")?;
@@ -39,16 +39,16 @@ impl Process {
         Ok(kilobytes * 1024)
     }
 
-    /// `path` as this process sees it, if it has disks of its own.
+    /// `path` as this process sees it; the process may have its own mounts.
     pub fn sees(&self, path: &Path) -> PathBuf {
         let root = PathBuf::from(format!("/proc/{}/root", self.child.id()));
         root.join(path.strip_prefix("/").unwrap_or(path))
     }
 
-    /// Asks it to leave (SIGTERM) and waits.
+    /// Asks the process to end (SIGTERM) and waits.
     ///
     /// # Errors
-    /// When it is still there after `limit`.
+    /// When the process still runs after `limit`.
     pub async fn terminate(mut self, limit: Duration) -> Result<ExitStatus> {
         self.signal(Signal::TERM)?;
         let deadline = Instant::now() + limit;
@@ -58,10 +58,10 @@ impl Process {
             }
             tokio::time::sleep(POLL).await;
         }
-        bail!("still there {limit:?} after SIGTERM: {}", self.log())
+        bail!("the process still runs {limit:?} after SIGTERM: {}", self.log())
     }
 
-    /// Stops it where it is (SIGSTOP), until it [`resumes`](Self::resume).
+    /// Stops the process (SIGSTOP) until [`resume`](Self::resume).
     ///
     /// # Errors
     /// When the system refuses.
@@ -69,7 +69,7 @@ impl Process {
         self.signal(Signal::STOP)
     }
 
-    /// Lets it go on (SIGCONT).
+    /// Resumes the process (SIGCONT).
     ///
     /// # Errors
     /// When the system refuses.
@@ -82,7 +82,7 @@ impl Process {
         kill_process(pid, signal).context("cannot signal")
     }
 
-    /// How it ended, if it has.
+    /// Its exit status, if the process has ended.
     ///
     /// # Errors
     /// When the system refuses.
@@ -90,42 +90,42 @@ impl Process {
         self.child.try_wait().context("cannot wait")
     }
 
-    /// Waits until it ends by itself.
+    /// Waits until the process ends by itself.
     ///
     /// # Errors
-    /// When it is still there after `limit`, with its log.
+    /// When the process still runs after `limit`, with its log.
     pub async fn until_it_ends(&mut self, limit: Duration) -> Result<ExitStatus> {
         let deadline = Instant::now() + limit;
         loop {
             match self.ended()? {
                 Some(status) => return Ok(status),
-                None if Instant::now() > deadline => bail!("still there after {limit:?}: {}", self.log()),
+                None if Instant::now() > deadline => bail!("the process still runs after {limit:?}: {}", self.log()),
                 None => tokio::time::sleep(POLL).await,
             }
         }
     }
 
-    /// Everything it has written.
+    /// The whole log.
     pub fn log(&self) -> String {
         read(&self.log)
     }
 
-    /// Waits until its log holds `text`.
+    /// Waits until the log contains `text`.
     ///
     /// # Errors
-    /// When it ends or `limit` is over before that, with the log.
+    /// When the process ends or `limit` passes before that, with the log.
     pub async fn until_log_holds(&mut self, text: &str, limit: Duration) -> Result<()> {
         self.until_log(text, limit, |log| log.contains(text)).await
     }
 
-    /// Waits until its log satisfies a condition.
+    /// Waits until the log satisfies a condition.
     ///
     /// # Errors
-    /// When it ends or `limit` is over before that, with the log.
+    /// When the process ends or `limit` passes before that, with the log.
     pub async fn until_log(&mut self, what: &str, limit: Duration, condition: impl Fn(&str) -> bool) -> Result<()> {
         let deadline = Instant::now() + limit;
         loop {
-            // Asked first: what it wrote before it ended is there then.
+            // This comes first, so that the log below holds everything that an ended process wrote.
             let ended = self.ended()?;
             if condition(&self.log()) {
                 return Ok(());

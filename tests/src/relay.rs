@@ -1,4 +1,4 @@
-//! A slow way to the learner.
+//! A slow line to the learner.
 
 use std::time::Duration;
 
@@ -8,21 +8,21 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until};
 
-/// A little at a time, so that nothing comes in bursts.
+/// Bytes of one write: small, so that nothing comes in bursts.
 const PIECE: usize = 4096;
 
-/// Carries connections to the learner, and only so many bytes a second of each back; ends when dropped.
+/// Carries connections to the learner, and a limited number of bytes a second back. Dropping it ends the connections.
 pub struct Relay {
-    /// Where it listens.
+    /// The URL at which it listens.
     pub url: String,
     accepting: JoinHandle<()>,
 }
 
 impl Relay {
-    /// Begins to carry connections to `learner`, as `host:port`.
+    /// Starts a relay to `learner`, given as `host:port`.
     ///
     /// # Errors
-    /// No port to be had.
+    /// When there is no free port.
     pub async fn start(learner: String, bytes_per_second: f64) -> Result<Self> {
         let listener = TcpListener::bind("127.0.0.1:0").await.context("no port for the relay")?;
         let url = format!("http://{}", listener.local_addr()?);

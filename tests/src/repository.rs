@@ -1,4 +1,4 @@
-//! The workspace's own files and dependencies, for the tests that hold the architecture.
+//! The workspace's own files and dependencies, for the architecture tests.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -10,7 +10,7 @@ use anyhow::{Context, Result, bail};
 /// The crates' folders, as the root manifest lists them.
 ///
 /// # Errors
-/// A manifest that cannot be read.
+/// When the manifest cannot be read.
 pub fn folders() -> Result<Vec<String>> {
     let manifest: toml::Table = fs::read_to_string(root().join("Cargo.toml"))?.parse()?;
     let members = manifest.get("workspace").and_then(|workspace| workspace.get("members")?.as_array());
@@ -35,7 +35,7 @@ pub struct Source {
 /// Every Rust file of the workspace's crates.
 ///
 /// # Errors
-/// A folder or file that cannot be read.
+/// When a folder or file cannot be read.
 pub fn sources() -> Result<Vec<Source>> {
     let root = root();
     let mut found = Vec::new();
@@ -60,18 +60,18 @@ fn collect(root: &Path, directory: &Path, found: &mut Vec<Source>) -> Result<()>
     Ok(())
 }
 
-/// Names of all crates that `package` is built from, itself left out: what its programs link.
+/// Names of all crates that `package` is built from, without itself. Its programs link them.
 ///
 /// # Errors
-/// When cargo does not answer.
+/// When cargo fails.
 pub fn dependencies(package: &str) -> Result<BTreeSet<String>> {
     tree(package, &[])
 }
 
-/// Names of the crates that `package` names itself.
+/// Names of the direct dependencies of `package`.
 ///
 /// # Errors
-/// When cargo does not answer.
+/// When cargo fails.
 pub fn direct_dependencies(package: &str) -> Result<BTreeSet<String>> {
     tree(package, &["--depth", "1"])
 }

@@ -1,4 +1,4 @@
-//! What whole-system tests make a learner and its actors go through.
+//! Steps that several whole-system tests take with a learner and its actors.
 
 use std::fs;
 use std::path::Path;
@@ -10,18 +10,18 @@ use comic_proto::v1::{Accounting, Status};
 use crate::process::Process;
 use crate::system::{Answered, System, balance, metric};
 
-/// Long enough for the slowest machine; no step waits longer than it needs.
+/// Long enough for the slowest machine. A step ends as soon as its condition holds.
 pub const LIMIT: Duration = Duration::from_secs(120);
-/// What an actor promises.
+/// The documented time in which an actor ends after SIGTERM.
 const ACTOR_LEAVES: Duration = Duration::from_secs(5);
-/// What a learner promises.
+/// The documented time in which a learner ends after SIGTERM.
 const LEARNER_LEAVES: Duration = Duration::from_secs(30);
-/// Bytes that a learner of the smallest experiment takes at most for training and a handful of actors, with what an
+/// Most bytes that a learner of the smallest experiment needs for training and a few actors, with the memory that an
 /// allocator keeps.
 const MEMORY: u64 = 300_000_000;
-/// More unrolls than a dead actor can have left behind: two batches in the batcher, one in training, its window.
+/// More unrolls than a dead actor can have in flight: two batches in the batcher, one in training, its window.
 const BEYOND_WHAT_IS_LEFT: u64 = 200;
-/// More versions than actors may lag behind.
+/// More versions than an actor may lag behind.
 const VERSIONS: f64 = 30.0;
 
 /// The accounting of a status.
@@ -29,27 +29,27 @@ pub fn accounting(status: &Status) -> Accounting {
     status.accounting.unwrap_or_default()
 }
 
-/// A status; a learner that is too busy for an answer is asked again.
+/// The learner's status. A learner that is too busy for an answer is asked again.
 ///
 /// # Errors
-/// When it does not answer, in time.
+/// When the learner does not answer in time.
 pub async fn now(system: &mut System) -> Result<Status> {
     system.until("an answer", LIMIT, |status| Some(status.clone())).await
 }
 
-/// Training goes beyond whatever an actor that is gone can have left behind.
+/// Waits until more unrolls are trained than a dead actor can have in flight.
 ///
 /// # Errors
-/// When it does not, in time.
+/// When this does not happen in time.
 pub async fn trains_on(system: &mut System, what: &str) -> Result<()> {
     let before = accounting(&now(system).await?).trained;
     system.until(what, LIMIT, |status| (accounting(status).trained >= before + BEYOND_WHAT_IS_LEFT).then_some(())).await
 }
 
-/// While versions go up, what is trained on stays only a few versions old: it was made with new parameters.
+/// Waits for new versions and checks that trained unrolls are only a few versions old: actors used new parameters.
 ///
 /// # Errors
-/// When it does not, in time.
+/// When this does not happen in time.
 pub async fn parameters_arrive(system: &mut System, what: &str) -> Result<()> {
     let before = metric(&now(system).await?, "version");
     system
@@ -60,26 +60,26 @@ pub async fn parameters_arrive(system: &mut System, what: &str) -> Result<()> {
         .await
 }
 
-/// Kills the learner in mid-stream; the next one goes on from a checkpoint.
+/// Kills the learner while it trains. The next learner resumes from a checkpoint.
 ///
 /// # Errors
-/// When it does not, in time.
+/// When this does not happen in time.
 pub async fn kill_and_restart_the_learner(system: &mut System) -> Result<Status> {
     let updates = newest_checkpoint(system).await?;
     system.learner.take().context("no learner")?.kill()?;
     ensure!(system.status().await.is_err(), "a killed learner does not answer");
     let status = system.start_learner(LIMIT).await?;
-    let what = format!("the restarted learner goes on from update {updates}");
+    let what = format!("the restarted learner resumes from update {updates}");
     system.until(&what, LIMIT, |status| (metric(status, "updates") > updates as f64).then_some(())).await?;
     let resumed = system.learner.as_ref().context("no learner")?.log();
     ensure!(!resumed.contains("damaged"), "the checkpoint did not verify: {resumed}");
     Ok(status)
 }
 
-/// Updates of the newest whole checkpoint, once there is one.
+/// Waits for a whole checkpoint and returns the updates of the newest one.
 ///
 /// # Errors
-/// When there is none, in time.
+/// When there is none in time.
 pub async fn newest_checkpoint(system: &mut System) -> Result<u64> {
     let run = system.run();
     system.until("a checkpoint is written", LIMIT, |_| checkpoint_in(&run)).await
@@ -92,40 +92,43 @@ pub fn checkpoint_in(run: &Path) -> Option<u64> {
     names.filter_map(|name| name.strip_prefix("checkpoint-")?.parse().ok()).max()
 }
 
-/// How many checkpoints of a run are being written, or were when the learner died.
+/// Number of checkpoints of a run that are not complete: they are being written, or were when the learner died.
 pub fn half_written(run: &Path) -> Option<usize> {
     let names = fs::read_dir(run.join("checkpoints")).ok()?.flatten().map(|entry| entry.file_name());
     Some(names.filter(|name| name.to_string_lossy().starts_with(".checkpoint-")).count())
 }
 
-/// An actor leaves when it is asked to, with 1: it was told to stop before the run was over, and whoever counts what ends
-/// with 0 as done must not count it.
+/// Asks an actor to end. Its exit code must be 1, since the run is not over: a supervisor that counts exit code 0 as done
+/// must not count this actor.
 ///
 /// # Errors
-/// When it does not, or in another way.
+/// When the actor does not end in time, or with another code.
 pub async fn leaves(actor: Process) -> Result<()> {
     let status = actor.terminate(ACTOR_LEAVES).await?;
-    ensure!(status.code() == Some(1), "an actor that is asked to leave leaves with {status}");
+    ensure!(status.code() == Some(1), "an actor after SIGTERM ended with {status}");
     Ok(())
 }
 
-/// Nobody produces any more: what was produced is trained on once, dropped for a counted reason, or in an open batch. Nothing
-/// that an actor was answered about is missing there, and nothing is there that none made. The learner gave back what memory
-/// it took.
+/// Checks the accounting after the actors have ended: each unroll was trained on once, dropped for a counted reason, or is
+/// in an open batch. Every acknowledged unroll is counted, and no other one. Also checks that the learner freed the memory
+/// of its actors.
 ///
 /// # Errors
-/// When it is not so.
+/// When one of these does not hold.
 pub async fn the_accounting_balances_at_the_end(mut system: System) -> Result<()> {
     let accounting = accounting(&now(&mut system).await?);
     ensure!(balance(&accounting), "{accounting:?}");
-    ensure!(accounting.dropped_invalid == 0, "no actor sends what is invalid: {accounting:?}");
+    ensure!(accounting.dropped_invalid == 0, "an actor sent an invalid unroll: {accounting:?}");
     let Answered { unrolls, all } = system.answered()?;
-    ensure!(unrolls <= accounting.produced, "actors were answered about {unrolls} unrolls: {accounting:?}");
-    ensure!(!all || unrolls == accounting.produced, "actors made no more than {unrolls} unrolls: {accounting:?}");
+    ensure!(unrolls <= accounting.produced, "{unrolls} unrolls were acknowledged, fewer were counted: {accounting:?}");
+    ensure!(
+        !all || unrolls == accounting.produced,
+        "actors made only {unrolls} unrolls, more were counted: {accounting:?}"
+    );
     let grown = system.grown()?;
-    ensure!(grown < MEMORY, "the learner has {grown} bytes more than before anybody came");
+    ensure!(grown < MEMORY, "the learner has {grown} bytes more than before the first actor");
     let learner = system.learner.take().context("no learner")?;
     let status = learner.terminate(LEARNER_LEAVES).await?;
-    ensure!(status.success(), "a learner that is asked to leave leaves with {status}");
+    ensure!(status.success(), "a learner after SIGTERM ended with {status}");
     Ok(())
 }

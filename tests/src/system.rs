@@ -1,4 +1,4 @@
-//! A learner and actors as real processes on this machine.
+//! Runs a learner and actors as real processes on this machine.
 
 use std::ffi::OsString;
 use std::fs::{self, OpenOptions};
@@ -18,13 +18,13 @@ use tempfile::TempDir;
 use crate::process::{POLL, Process};
 use crate::repository::root;
 
-/// Variables that would say where the learner is and what to show it.
+/// Environment variables of the user that would change how the programs reach the learner.
 const SETTINGS: [&str; 7] =
     ["COMIC_LIVENESS", "COMIC_LEARNER", "COMIC_CA", "COMIC_CERT", "COMIC_KEY", "COMIC_TOKEN_FILE", "COMIC_TOKEN"];
-/// How long a status call may take.
+/// Limit of a status call.
 const CALL_LIMIT: Duration = Duration::from_secs(5);
 
-/// Options of a learner whose experiment is so small that an update takes milliseconds.
+/// Options of a learner with a small experiment: an update takes milliseconds.
 pub const SMALL: [&str; 32] = [
     "--preset",
     "quickstart",
@@ -63,7 +63,7 @@ pub const SMALL: [&str; 32] = [
 /// A program of this workspace, built beside the running test.
 ///
 /// # Errors
-/// When it has not been built, with the command that does.
+/// When the program is not built, with the command that builds it.
 pub fn program(name: &str) -> Result<PathBuf> {
     let own = std::env::current_exe().context("cannot tell where this test lies")?;
     // Tests lie in target/PROFILE/deps, programs in target/PROFILE.
@@ -78,10 +78,10 @@ pub fn program(name: &str) -> Result<PathBuf> {
     Ok(path)
 }
 
-/// What a program says of a command's options.
+/// The help text of a command.
 ///
 /// # Errors
-/// When it does not.
+/// When the program fails.
 pub fn help(name: &str, command: &[&str]) -> Result<String> {
     let output = Command::new(program(name)?).args(command).arg("--help").output();
     Ok(String::from_utf8(output.with_context(|| format!("cannot start {name}"))?.stdout)?)
@@ -90,53 +90,53 @@ pub fn help(name: &str, command: &[&str]) -> Result<String> {
 /// The Python that has dm_control, torch and TensorBoard.
 ///
 /// # Errors
-/// When it has not been made, with the command that does.
+/// When it does not exist, with the command that makes it.
 pub fn python() -> Result<PathBuf> {
     let path = root().join(".deps/python/requirements-export/bin/python");
-    ensure!(path.exists(), "there is no {}: `cargo xtask test` makes it, once", path.display());
+    ensure!(path.exists(), "no file {}; `cargo xtask test` makes it", path.display());
     Ok(path)
 }
 
-/// A learner and actors that share one run; whatever is still there at the end of the test is killed.
+/// A learner and actors of one run. Dropping it kills every process that still runs.
 pub struct System {
     directory: TempDir,
-    /// Where the learner listens; this machine alone unless given.
+    /// The address at which the learner listens. The default is the loopback address.
     pub host: String,
     port: u16,
-    /// While it lives the port is this system's.
+    /// Reserves the port for this system.
     _kept: UdpSocket,
     arguments: Vec<String>,
-    /// How actors and the tests themselves reach the learner; with an authority, by https.
+    /// How actors and tests reach the learner. With an authority they use https.
     pub access: Access,
-    /// What the learner logs, as RUST_LOG has it; the usual unless given.
+    /// The learner's `RUST_LOG`, if it is not the default.
     pub log_level: Option<String>,
-    /// Bytes of a disk for nothing but the run, which goes when the learner does and takes root to make.
+    /// Size in bytes of a disk for the run. The disk needs root, and disappears when the learner ends.
     pub disk: Option<u64>,
-    /// A library with a clock that every program goes by, and the file from which it takes the time.
+    /// A library that replaces the clock of every program, and the file from which it reads the time.
     pub clock: Option<(PathBuf, PathBuf)>,
-    /// The learner's process, while there is one.
+    /// The learner's process, while it runs.
     pub learner: Option<Process>,
-    /// Bytes that it had before anybody came.
+    /// Bytes of memory of the learner before the first actor joined.
     alone: u64,
-    /// What the actors log, and the crowds, which count nothing there.
+    /// The logs of the actors and of the simulated crowds. A crowd does not log acknowledged unrolls.
     actors: Vec<PathBuf>,
     started: usize,
 }
 
-/// Unrolls that actors were answered about, by their own count.
+/// Unrolls that were acknowledged, as the actors count them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Answered {
-    /// How many.
+    /// Their number.
     pub unrolls: u64,
-    /// That is all that were ever sent: every actor left in order, with nothing unanswered.
+    /// Whether these are all unrolls that were sent: every actor ended normally, with no unroll unanswered.
     pub all: bool,
 }
 
 impl System {
-    /// A run whose learner is started with `arguments`; nothing runs yet.
+    /// A run whose learner has these arguments. It starts nothing.
     ///
     /// # Errors
-    /// No directory or port to be had.
+    /// When there is no directory or port.
     pub fn new(arguments: &[&str]) -> Result<Self> {
         let (port, kept) = free_port()?;
         Ok(Self {
@@ -156,7 +156,7 @@ impl System {
         })
     }
 
-    /// Overrides a field of the experiment when the learner starts the next time.
+    /// Overrides a field of the experiment at the next start of the learner.
     pub fn set(&mut self, field: &str) {
         self.arguments.extend(["--set".to_owned(), field.to_owned()]);
     }
@@ -177,10 +177,10 @@ impl System {
         self.directory.path().join("run")
     }
 
-    /// Starts the learner, anew after it was killed, and returns its first status.
+    /// Starts the learner, or restarts it after a kill, and returns its first status.
     ///
     /// # Errors
-    /// When it does not serve within `limit`, with the end of its log.
+    /// When the learner does not serve within `limit`, with the end of its log.
     pub async fn start_learner(&mut self, limit: Duration) -> Result<Status> {
         let mut command = match self.disk {
             Some(bytes) => on_a_disk_of(bytes, &self.run())?,
@@ -197,24 +197,24 @@ impl System {
         Ok(status)
     }
 
-    /// Bytes that the learner has more than before anybody came.
+    /// Bytes by which the learner's memory has grown since its start.
     ///
     /// # Errors
-    /// When there is none, or the system does not say.
+    /// When no learner runs, or the system gives no answer.
     pub fn grown(&self) -> Result<u64> {
         Ok(self.learner.as_ref().context("no learner")?.resident()?.saturating_sub(self.alone))
     }
 
-    /// What the actors' logs say of the answers they got.
+    /// The acknowledged unrolls, from the actors' logs.
     ///
     /// # Errors
-    /// When one is not what an actor writes.
+    /// When a log is not what an actor writes.
     pub fn answered(&self) -> Result<Answered> {
         let mut answered = Answered { unrolls: 0, all: true };
         for log in &self.actors {
             let text = fs::read_to_string(log).context("no log")?;
             let Some((_, last)) = text.rsplit_once("Settled {") else {
-                ensure!(!text.contains("exiting"), "an actor left without a word of its unrolls: {text}");
+                ensure!(!text.contains("exiting"), "an actor ended without logging its unrolls: {text}");
                 answered.all = false;
                 continue;
             };
@@ -229,19 +229,19 @@ impl System {
         Ok(answered)
     }
 
-    /// Starts an actor, which is told nothing but where the learner is.
+    /// Starts an actor that gets only the learner's address.
     ///
     /// # Errors
-    /// When it cannot be started.
+    /// When the program cannot be started.
     pub fn start_actor(&mut self) -> Result<Process> {
         let access = self.access.clone();
         self.start_actor_with(&access, |_| {})
     }
 
-    /// Starts an actor that shows and trusts what `access` says; `change` has the last word.
+    /// Starts an actor with the credentials of `access`. `change` may change its command last.
     ///
     /// # Errors
-    /// When it cannot be started.
+    /// When the program cannot be started.
     pub fn start_actor_with(&mut self, access: &Access, change: impl FnOnce(&mut Command)) -> Result<Process> {
         let mut command = Command::new(program("comic-actor")?);
         command.args(["--learner", &self.url()]).args(flags(access));
@@ -252,17 +252,17 @@ impl System {
     /// Starts `comic-learner status --watch`.
     ///
     /// # Errors
-    /// When it cannot be started.
+    /// When the program cannot be started.
     pub fn start_watching(&mut self) -> Result<Process> {
         let mut command = Command::new(program("comic-learner")?);
         command.args(["status", "--watch", "--learner", &self.url()]).args(flags(&self.access));
         self.spawn("watch", command)
     }
 
-    /// The page at the address for metrics that the learner prints when it serves.
+    /// The metrics page, at the address that the learner logs.
     ///
     /// # Errors
-    /// When it has none, or does not answer.
+    /// When the learner logs no address, or does not answer.
     pub fn metrics_page(&self) -> Result<String> {
         let log = self.learner.as_ref().context("no learner")?.log();
         let mut lines = log.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
@@ -277,18 +277,18 @@ impl System {
     /// Starts an actor in this network namespace.
     ///
     /// # Errors
-    /// When it cannot be started.
+    /// When the program cannot be started.
     pub fn start_actor_on(&mut self, host: &str) -> Result<Process> {
         let mut command = Command::new("ip");
         command.args(["netns", "exec", host]).arg(program("comic-actor")?).args(["--learner", &self.url()]);
         self.spawn("actor", command)
     }
 
-    /// Starts a process that is many actors, which are not real: they send unrolls of zeros as fast as they are taken, and
-    /// read parameters.
+    /// Starts a process of many simulated actors. They send unrolls of zeros as fast as the learner accepts them, and read
+    /// parameters.
     ///
     /// # Errors
-    /// When it cannot be started.
+    /// When the program cannot be started.
     pub fn start_crowd(&mut self, actors: usize) -> Result<Process> {
         let mut command = Command::new(program("comic-bench-learner")?);
         command.args(["crowd", "--host", &self.address(), "--actors", &actors.to_string()]);
@@ -296,10 +296,10 @@ impl System {
         self.spawn("crowd", command)
     }
 
-    /// Starts an actor that simulates so many environments and reaches the learner at `url`.
+    /// Starts an actor with this number of environments that reaches the learner at `url`.
     ///
     /// # Errors
-    /// When it cannot be started.
+    /// When the program cannot be started.
     pub fn start_actor_of(&mut self, environments: u32, url: &str) -> Result<Process> {
         let mut command = Command::new(program("comic-actor")?);
         command.args(["--learner", url, "--environments", &environments.to_string()]);
@@ -309,7 +309,7 @@ impl System {
     /// Runs `comic-learner COMMAND` against the learner and waits for its end.
     ///
     /// # Errors
-    /// When it cannot be started.
+    /// When the program cannot be started.
     pub fn ask(&self, command: &[&str]) -> Result<Output> {
         let mut asking = Command::new(program("comic-learner")?);
         asking.args(command).args(["--learner", &self.url()]).args(flags(&self.access));
@@ -323,7 +323,7 @@ impl System {
         self.started += 1;
         let log = self.directory.path().join(format!("{}-{kind}.log", self.started));
         let output = OpenOptions::new().create(true).append(true).open(&log).context("cannot write a log")?;
-        // Nobody's own directories and settings decide what a test sees.
+        // The user's directories and settings must not change the result of a test.
         let home = self.directory.path().join("home");
         fs::create_dir_all(&home).context("cannot make a home directory")?;
         command.env("HOME", &home).env("XDG_CACHE_HOME", home.join("cache")).env("NO_COLOR", "1");
@@ -336,7 +336,7 @@ impl System {
         if let Some((library, clock)) = &self.clock {
             command.env("LD_PRELOAD", library).env("COMIC_CLOCK", clock);
         }
-        // A crowd goes on until its input ends, which is when the test lets go of it.
+        // A crowd runs until its input ends, when the test drops it.
         let child = command.stdin(Stdio::piped()).stdout(output.try_clone()?).stderr(output).spawn();
         let child = child.with_context(|| format!("cannot start the {kind}"))?;
         if matches!(kind, "actor" | "crowd") {
@@ -345,10 +345,10 @@ impl System {
         Ok(Process { child, log })
     }
 
-    /// What the learner says of itself.
+    /// The learner's status.
     ///
     /// # Errors
-    /// When it does not answer.
+    /// When the learner does not answer.
     pub async fn status(&self) -> Result<Status> {
         let (endpoint, bearer) = (self.access.endpoint(&self.url())?, self.access.bearer()?);
         let call = async {
@@ -358,10 +358,10 @@ impl System {
         tokio::time::timeout(CALL_LIMIT, call).await.context("the learner does not answer")?
     }
 
-    /// Polls the learner's status until `condition` gives something; accounting that do not balance end the test at once.
+    /// Polls the learner's status until `condition` gives a value. Accounting that does not balance is an error at once.
     ///
     /// # Errors
-    /// After `limit`, with `what` was waited for, the last status and the end of the learner's log; or when the learner
+    /// After `limit`, with `what` the test waits for, the last status and the end of the learner's log; or when the learner
     /// has ended.
     pub async fn until<T>(
         &mut self,
@@ -375,7 +375,7 @@ impl System {
             match self.status().await {
                 Ok(status) => {
                     let accounting = status.accounting.unwrap_or_default();
-                    ensure!(balance(&accounting), "{what}: the accounting do not balance: {accounting:?}");
+                    ensure!(balance(&accounting), "{what}: the accounting does not balance: {accounting:?}");
                     if let Some(found) = condition(&status) {
                         return Ok(found);
                     }
@@ -395,7 +395,7 @@ impl System {
     }
 }
 
-/// The learner, with a disk mounted at `run` that it alone sees.
+/// The learner's command. It mounts a disk at `run` that only the learner sees.
 fn on_a_disk_of(bytes: u64, run: &Path) -> Result<Command> {
     fs::create_dir_all(run).context("cannot make the run's directory")?;
     let mut command = Command::new("unshare");
@@ -404,7 +404,7 @@ fn on_a_disk_of(bytes: u64, run: &Path) -> Result<Command> {
     Ok(command)
 }
 
-/// The options that say the same.
+/// The command-line options for this access.
 fn flags(access: &Access) -> Vec<OsString> {
     let Access { ca, cert, key, token_file } = access;
     let flags = [("--ca", ca), ("--cert", cert), ("--key", key), ("--token-file", token_file)];
@@ -430,14 +430,14 @@ pub fn balance(accounting: &Accounting) -> bool {
     produced == trained + dropped + in_flight
 }
 
-/// A number in the status's metrics; 0 while there are none.
+/// A number of the status's metrics, or 0 while there are none.
 pub fn metric(status: &Status, name: &str) -> f64 {
     let metrics: Value = serde_json::from_str(&status.metrics_json).unwrap_or_default();
     metrics[name].as_f64().unwrap_or_default()
 }
 
-/// A port that is free now, below the ephemeral range so that no client gets it while the learner is down, and what keeps
-/// other tests of this process from it: UDP has ports of its own, so the learner can listen there.
+/// A free port below the ephemeral range, so that no client gets it while the learner is down. The UDP socket reserves it
+/// among the tests of this process. UDP ports are separate from TCP ports, so the learner can still listen.
 fn free_port() -> Result<(u16, UdpSocket)> {
     let offset = u16::try_from(std::process::id() % 10_000)?;
     let mut candidates = (0..10_000).map(|step| 20_000 + (offset + step) % 10_000);

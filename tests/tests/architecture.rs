@@ -1,4 +1,6 @@
-//! The invariants of ARCHITECTURE.md that can be read off the repository itself.
+//! The invariants of ARCHITECTURE.md that follow from the repository's own files and dependencies.
+
+use std::collections::BTreeSet;
 
 use anyhow::{Result, ensure};
 use comic_tests::modules::circles;
@@ -8,38 +10,38 @@ const MUJOCO: [&str; 2] = ["mujoco-rs", "mujoco-sys"];
 const LIBTORCH: [&str; 2] = ["tch", "torch-sys"];
 const GRPC: [&str; 2] = ["tonic", "tonic-prost"];
 
-fn knows_nothing_of(package: &str, forbidden: &[&[&str]]) -> Result<()> {
+fn does_not_depend_on(package: &str, forbidden: &[&[&str]]) -> Result<()> {
     let found = dependencies(package)?;
     for name in forbidden.concat() {
-        ensure!(!found.contains(name), "{package} is built from {name}");
+        ensure!(!found.contains(name), "{package} depends on {name}");
     }
     Ok(())
 }
 
 #[test]
-fn the_wire_knows_neither_simulator_nor_libtorch() -> Result<()> {
-    knows_nothing_of("comic-proto", &[&MUJOCO, &LIBTORCH])
+fn proto_depends_on_neither_simulator_nor_libtorch() -> Result<()> {
+    does_not_depend_on("comic-proto", &[&MUJOCO, &LIBTORCH])
 }
 
 #[test]
-fn clips_know_neither_simulator_nor_libtorch_nor_grpc() -> Result<()> {
-    knows_nothing_of("comic-clips", &[&MUJOCO, &LIBTORCH, &GRPC])
+fn clips_depend_on_neither_simulator_nor_libtorch_nor_grpc() -> Result<()> {
+    does_not_depend_on("comic-clips", &[&MUJOCO, &LIBTORCH, &GRPC])
 }
 
 #[test]
-fn tasks_know_neither_libtorch_nor_grpc() -> Result<()> {
-    knows_nothing_of("comic-tasks", &[&LIBTORCH, &GRPC])
+fn tasks_depend_on_neither_libtorch_nor_grpc() -> Result<()> {
+    does_not_depend_on("comic-tasks", &[&LIBTORCH, &GRPC])
 }
 
 #[test]
-fn networks_know_neither_simulator_nor_grpc() -> Result<()> {
-    knows_nothing_of("comic-networks", &[&MUJOCO, &GRPC])
+fn networks_depend_on_neither_simulator_nor_grpc() -> Result<()> {
+    does_not_depend_on("comic-networks", &[&MUJOCO, &GRPC])
 }
 
-/// It shares the unroll's layout with the wire's crate, so gRPC is beneath it; it calls none of it.
+/// Replay needs the unroll's layout from proto, so gRPC is among its indirect dependencies.
 #[test]
-fn replay_knows_neither_simulator_nor_libtorch_and_calls_no_grpc() -> Result<()> {
-    knows_nothing_of("comic-replay", &[&MUJOCO, &LIBTORCH])?;
+fn replay_depends_on_neither_simulator_nor_libtorch_and_names_no_grpc() -> Result<()> {
+    does_not_depend_on("comic-replay", &[&MUJOCO, &LIBTORCH])?;
     let named = direct_dependencies("comic-replay")?;
     ensure!(GRPC.iter().all(|name| !named.contains(*name)), "comic-replay names {GRPC:?}");
     Ok(())
@@ -47,17 +49,23 @@ fn replay_knows_neither_simulator_nor_libtorch_and_calls_no_grpc() -> Result<()>
 
 #[test]
 fn the_learner_links_no_simulator() -> Result<()> {
-    knows_nothing_of("comic-learner", &[&MUJOCO, &["comic-tasks", "comic-actor"]])
+    does_not_depend_on("comic-learner", &[&MUJOCO, &["comic-tasks", "comic-actor"]])
 }
 
 #[test]
-fn actors_know_no_losses() -> Result<()> {
-    knows_nothing_of("comic-actor", &[&["comic-learner"]])
+fn actors_link_no_losses() -> Result<()> {
+    does_not_depend_on("comic-actor", &[&["comic-learner"]])
 }
 
 #[test]
-fn set_up_needs_nothing_of_what_it_sets_up() -> Result<()> {
-    knows_nothing_of("xtask", &[&MUJOCO, &LIBTORCH, &GRPC])
+fn xtask_and_setup_link_nothing_that_they_fetch() -> Result<()> {
+    does_not_depend_on("xtask", &[&MUJOCO, &LIBTORCH, &GRPC])?;
+    does_not_depend_on("comic-setup", &[&MUJOCO, &LIBTORCH, &GRPC])
+}
+
+#[test]
+fn shipped_programs_contain_no_benchmarks() -> Result<()> {
+    ["comic-actor", "comic-learner"].iter().try_for_each(|package| does_not_depend_on(package, &[&["comic-bench"]]))
 }
 
 /// A module and the modules inside it may need each other. With `--no-capture` this lists every circle in full.
@@ -77,7 +85,7 @@ fn no_modules_import_each_other_in_a_circle() -> Result<()> {
     Ok(())
 }
 
-/// A library, a program, a test or a benchmark.
+/// Whether a file is the root of a library, a program, a test or a benchmark.
 fn is_crate_root(path: &str) -> bool {
     let Some((folder, file)) = path.rsplit_once('/') else { return false };
     let folder = folder.rsplit('/').next().unwrap_or_default();
@@ -88,7 +96,17 @@ fn is_crate_root(path: &str) -> bool {
     }
 }
 
-/// Files in which `holds` finds a line, as `path:line`.
+/// The files in these folders, at least one of each.
+fn within(folders: &[&str]) -> Result<Vec<Source>> {
+    let mut sources = sources()?;
+    sources.retain(|source| folders.iter().any(|folder| source.path.starts_with(folder)));
+    for folder in folders {
+        ensure!(sources.iter().any(|source| source.path.starts_with(folder)), "no Rust file is in {folder}");
+    }
+    Ok(sources)
+}
+
+/// The lines that satisfy `holds`, as `path:line`.
 fn places(sources: &[Source], holds: impl Fn(&str) -> bool) -> Vec<String> {
     let lines = sources
         .iter()
@@ -96,20 +114,28 @@ fn places(sources: &[Source], holds: impl Fn(&str) -> bool) -> Vec<String> {
     lines.filter(|(_, _, line)| holds(line)).map(|(source, number, _)| format!("{}:{number}", source.path)).collect()
 }
 
+/// Command-line options may name a low level. All other code works with every low level.
 #[test]
-fn neither_actor_nor_learner_asks_which_low_level_acts() -> Result<()> {
-    let mut sources = sources()?;
-    sources.retain(|source| ["actor/src/", "learner/src/"].iter().any(|crate_| source.path.starts_with(crate_)));
-    ensure!(!sources.is_empty(), "the crates are not where this test looks for them");
+fn neither_actor_nor_learner_names_a_low_level() -> Result<()> {
+    let mut sources = within(&["actor/src/", "learner/src/"])?;
+    sources.retain(|source| !source.path.ends_with("/options.rs"));
     let found = places(&sources, |line| line.contains(concat!("LowLevel", "Name::")) || line.contains(".low_level"));
-    let found: Vec<_> = found.into_iter().filter(|place| !place.starts_with("learner/src/options.rs")).collect();
     ensure!(found.is_empty(), "{found:?}");
+    Ok(())
+}
+
+/// The loop works with every algorithm. One file makes the one that the experiment names.
+#[test]
+fn one_file_of_the_training_loop_names_the_algorithm() -> Result<()> {
+    let found = places(&within(&["learner/src/train/"])?, |line| line.contains("crate::vmpo"));
+    let files: BTreeSet<_> = found.iter().filter_map(|place| place.split(':').next()).collect();
+    ensure!(files.len() <= 1, "{files:?}");
     Ok(())
 }
 
 #[test]
 fn every_channel_is_bounded() -> Result<()> {
-    // Put together here so that this file is not found itself.
+    // `concat!` keeps these lines from being found themselves.
     let signs = [concat!("unbounded", "_channel"), concat!("unbounded", "("), concat!("mpsc::", "channel()")];
     let found = places(&sources()?, |line| signs.iter().any(|sign| line.contains(sign)));
     ensure!(found.is_empty(), "unbounded channels: {found:?}");
@@ -118,16 +144,15 @@ fn every_channel_is_bounded() -> Result<()> {
 
 #[test]
 fn only_the_checkpoint_module_touches_the_learners_checkpoints() -> Result<()> {
-    let learner: Vec<Source> =
-        sources()?.into_iter().filter(|source| source.path.starts_with("learner/src/")).collect();
+    let learner = within(&["learner/src/"])?;
     let found = places(&learner, |line| line.contains("join(\"checkpoints\")") || line.contains("fs::rename"));
-    ensure!(!found.is_empty(), "the checkpoint module is not where this test looks for it");
+    ensure!(!found.is_empty(), "no line of learner/src touches the checkpoint directory");
     let others: Vec<_> = found.iter().filter(|place| !place.starts_with("learner/src/checkpoint")).collect();
     ensure!(others.is_empty(), "other modules touch checkpoints: {others:?}");
     Ok(())
 }
 
-/// Set-up moves what a later run verifies again; everything else that is renamed must survive a power cut.
+/// A renamed file must survive a power cut. Set-up needs no such care, since its next run verifies every file.
 #[test]
 fn files_are_renamed_durably() -> Result<()> {
     let found = places(&sources()?, |line| line.contains(concat!("fs::", "rename(")));
@@ -153,6 +178,50 @@ fn no_test_is_ignored_and_nothing_is_left_for_later() -> Result<()> {
     Ok(())
 }
 
+/// A test that returns early counts as passed. So a test without its requirement must fail, and `cargo xtask test` says
+/// which tests it leaves out. No test reads files outside the repository.
+#[test]
+fn no_test_passes_without_running() -> Result<()> {
+    let signs = [concat!("eprintln!(\"", "skipped"), concat!("../", "shared"), concat!("\"..\", ", "\"shared\"")];
+    let found = places(&sources()?, |line| signs.iter().any(|sign| line.contains(sign)));
+    ensure!(found.is_empty(), "{found:?}");
+    let early: Vec<_> = sources()?.iter().flat_map(early_returns).collect();
+    ensure!(early.is_empty(), "tests that return before their end: {early:?}");
+    Ok(())
+}
+
+/// The tests of a file that return without a value, as `path: name`.
+fn early_returns(source: &Source) -> Vec<String> {
+    let mut found = Vec::new();
+    let mut lines = source.text.lines();
+    while let Some(line) = lines.next() {
+        if !["#[test]", "#[tokio::test"].iter().any(|sign| line.trim_start().starts_with(sign)) {
+            continue;
+        }
+        let Some(head) = lines.find(|line| line.contains("fn ")) else { break };
+        let end = format!("{}}}", &head[..head.len() - head.trim_start().len()]);
+        let mut body = lines.by_ref().take_while(|line| *line != end);
+        if body.any(|line| line.trim() == "return;" || line.contains("else { return };")) {
+            found.push(format!("{}: {}", source.path, head.trim()));
+        }
+    }
+    found
+}
+
+/// Each invariant of ARCHITECTURE.md names the file that holds it.
+#[test]
+fn every_file_that_the_architecture_names_exists() -> Result<()> {
+    let text = std::fs::read_to_string(root().join("ARCHITECTURE.md"))?;
+    let names = text.split('`').skip(1).step_by(2);
+    let paths = names.filter(|name| name.ends_with(".rs") || name.ends_with('/')).filter(|name| name.contains('/'));
+    // Beside a path, a file of the same folder or a folder of the same crate stands without the rest.
+    let files: Vec<String> = sources()?.into_iter().map(|source| source.path).collect();
+    let exists = |path: &str| root().join(path).exists() || files.iter().any(|file| file.contains(&format!("/{path}")));
+    let missing: Vec<_> = paths.filter(|path| !exists(path)).collect();
+    ensure!(missing.is_empty(), "ARCHITECTURE.md names files that do not exist: {missing:?}");
+    Ok(())
+}
+
 #[test]
 fn a_file_is_one_concept_long() -> Result<()> {
     let long = sources()?.into_iter().map(|source| (source.text.lines().count(), source.path));
@@ -166,34 +235,32 @@ fn every_crate_keeps_the_workspaces_lints() -> Result<()> {
     for folder in folders()? {
         let manifest = std::fs::read_to_string(root().join(&folder).join("Cargo.toml"))?;
         let inherited = manifest.contains("[lints]\nworkspace = true");
-        // Where unsafe code cannot be done without, a crate has its own copy, in which it is denied, not forbidden.
+        // A crate that needs unsafe code has its own copy of the lints, which denies unsafe code instead of forbidding it.
         let copied =
             ["unsafe_code = \"deny\"", "missing_docs", "unwrap_used = \"deny\"", "disallowed_methods = \"deny\""]
                 .iter()
                 .all(|lint| manifest.contains(lint));
-        ensure!(inherited || copied, "{folder}/Cargo.toml keeps no lints");
+        ensure!(inherited || copied, "{folder}/Cargo.toml lacks the workspace's lints");
     }
     Ok(())
 }
 
-/// Where foreign functions or the processor's own instructions take it, and nowhere else.
+/// Foreign functions and processor instructions need unsafe code. Only these files call them.
 #[test]
-fn these_files_alone_are_allowed_what_the_compiler_cannot_check() -> Result<()> {
-    const FILES: [&str; 8] = [
+fn unsafe_code_is_in_these_files_only() -> Result<()> {
+    const FILES: [&str; 7] = [
         "learner/src/device/cuda.rs",
         "replay/src/streaming.rs",
-        "tasks/src/arenas.rs",
+        "tasks/src/arenas",
         "tasks/src/humanoid/body.rs",
         "tasks/src/silence.rs",
         "tasks/tests/parity/model.rs",
         "tasks/tests/parity/model_arrays.rs",
-        // Where the word is a crate's lint, above.
-        "tests/tests/architecture.rs",
     ];
-    let found = sources()?.into_iter().filter(|source| source.text.contains(concat!("unsafe", "_code")));
-    let mut found: Vec<_> = found.map(|source| source.path).collect();
-    found.sort();
-    ensure!(found == FILES, "{found:?}");
+    let found = sources()?.into_iter().filter(|source| source.text.contains(concat!("allow(unsafe", "_code")));
+    let found: Vec<_> = found.map(|source| source.path).collect();
+    let expected = found.len() == FILES.len() && found.iter().zip(FILES).all(|(path, file)| path.starts_with(file));
+    ensure!(expected, "{found:?}");
     Ok(())
 }
 

@@ -1,5 +1,5 @@
-//! Where the learner asks for certificates, an actor without one ends at first contact with the exit code that says: do
-//! not try again; and so does one that does not trust the learner's.
+//! When the learner requires client certificates, an actor without one ends at first contact with exit code 2: a retry
+//! would not help. The same holds for an actor that does not trust the learner's certificate.
 
 use std::time::Duration;
 

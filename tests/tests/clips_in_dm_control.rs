@@ -1,4 +1,4 @@
-//! `comic-actor clips` end to end; what it writes is read by dm_control's own loader.
+//! `comic-actor clips` end to end: dm_control's own loader reads the files that it writes.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -8,7 +8,7 @@ use comic_tests::repository::root;
 use comic_tests::system::{program, python};
 use serde_json::Value;
 
-/// m, or a quaternion's part: kinematics of two programs in double precision.
+/// Metres, or parts of a quaternion. Both programs compute in double precision.
 const TOLERANCE: f64 = 1e-9;
 
 fn clips(arguments: &[&str]) -> Result<Output> {
@@ -21,7 +21,7 @@ fn succeeds(arguments: &[&str]) -> Result<String> {
     Ok(String::from_utf8(output.stdout)?)
 }
 
-/// What `tests/python/read_clips.py` says of a file.
+/// The JSON that `tests/python/read_clips.py` prints for a file.
 fn dm_control(file: &str) -> Result<Value> {
     let output = Command::new(python()?).arg(root().join("tests/python/read_clips.py")).arg(file).output()?;
     ensure!(output.status.success(), "dm_control cannot read {file}: {}", String::from_utf8_lossy(&output.stderr));
@@ -38,7 +38,7 @@ fn path(directory: &Path, name: &str) -> String {
 }
 
 #[test]
-fn imported_and_merged_clips_are_read_by_dm_control_with_its_own_kinematics() -> Result<()> {
+fn dm_control_reads_imported_and_merged_clips_and_computes_the_same_kinematics() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let (run, all) = (path(directory.path(), "run.h5"), path(directory.path(), "all.h5"));
     let import = ["import", "--asf", &recording("02.asf"), "--amc", &recording("02_03.amc"), "--out", &run];
@@ -67,12 +67,13 @@ fn imported_and_merged_clips_are_read_by_dm_control_with_its_own_kinematics() ->
 }
 
 #[test]
-fn what_was_taken_gives_the_same_file_again() -> Result<()> {
+fn the_printed_options_give_the_same_file_again() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let (first, second) = (path(directory.path(), "a.h5"), path(directory.path(), "b.h5"));
     let import = ["import", "--asf", &recording("02.asf"), "--amc", &recording("02_03.amc"), "--out"];
     let said = succeeds(&[&import[..], &[&first]].concat())?;
-    let options = said.lines().next().and_then(|line| line.split_once(" with ")).context("nothing said")?.1;
+    let options =
+        said.lines().next().and_then(|line| line.split_once(" with ")).context("the program printed no options")?.1;
     let taken: Vec<&str> = options.split(' ').collect();
     succeeds(&[&import[..], &[&second], &taken].concat())?;
     ensure!(std::fs::read(first)? == std::fs::read(second)?);

@@ -1,4 +1,4 @@
-//! Somebody sets the clock on the wall: nothing that waits, expires or is measured goes by it.
+//! The system clock is set while a run trains: no waiting, timeout or measurement depends on it.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,14 +6,14 @@ use std::process::Command;
 
 use anyhow::{Context as _, Result, ensure};
 use comic_proto::v1::Status;
-use comic_tests::lockstep::{ALL, SLOW_BYTES_PER_SECOND, UPDATES, is_over, learnt, learnt_by, lockstep};
+use comic_tests::lockstep::{ALL, SLOW_BYTES_PER_SECOND, UPDATES, final_state, final_state_of, is_over, lockstep};
 use comic_tests::process::Process;
 use comic_tests::relay::Relay;
 use comic_tests::repository::root;
 use comic_tests::steps::{LIMIT, leaves, now, parameters_arrive, the_accounting_balances_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System, metric};
 
-/// Far enough for another year in every line of a log.
+/// Far enough that every line of a log shows another year.
 const JUMP: i64 = 400 * 86_400;
 
 #[tokio::test]
@@ -28,7 +28,7 @@ async fn nothing_is_lost_when_the_clock_is_set() -> Result<()> {
     for jump in [JUMP, -JUMP] {
         fs::write(&clock, jump.to_string())?;
         says_another_year(&mut actor, jump).await?;
-        trains_on(&mut system, "training goes on").await?;
+        trains_on(&mut system, "training continues").await?;
         parameters_arrive(&mut system, "new parameters arrive").await?;
         let Status { actors, .. } = now(&mut system).await?;
         let actors = actors.context("no actors")?;
@@ -42,10 +42,10 @@ async fn nothing_is_lost_when_the_clock_is_set() -> Result<()> {
 }
 
 #[tokio::test]
-async fn a_clock_that_is_set_changes_nothing_that_is_learnt() -> Result<()> {
+async fn a_changed_clock_does_not_change_the_parameters() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let mut system = lockstep(&[])?;
-    // A line for every update at the least, so that each jump is seen in one.
+    // The learner logs at least one line for every update, so each jump shows in a line.
     system.log_level = Some("info,comic_learner=debug".into());
     let clock = clock_of(&mut system, directory.path())?;
     system.start_learner(LIMIT).await?;
@@ -55,16 +55,16 @@ async fn a_clock_that_is_set_changes_nothing_that_is_learnt() -> Result<()> {
         let what = format!("{updates} updates");
         let done = |status: &Status| Some(metric(status, "updates")).filter(|done| *done >= updates);
         let done = system.until(&what, LIMIT, done).await?;
-        ensure!(done < UPDATES as f64, "the clock is set in the middle of the run, not after {done} updates");
+        ensure!(done < UPDATES as f64, "the clock was set too late: after {done} updates");
         fs::write(&clock, jump.to_string())?;
     }
     let log = is_over(&mut system, &mut actors).await?;
     ensure!([JUMP, -JUMP].iter().all(|jump| says_year_after(&log, *jump)), "the learner did not see both jumps: {log}");
-    ensure!(learnt(&system)? == learnt_by(&[ALL], &[]).await?, "a clock that was set changed something");
+    ensure!(final_state(&system)? == final_state_of(&[ALL], &[]).await?, "a changed clock changed the parameters");
     Ok(())
 }
 
-/// Gives the programs of a system a clock of their own; the file that says how many seconds it is off.
+/// Gives the programs of a system their own clock. Returns the file that holds its offset in seconds.
 fn clock_of(system: &mut System, directory: &Path) -> Result<PathBuf> {
     let (library, clock) = (directory.join("clock.so"), directory.join("clock"));
     compile(&library)?;
@@ -73,7 +73,7 @@ fn clock_of(system: &mut System, directory: &Path) -> Result<PathBuf> {
     Ok(clock)
 }
 
-/// That the jump was seen at all: lines of the log bear the new year.
+/// Checks that the jump had an effect: lines of the log show the new year.
 async fn says_another_year(actor: &mut Process, jump: i64) -> Result<()> {
     actor.until_log("another year", LIMIT, |log| says_year_after(log, jump)).await
 }
@@ -83,7 +83,7 @@ fn says_year_after(log: &str, jump: i64) -> bool {
     log.contains(&format!("\n{year}-"))
 }
 
-/// With the compiler that Rust links with.
+/// Uses the C compiler that Rust links with.
 fn compile(library: &Path) -> Result<()> {
     let source = root().join("tests/fixtures/jumping_clock.c");
     let output = Command::new("cc").args(["-shared", "-fPIC", "-O1", "-o"]).arg(library).arg(&source).output();

@@ -1,6 +1,6 @@
-//! The images and the compose files: real containers, and what happens to them.
+//! The images and the compose files, tested with real containers.
 //!
-//! `cargo xtask test --docker` builds the images first; without it these tests are left out, and it says so.
+//! `cargo xtask test --docker` builds the images first. Without `--docker` it says that these tests are not run.
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
@@ -10,9 +10,9 @@ use anyhow::{Context, Result, bail, ensure};
 use comic_tests::compose::{Project, docker};
 use serde_json::Value;
 
-/// Long enough for two slow cores; no step waits longer than it needs.
+/// Long enough for two slow cores. A step ends as soon as its condition holds.
 const LIMIT: Duration = Duration::from_secs(180);
-/// More unrolls than containers that are gone can have left behind.
+/// More unrolls than removed containers can have in flight.
 const BEYOND_WHAT_IS_LEFT: u64 = 100;
 
 fn trained(status: &Value) -> u64 {
@@ -23,7 +23,7 @@ fn alive(status: &Value) -> u64 {
     status["actors"]["alive"].as_u64().unwrap_or_default()
 }
 
-/// So many actors are there, and what is trained on goes beyond whatever others have left behind.
+/// Waits for this number of actors, and for more trained unrolls than removed actors can have in flight.
 async fn trains_on_with(actors: u64, project: &Project, what: &str) -> Result<Value> {
     let status = project.until(what, LIMIT, |status| alive(status) == actors).await?;
     let before = trained(&status);
@@ -33,26 +33,26 @@ async fn trains_on_with(actors: u64, project: &Project, what: &str) -> Result<Va
 }
 
 #[tokio::test]
-async fn containers_survive_what_happens_to_them_and_their_accounting_balance() -> Result<()> {
+async fn containers_survive_kills_and_cuts_and_the_accounting_balances() -> Result<()> {
     let project = Project::new("faults", &["compose.yaml"]);
     project.up(2)?;
     trains_on_with(2, &project, "two actors train").await?;
-    they_are_what_the_image_promises(&project).await?;
+    check_containers(&project).await?;
     let metrics = get(&project, "learner", "9090", "/metrics")?;
     ensure!(metrics.contains("comic_actors{state=\"alive\"} 2\n"), "Prometheus sees two actors");
     tensorboard_shows_the_curves(&project).await?;
 
     let [killed, kept] = &project.containers("actor")?[..] else { bail!("not two actors") };
     killed.docker(&["kill"])?;
-    trains_on_with(1, &project, "one goes on when the other is killed").await?;
-    ensure!(killed.inspect(".State.ExitCode")? == "137", "it was killed");
+    trains_on_with(1, &project, "one actor trains on when the other is killed").await?;
+    ensure!(killed.inspect(".State.ExitCode")? == "137", "the container was not killed");
     project.up(2)?;
     trains_on_with(2, &project, "it is started again").await?;
 
     let network = project.network();
     docker(&["network", "disconnect", &network, &kept.inspect(".Id")?])?;
-    trains_on_with(1, &project, "one goes on when the other's network is cut").await?;
-    ensure!(kept.inspect(".State.Running")? == "true", "it waits for its learner");
+    trains_on_with(1, &project, "one actor trains on when the network of the other is cut").await?;
+    ensure!(kept.inspect(".State.Running")? == "true", "the actor does not wait for its learner");
     docker(&["network", "connect", &network, &kept.inspect(".Id")?])?;
     kept.until_log_holds("reconnected to the learner", LIMIT).await?;
     trains_on_with(2, &project, "it is back when its network is").await?;
@@ -63,9 +63,9 @@ async fn containers_survive_what_happens_to_them_and_their_accounting_balance() 
     ensure!(learner.inspect(".State.ExitCode")? == "0", "SIGTERM reached the learner: {}", learner.log()?);
     project.compose(&["start", "learner"])?;
     let after = trains_on_with(2, &project, "the learner resumes and the actors find it").await?;
-    ensure!(learner.log()?.contains("resuming"), "it began anew: {}", learner.log()?);
-    ensure!(after["learner_epoch"].as_u64() > before["learner_epoch"].as_u64(), "it is another life");
-    ensure!(trained(&after) > trained(&before), "of the same run");
+    ensure!(learner.log()?.contains("resuming"), "the learner did not resume: {}", learner.log()?);
+    ensure!(after["learner_epoch"].as_u64() > before["learner_epoch"].as_u64(), "the learner epoch did not grow");
+    ensure!(trained(&after) > trained(&before), "the count of trained unrolls did not grow");
 
     project.up(4)?;
     trains_on_with(4, &project, "four actors").await?;
@@ -76,23 +76,26 @@ async fn containers_survive_what_happens_to_them_and_their_accounting_balance() 
         container.until_is(".State.Health.Status", "healthy", LIMIT).await?;
     }
     project.compose(&["stop", "actor"])?;
-    ensure!(healthy.inspect(".State.ExitCode")? == "1", "an actor that is told to stop is not done");
-    let last = project.until("nobody acts", LIMIT, |status| alive(status) == 0).await?;
-    ensure!(last["accounting"]["dropped"]["invalid"] == 0, "nobody sends what is invalid: {last}");
+    ensure!(healthy.inspect(".State.ExitCode")? == "1", "an actor that is told to stop must end with 1");
+    let last = project.until("no actor is connected", LIMIT, |status| alive(status) == 0).await?;
+    ensure!(last["accounting"]["dropped"]["invalid"] == 0, "an actor sent an invalid unroll: {last}");
     Ok(())
 }
 
-/// Nobody's root, nothing to write into, the program itself as the first process, and well by its own account.
-async fn they_are_what_the_image_promises(project: &Project) -> Result<()> {
+/// Each container runs as a user without privileges, on a read-only file system, with the program as process 1, and healthy.
+async fn check_containers(project: &Project) -> Result<()> {
     for (service, program) in [("learner", "comic-learner"), ("actor", "comic-actor")] {
         for container in project.containers(service)? {
             let size = docker(&["image", "inspect", "--format", "{{.Size}}", &container.inspect(".Image")?])?;
             ensure!(size.trim().parse::<u64>()? < 700_000_000, "the image of the {service} has {size} bytes");
-            ensure!(container.exec(&["cat", "/proc/1/comm"])?.trim() == program, "another first process");
+            ensure!(container.exec(&["cat", "/proc/1/comm"])?.trim() == program, "process 1 is another program");
             ensure!(container.exec(&["id", "--user"])?.trim() == "10001", "another user");
-            ensure!(container.exec(&["touch", "/usr/local/bin/file"]).is_err(), "it can write into its image");
-            ensure!(container.inspect(".HostConfig.ReadonlyRootfs")? == "true", "it could as root");
-            // An actor is well from its first steps on, which are some seconds after it joined.
+            ensure!(
+                container.exec(&["touch", "/usr/local/bin/file"]).is_err(),
+                "the container can write into its image"
+            );
+            ensure!(container.inspect(".HostConfig.ReadonlyRootfs")? == "true", "root could write into the image");
+            // An actor is healthy after its first steps, some seconds after it joined.
             let begun = Instant::now();
             while let Err(error) = container.exec(&[program, "health"]) {
                 ensure!(begun.elapsed() < LIMIT, "{service}: {error:#}");
@@ -101,13 +104,13 @@ async fn they_are_what_the_image_promises(project: &Project) -> Result<()> {
         }
     }
     let actor = project.containers("actor")?.into_iter().next().context("no actor")?;
-    ensure!(actor.exec(&["python3", "--version"]).is_err(), "there is a Python in the actor's image");
+    ensure!(actor.exec(&["python3", "--version"]).is_err(), "the actor's image holds Python");
     let libraries = project.in_learner(&["find", "/opt/comic", "-name", "libmujoco*"])?;
-    ensure!(libraries.is_empty(), "there is a MuJoCo in the learner's image: {libraries}");
+    ensure!(libraries.is_empty(), "the learner's image holds MuJoCo: {libraries}");
     Ok(())
 }
 
-/// The profile `tensorboard`: what the learner writes into its volume is read there, by a container that cannot write.
+/// The profile `tensorboard`: a container that cannot write reads the curves from the learner's volume.
 async fn tensorboard_shows_the_curves(project: &Project) -> Result<()> {
     project.compose(&["--profile", "tensorboard", "up", "--detach", "--no-build", "--no-deps", "tensorboard"])?;
     let begun = Instant::now();
@@ -121,12 +124,12 @@ async fn tensorboard_shows_the_curves(project: &Project) -> Result<()> {
     let container = project.container("tensorboard")?;
     container.until_is(".State.Health.Status", "healthy", LIMIT).await?;
     ensure!(container.exec(&["id", "--user"])?.trim() == "10001", "another user");
-    ensure!(container.inspect(".HostConfig.ReadonlyRootfs")? == "true", "it could write into its image as root");
-    ensure!(container.exec(&["touch", "/runs/file"]).is_err(), "it can write into the runs");
+    ensure!(container.inspect(".HostConfig.ReadonlyRootfs")? == "true", "root could write into the image");
+    ensure!(container.exec(&["touch", "/runs/file"]).is_err(), "the container can write into the runs");
     project.compose(&["--profile", "tensorboard", "rm", "--stop", "--force", "tensorboard"]).map(drop)
 }
 
-/// A page at a port that Compose publishes.
+/// Gets a page from a port that Compose publishes.
 fn get(project: &Project, service: &str, port: &str, path: &str) -> Result<String> {
     let address = project.compose(&["--profile", "tensorboard", "port", service, port])?;
     let mut stream = TcpStream::connect(address.trim())?;
@@ -138,7 +141,7 @@ fn get(project: &Project, service: &str, port: &str, path: &str) -> Result<Strin
 }
 
 #[tokio::test]
-async fn containers_with_tls_and_a_token_make_both_themselves() -> Result<()> {
+async fn containers_make_their_own_certificates_and_token() -> Result<()> {
     let project = Project::new("tls", &["compose.yaml", "compose.tls.yaml"]);
     project.up(2)?;
     trains_on_with(2, &project, "two actors train").await?;
@@ -150,13 +153,13 @@ async fn containers_with_tls_and_a_token_make_both_themselves() -> Result<()> {
         "an actor has what is not its own: {shown:?}"
     );
     let refused = project.in_learner(&["env", "--unset=COMIC_TOKEN_FILE", "comic-learner", "status"]);
-    ensure!(refused.is_err_and(|error| format!("{error:#}").contains("token")), "it tells whoever asks");
+    ensure!(refused.is_err_and(|error| format!("{error:#}").contains("token")), "the learner answers without a token");
     Ok(())
 }
 
-/// Ten times within two minutes, and then it is left as it is.
+/// Compose restarts the container ten times within two minutes, then gives up.
 #[tokio::test]
-async fn containers_whose_configuration_is_wrong_are_given_up() -> Result<()> {
+async fn containers_with_a_wrong_configuration_are_restarted_ten_times_only() -> Result<()> {
     let mut project = Project::new("mistake", &["compose.yaml"]);
     project.tell("--set no.such.field=1");
     project.compose(&["up", "--detach", "--no-build", "learner"])?;
@@ -168,7 +171,7 @@ async fn containers_whose_configuration_is_wrong_are_given_up() -> Result<()> {
 }
 
 #[tokio::test]
-async fn containers_end_when_their_run_is_over() -> Result<()> {
+async fn containers_end_when_the_run_is_over() -> Result<()> {
     let mut project = Project::new("over", &["compose.yaml"]);
     project.tell("--set budget.updates=200");
     project.up(2)?;

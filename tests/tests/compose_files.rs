@@ -1,4 +1,4 @@
-//! The compose files and the Dockerfile agree with each other and with the programs; no engine is asked.
+//! The compose files and the Dockerfile agree with each other and with the programs. These tests need no Docker engine.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -7,7 +7,7 @@ use anyhow::{Context, Result, ensure};
 use comic_tests::repository::root;
 use serde_yaml_ng::Value;
 
-/// A file of `deploy`, anchors and merges resolved.
+/// Reads a file of `deploy` and resolves its anchors and merges.
 fn compose(file: &str) -> Result<Value> {
     let mut document: Value = serde_yaml_ng::from_str(&text(file)?)?;
     document.apply_merge()?;
@@ -32,7 +32,7 @@ fn every_container_is_limited_and_writes_where_it_is_told() -> Result<()> {
     let services =
         |document: &Value| Ok::<_, anyhow::Error>(document["services"].as_mapping().context("no services")?.clone());
     let plain = services(&plain)?;
-    // Of the second file, what the first does not have: the rest is laid over it.
+    // The second file is laid over the first: only services that the first does not have are complete in it.
     let own = services(&tls)?.into_iter().filter(|(name, _)| !plain.contains_key(name));
     for (name, service) in plain.iter().map(|(name, service)| (name.clone(), service.clone())).chain(own) {
         ensure!(service["read_only"] == true && service["cap_drop"][0] == "ALL", "{name:?}: {service:?}");
@@ -52,7 +52,7 @@ fn every_container_is_limited_and_writes_where_it_is_told() -> Result<()> {
 }
 
 #[test]
-fn each_has_longer_to_leave_than_it_takes() -> Result<()> {
+fn each_container_has_more_time_to_stop_than_its_program_takes() -> Result<()> {
     let document = compose("compose.yaml")?;
     for (service, seconds) in [("learner", 30), ("actor", 5)] {
         let period = document["services"][service]["stop_grace_period"].as_str().unwrap_or_default().strip_suffix('s');
@@ -61,9 +61,9 @@ fn each_has_longer_to_leave_than_it_takes() -> Result<()> {
     Ok(())
 }
 
-/// A file that is laid over another replaces its command, so everything else is there twice.
+/// A file that is laid over another replaces its command, so both files list the other options.
 #[test]
-fn with_tls_the_learner_is_told_the_same_but_for_who_gets_in() -> Result<()> {
+fn with_tls_the_learner_has_the_same_options_except_for_access() -> Result<()> {
     let plain = command("compose.yaml", "learner")?;
     let tls = command("compose.tls.yaml", "learner")?;
     let at = tls.iter().position(|word| word == "--cert").context("no --cert")?;
@@ -84,8 +84,8 @@ fn arguments_of(dockerfile: &str) -> BTreeSet<String> {
 fn every_argument_of_the_dockerfile_can_be_given_to_compose() -> Result<()> {
     let dockerfile = text("Dockerfile")?;
     let mut asked = arguments_of(&dockerfile);
-    // Of images that compose does not build.
-    ensure!(asked.remove("ACCELERATOR"), "what do the images for accelerators ask for?");
+    // Compose does not build the images for accelerators.
+    ensure!(asked.remove("ACCELERATOR"), "the Dockerfile has no argument ACCELERATOR");
     let given_to = |service: &str| -> Result<(Value, BTreeSet<String>)> {
         let build = compose("compose.yaml")?["services"][service]["build"].clone();
         let given = build["args"].as_mapping().context("no arguments")?;
@@ -109,7 +109,7 @@ fn images_are_built_with_the_workspaces_own_rust() -> Result<()> {
     let manifest = fs::read_to_string(root().join("Cargo.toml"))?;
     let version = manifest.lines().find_map(|line| line.strip_prefix("rust-version = \"")?.strip_suffix('"'));
     let image = format!("rust:{}-bookworm", version.context("no rust-version")?);
-    for file in ["Dockerfile", "compose.yaml", "xtask/src/images.rs"] {
+    for file in ["Dockerfile", "compose.yaml", "../xtask/src/images.rs"] {
         ensure!(text(file)?.contains(&image), "{file} names no {image}");
     }
     Ok(())

@@ -1,4 +1,4 @@
-//! Hundreds and thousands of actors, which are not real: one process carries many, each with a connection of its own.
+//! Hundreds and thousands of simulated actors: one process runs many, each with its own connection.
 
 use std::process::Command;
 use std::time::Duration;
@@ -13,11 +13,11 @@ use comic_tests::system::{SMALL, System, program};
 use serde_json::Value;
 
 const MEGABYTE: u64 = 1_000_000;
-/// Hundreds of connections are made and noticed in this time, whatever else the machine does.
+/// Time in which hundreds of connections are made and counted, even on a busy machine.
 const CROWD_LIMIT: Duration = Duration::from_secs(120);
 
 #[tokio::test]
-async fn actors_become_a_hundred_times_as_many_and_few_again() -> Result<()> {
+async fn a_hundred_times_as_many_actors_come_and_leave() -> Result<()> {
     let mut system = System::new(&SMALL)?;
     system.start_learner(LIMIT).await?;
     let few = system.start_crowd(5)?;
@@ -32,8 +32,11 @@ async fn actors_become_a_hundred_times_as_many_and_few_again() -> Result<()> {
         trains_on(&mut system, "the five that stayed are trained on").await?;
         left.push(system.learner.as_ref().context("no learner")?.resident()?);
     }
-    // What the first crowd used, the allocator keeps for the next, and does not always find again.
-    ensure!(left[2] < left[0] + 60 * MEGABYTE, "each of those who left keeps 60 KB: bytes after each crowd {left:?}");
+    // The allocator keeps the memory of the first crowd for the next one, but cannot always reuse all of it.
+    ensure!(
+        left[2] < left[0] + 60 * MEGABYTE,
+        "each actor that left still takes 60 KB: bytes after each crowd {left:?}"
+    );
     drop(few);
     the_accounting_balances_at_the_end(system).await
 }
@@ -52,7 +55,7 @@ async fn fifty_actors_come_back_to_a_learner_that_was_killed() -> Result<()> {
     let resumed = accounting(&kill_and_restart_the_learner(&mut system).await?).trained;
     actors(&mut system, 50).await?;
     trains_on(&mut system, "fifty actors' unrolls are trained on again").await?;
-    // What was acknowledged and trained on after the checkpoint has a name, once every actor told its next number.
+    // The accounting names the unrolls that were trained on after the checkpoint, once every actor has sent its next number.
     let counted = |status: &Status| accounting(status).dropped_lost_at_restart >= before.saturating_sub(resumed);
     system.until("what the learner lost is counted", LIMIT, |status| counted(status).then_some(())).await?;
     drop(crowd);
@@ -66,16 +69,17 @@ async fn actors(system: &mut System, wanted: u64) -> Result<()> {
 }
 
 #[test]
-fn a_thousand_readers_that_stop_cost_less_than_60_mb_and_delay_nobody() -> Result<()> {
+fn a_thousand_readers_that_stop_cost_less_than_60_mb_and_delay_no_one() -> Result<()> {
     let output = Command::new(program("comic-bench-learner")?)
         .args(["stalled", "--connections", "1000", "--parameters", "2000000"])
+        .env("RUST_LOG", "warn")
         .output()?;
     ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let figure: Value = serde_json::from_slice(&output.stdout).context("no figure")?;
     let number = |name: &str| figure[name].as_f64().with_context(|| format!("no `{name}` in {figure}"));
     ensure!(number("stalled")? == 1000.0, "{figure}");
     ensure!(number("value")? < 60.0, "more than 60 MB: {figure}");
-    // At the median: a version that nobody gets on with gives its place away after five seconds, once.
+    // This is the median. A version that no reader can finish loses its place after five seconds, once.
     ensure!(number("a_healthy_reader_waits_s")? < 5.0, "{figure}");
     Ok(())
 }

@@ -1,7 +1,7 @@
-//! A disk without room: training goes on, says so, and checkpoints come back as soon as there is room again.
+//! A full disk: training continues and logs the errors; checkpoints are written again as soon as there is room.
 //!
-//! The learner gets a disk of its own, which takes root: where that cannot be made, `cargo xtask test` says so and leaves
-//! this out.
+//! The learner gets its own disk, which needs root. On a machine where that is impossible, `cargo xtask test` says that
+//! these tests are not run.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::Write as _;
@@ -11,7 +11,7 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result, ensure};
 use comic_proto::v1::Status;
-use comic_tests::lockstep::{ALL, SLOW_BYTES_PER_SECOND, UPDATES, is_over, learnt_by, learnt_in, lockstep};
+use comic_tests::lockstep::{ALL, SLOW_BYTES_PER_SECOND, UPDATES, final_state_in, final_state_of, is_over, lockstep};
 use comic_tests::relay::Relay;
 use comic_tests::steps::{
     LIMIT, checkpoint_in, half_written, leaves, now, the_accounting_balances_at_the_end, trains_on,
@@ -21,12 +21,12 @@ use comic_tests::tensorboard::curves;
 
 /// Room for a few dozen checkpoints.
 const DISK: u64 = 64 << 20;
-/// What the learner's log says of every checkpoint that was refused.
+/// The learner's log line for every checkpoint that could not be written.
 const REFUSED: &str = "checkpoint not written";
 
 #[tokio::test]
-async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
-    // Without it nobody could read what is written below, whatever it is.
+async fn on_a_full_disk_only_checkpoints_are_lost() -> Result<()> {
+    // Without this file no one could read the curves below.
     python()?;
     let mut system = System::new(&[&SMALL[..], &["--metrics-port", "0"]].concat())?;
     system.disk = Some(DISK);
@@ -42,27 +42,27 @@ async fn a_full_disk_costs_checkpoints_and_nothing_else() -> Result<()> {
     let page = system.metrics_page()?;
     let failed = page.lines().find_map(|line| line.strip_prefix("comic_checkpoints_total{result=\"failed\"} "));
     ensure!(failed.context("no metric")?.parse::<u64>()? >= 2, "{page}");
-    trains_on(&mut system, "training goes on").await?;
+    trains_on(&mut system, "training continues").await?;
     system.until("what is half-written goes away", LIMIT, |_| (half_written(&run)? == 0).then_some(())).await?;
 
     let before = checkpoint_in(&run);
     fs::remove_file(&filler)?;
     system.until("checkpoints are written again", LIMIT, |_| (checkpoint_in(&run) > before).then_some(())).await?;
     let step = system.until("an answer", LIMIT, |status| Some(metric(status, "environment_steps"))).await?;
-    // A line of which half was written would be the last that TensorBoard reads.
+    // TensorBoard would stop at a line that was only half written.
     let last = |run: &Path| Some(curves(&run.join("tensorboard")).ok()?.get("updates")?.last()?.0 as f64);
-    system.until("TensorBoard sees what is learnt since", LIMIT, |_| (last(&run)? > step).then_some(())).await?;
+    system.until("TensorBoard sees newer updates", LIMIT, |_| (last(&run)? > step).then_some(())).await?;
     leaves(actor).await?;
     the_accounting_balances_at_the_end(system).await
 }
 
 #[tokio::test]
-async fn a_full_disk_changes_nothing_that_is_learnt() -> Result<()> {
+async fn on_a_full_disk_the_parameters_are_the_same() -> Result<()> {
     let mut system = lockstep(&[])?;
     system.disk = Some(DISK);
     system.start_learner(LIMIT).await?;
     let seen = system.learner.as_ref().context("no learner")?.sees(&system.run());
-    // As long as somebody has it open the disk stays, also when the learner is gone.
+    // The open directory keeps the disk after the learner has ended.
     let disk = File::open(&seen)?;
     let run = PathBuf::from(format!("/proc/self/fd/{}", disk.as_raw_fd()));
     system
@@ -72,21 +72,21 @@ async fn a_full_disk_changes_nothing_that_is_learnt() -> Result<()> {
     fill(&filler)?;
     let relay = Relay::start(system.address(), SLOW_BYTES_PER_SECOND).await?;
     let actor = system.start_actor_of(ALL, &relay.url)?;
-    // The warm start's checkpoint, and one in the middle of training.
+    // One is the warm start's checkpoint, the other one falls in the middle of training.
     fill_until_refused(&mut system, &filler, 1).await?;
     let updates = |status: &Status| metric(status, "updates");
     system.until("an update", LIMIT, |status| (updates(status) >= 1.0).then_some(())).await?;
     let refused = system.learner.as_ref().context("no learner")?.log().matches(REFUSED).count();
     fill_until_refused(&mut system, &filler, refused + 1).await?;
     let done = updates(&now(&mut system).await?);
-    ensure!(done < UPDATES as f64, "the disk was full until {done} updates, which is to the end");
+    ensure!(done < UPDATES as f64, "the disk was full to the end: {done} updates");
     fs::remove_file(&filler)?;
     is_over(&mut system, &mut [actor]).await?;
-    ensure!(learnt_in(&run)? == learnt_by(&[ALL], &[]).await?, "a disk without room changed something");
+    ensure!(final_state_in(&run)? == final_state_of(&[ALL], &[]).await?, "a full disk changed the parameters");
     Ok(())
 }
 
-/// Takes what room there is, again and again, until so many checkpoints were refused.
+/// Fills the disk again and again until this number of checkpoints could not be written.
 async fn fill_until_refused(system: &mut System, filler: &Path, checkpoints: usize) -> Result<()> {
     let learner = system.learner.as_mut().context("no learner")?;
     let deadline = Instant::now() + LIMIT;
@@ -99,7 +99,7 @@ async fn fill_until_refused(system: &mut System, filler: &Path, checkpoints: usi
     Ok(())
 }
 
-/// Takes what room there is.
+/// Fills the disk.
 fn fill(path: &Path) -> Result<()> {
     let mut file = OpenOptions::new().create(true).append(true).open(path)?;
     let block = [0; 4096];

@@ -1,4 +1,4 @@
-//! An expired certificate keeps actors out only until it is renewed: neither learner nor actor is started again.
+//! An expired certificate refuses actors only until it is renewed. Neither the learner nor the actor restarts.
 
 use std::time::Duration;
 
@@ -20,12 +20,12 @@ async fn actors_wait_for_the_renewed_certificate() -> Result<()> {
     system.access = authority.access(Some("own"));
     system.start_learner(LIMIT).await?;
     authority.issue("server", -60)?;
-    ensure!(system.status().await.is_err(), "an expired certificate is taken by a client");
+    ensure!(system.status().await.is_err(), "a client accepted an expired certificate");
 
     let mut actor = system.start_actor_with(&authority.access(Some("client")), |_| {})?;
     actor.until_log_holds("no connection to the learner", LIMIT).await?;
     authority.issue("server", 60)?;
-    // Now it is the actor's that has expired.
+    // Now the actor's certificate has expired.
     actor.until_log_holds("CertificateExpired", LIMIT).await?;
     authority.issue("client", 60)?;
     actor.until_log_holds("joined the learner", LIMIT).await

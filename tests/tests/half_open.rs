@@ -1,5 +1,5 @@
-//! A peer that is there and does not answer for a minute: noticed within half of it, on both sides, and welcome again
-//! afterwards.
+//! A peer stays connected but does not answer for a minute. The other side notices within half a minute, and accepts the
+//! peer again afterwards.
 
 use std::time::Duration;
 
@@ -8,13 +8,13 @@ use comic_tests::steps::{LIMIT, leaves, the_accounting_balances_at_the_end, trai
 use comic_tests::system::{SMALL, System};
 use tokio::time::{Instant, sleep_until};
 
-/// What is promised.
+/// The documented time in which a silent peer is noticed.
 const NOTICED: Duration = Duration::from_secs(30);
 /// How long a peer is stopped.
 const STOPPED: Duration = Duration::from_secs(60);
 
 #[tokio::test]
-async fn a_stopped_actor_is_given_up_and_comes_back() -> Result<()> {
+async fn a_stopped_actor_is_counted_as_lost_and_joins_again() -> Result<()> {
     let mut system = System::new(&SMALL)?;
     system.start_learner(LIMIT).await?;
     let mut stopped = system.start_actor()?;
@@ -39,7 +39,7 @@ async fn a_stopped_actor_is_given_up_and_comes_back() -> Result<()> {
 }
 
 #[tokio::test]
-async fn a_stopped_learner_is_noticed_and_served_again() -> Result<()> {
+async fn a_stopped_learner_is_noticed_and_its_actor_joins_again() -> Result<()> {
     let mut system = System::new(&SMALL)?;
     system.start_learner(LIMIT).await?;
     let mut actor = system.start_actor()?;
@@ -54,7 +54,7 @@ async fn a_stopped_learner_is_noticed_and_served_again() -> Result<()> {
     learner.resume()?;
 
     actor.until_log_holds("reconnected to the learner", LIMIT).await?;
-    trains_on(&mut system, "training goes on").await?;
+    trains_on(&mut system, "training continues").await?;
     leaves(actor).await?;
     the_accounting_balances_at_the_end(system).await
 }

@@ -1,5 +1,5 @@
-//! The Kubernetes manifests of every overlay: read strictly, held against what a cluster should ask of them, and against the
-//! programs themselves.
+//! The Kubernetes manifests of every overlay: they are read strictly, and compared with the rules of a careful cluster and
+//! with the programs.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -24,7 +24,7 @@ use serde_json::{Value, json};
 const LIMIT: Duration = Duration::from_secs(120);
 
 #[test]
-fn what_kubernetes_does_not_know_is_refused() -> Result<()> {
+fn a_field_that_kubernetes_does_not_know_is_refused() -> Result<()> {
     let manifest = |field: &str| {
         json!({
             "apiVersion": "v1", "kind": "Service", "metadata": { "name": "a" },
@@ -39,17 +39,17 @@ fn what_kubernetes_does_not_know_is_refused() -> Result<()> {
 }
 
 #[test]
-fn what_is_said_twice_is_refused() -> Result<()> {
+fn a_field_that_is_given_twice_is_refused() -> Result<()> {
     let service = "kind: Service\nmetadata: {name: a}\n";
     ensure!(manifests_in(service)?.len() == 1);
     for twice in [format!("{service}---\n{service}"), format!("{service}metadata: {{name: b}}\n")] {
-        ensure!(manifests_in(&twice).is_err(), "taken: {twice}");
+        ensure!(manifests_in(&twice).is_err(), "accepted: {twice}");
     }
     Ok(())
 }
 
 #[test]
-fn probes_ask_what_answers() -> Result<()> {
+fn probes_use_ports_and_commands_that_exist() -> Result<()> {
     each(|cluster| {
         let learner = container(cluster.learner_pod()?)?;
         for (probe, path) in [
@@ -103,7 +103,7 @@ fn names_and_ports_agree_with_each_other_and_with_the_programs() -> Result<()> {
         ensure!(service.cluster_ip.as_deref() == Some("None"), "one learner needs no virtual address");
         ensure!(
             service.publish_not_ready_addresses == Some(true),
-            "who is never ready could not say that a run is over"
+            "an actor must reach a learner that is not ready, to hear that the run is over"
         );
         let name = cluster.service.metadata.name.as_deref().unwrap_or_default();
         let set = &cluster.learner.spec;
@@ -118,7 +118,7 @@ fn names_and_ports_agree_with_each_other_and_with_the_programs() -> Result<()> {
     })
 }
 
-/// What `--help` says is taken where nothing is given.
+/// The default of an option, from the `--help` text.
 fn default_of(option: &str, help: &str) -> Result<i32> {
     let behind = help.split(option).nth(1).with_context(|| format!("no {option}"))?;
     let default = behind.split("[default: ").nth(1).and_then(|text| text.split(']').next());
@@ -158,7 +158,7 @@ fn suffixed(name: &str, device: Option<&str>) -> String {
 }
 
 #[test]
-fn actors_are_a_job_that_grows_and_ends_as_their_exit_codes_say() -> Result<()> {
+fn actors_are_an_indexed_job_that_follows_their_exit_codes() -> Result<()> {
     each(|cluster| {
         let job = cluster.actors.spec.as_ref().context("no spec")?;
         ensure!(job.completion_mode.as_deref() == Some("Indexed"), "only an indexed Job grows");
@@ -166,8 +166,8 @@ fn actors_are_a_job_that_grows_and_ends_as_their_exit_codes_say() -> Result<()> 
         ensure!(job.completions == Some(parallelism), "{parallelism} at once of {:?}", job.completions);
         let pod = cluster.actor_pod()?;
         let name = option(container(pod)?, "--name")?;
-        ensure!(name.contains("$(JOB_COMPLETION_INDEX)"), "{name}: all pods but one would be superseded");
-        ensure!(pod.restart_policy.as_deref() == Some("Never"), "a policy for failures takes this");
+        ensure!(name.contains("$(JOB_COMPLETION_INDEX)"), "{name}: each pod would replace the others");
+        ensure!(pod.restart_policy.as_deref() == Some("Never"), "a pod failure policy needs this restart policy");
         let name = container(pod)?.name.as_str();
         let rules = &job.pod_failure_policy.as_ref().context("no policy for failures")?.rules;
         let of_code = |code| {
@@ -194,17 +194,17 @@ fn actors_are_a_job_that_grows_and_ends_as_their_exit_codes_say() -> Result<()> 
         );
         ensure!(
             budget.unhealthy_pod_eviction_policy.as_deref() == Some("AlwaysAllow"),
-            "a learner away holds up drains"
+            "an absent learner would block the draining of nodes"
         );
         let labels = job.template.metadata.as_ref().and_then(|metadata| metadata.labels.as_ref());
         ensure!(budget.selector.as_ref().and_then(|selector| selector.match_labels.as_ref()) == labels);
         let spread = pod.topology_spread_constraints.iter().flatten().next().context("they are not spread")?;
         ensure!(spread.label_selector.as_ref().and_then(|selector| selector.match_labels.as_ref()) == labels);
-        // As evenly as it goes; a small cluster takes them all the same.
+        // Pods spread as evenly as possible. A small cluster still runs all of them.
         let (over, skew, otherwise) = (&*spread.topology_key, spread.max_skew, &*spread.when_unsatisfiable);
         ensure!((over, skew, otherwise) == ("kubernetes.io/hostname", 1, "ScheduleAnyway"), "{spread:?}");
         let allowed: i32 = option(container(cluster.learner_pod()?)?, "--max-actors")?.parse()?;
-        ensure!(parallelism <= allowed, "{parallelism} actors, and the learner takes {allowed}");
+        ensure!(parallelism <= allowed, "{parallelism} actors, but the learner accepts {allowed}");
         Ok(())
     })
 }
@@ -214,9 +214,15 @@ fn only_actors_reach_the_learners_port() -> Result<()> {
     each(|cluster| {
         let everybody = cluster.policies["comic"].spec.as_ref().context("no spec")?;
         let chosen = everybody.pod_selector.as_ref().context("no pods")?;
-        ensure!(chosen.match_labels.is_none() && chosen.match_expressions.is_none(), "not everybody");
-        ensure!(everybody.policy_types.as_deref() == Some(&["Ingress".to_owned(), "Egress".to_owned()]), "one way");
-        ensure!(everybody.ingress.is_none() && everybody.egress.is_none(), "somebody gets through");
+        ensure!(
+            chosen.match_labels.is_none() && chosen.match_expressions.is_none(),
+            "the policy does not choose every pod"
+        );
+        ensure!(
+            everybody.policy_types.as_deref() == Some(&["Ingress".to_owned(), "Egress".to_owned()]),
+            "the policy covers only one direction"
+        );
+        ensure!(everybody.ingress.is_none() && everybody.egress.is_none(), "the policy lets traffic through");
         let learner = cluster.learner.spec.template.metadata.as_ref().and_then(|metadata| metadata.labels.as_ref());
         let job = cluster.actors.spec.as_ref().context("no spec")?;
         let actors = job.template.metadata.as_ref().and_then(|metadata| metadata.labels.as_ref());
@@ -225,7 +231,7 @@ fn only_actors_reach_the_learners_port() -> Result<()> {
             .map(|port| (port.name.as_deref().unwrap_or_default(), format!("TCP {}", port.container_port)))
             .collect();
         let port = |name: &str| vec![ports[name].clone()];
-        // Beside that one, each policy lets somebody through: this is all of it.
+        // Every other policy allows some traffic. These are all of them.
         let ways = allowed(cluster, "comic-learner", learner, |policy| {
             policy.ingress.iter().flatten().map(ingress).collect()
         })?;
@@ -247,7 +253,7 @@ type Way = (Value, Value, Vec<String>);
 
 type Labels = BTreeMap<String, String>;
 
-/// Who gets through by the policy of this name, which is for the pods of these labels.
+/// The traffic that this policy allows. It must choose the pods with these labels.
 fn allowed(
     cluster: &Cluster,
     name: &str,
@@ -291,7 +297,7 @@ fn way(peers: Option<&[NetworkPolicyPeer]>, ports: Option<&[NetworkPolicyPort]>)
     }
 }
 
-/// Secrets are made by hand: everything that the programs read is in a Secret as deploy/README.md makes it.
+/// Users make the Secrets. The commands in deploy/README.md put every file there that the programs read.
 #[test]
 fn secrets_hold_what_the_programs_read() -> Result<()> {
     let readme = fs::read_to_string(root().join("deploy/README.md"))?.replace("\\\n", "");
@@ -303,7 +309,7 @@ fn secrets_hold_what_the_programs_read() -> Result<()> {
                 volume.secret.as_ref().and_then(|secret| secret.secret_name.as_deref()).context("no Secret")?;
             let command = readme.lines().find(|line| line.contains(&format!("create secret generic {secret} ")));
             let made: BTreeSet<_> = command
-                .with_context(|| format!("nobody makes the Secret {secret}"))?
+                .with_context(|| format!("no command makes the Secret {secret}"))?
                 .split_whitespace()
                 .filter_map(|word| word.strip_prefix("--from-file=access/"))
                 .collect();
@@ -315,15 +321,15 @@ fn secrets_hold_what_the_programs_read() -> Result<()> {
                 .chain(environment(container).into_values())
                 .collect();
             let read: BTreeSet<_> = read.into_iter().filter_map(|word| word.strip_prefix("/access/")).collect();
-            ensure!(read == made, "read are {read:?}, made are {made:?}");
+            ensure!(read == made, "the programs read {read:?}, the commands make {made:?}");
         }
         Ok(())
     })
 }
 
-/// The real programs with the arguments of the manifests: the learner serves, and an actor joins it.
+/// Runs the real programs with the arguments of the manifests: the learner serves, and an actor joins it.
 #[tokio::test]
-async fn the_programs_take_what_the_manifests_tell_them() -> Result<()> {
+async fn the_programs_accept_the_arguments_of_the_manifests() -> Result<()> {
     let access = tempfile::tempdir()?;
     let mut certs = std::process::Command::new(program("comic-learner")?);
     certs.args(["certs", "--token", "--name", "comic-learner", "localhost", "--out"]).arg(access.path());
@@ -336,14 +342,14 @@ async fn the_programs_take_what_the_manifests_tell_them() -> Result<()> {
         let cluster = Cluster::read(render(&directory)?)?;
         let (learner, actor) = (container(cluster.learner_pod()?)?, container(cluster.actor_pod()?)?);
         let mut told: Vec<String> = learner.args.iter().flatten().map(|word| place(word)).collect();
-        // Where the run lies and which ports are free, the test decides.
+        // The test chooses the run's directory and free ports.
         let run = told.iter().position(|word| word == "--run").context("no --run")?;
         told.drain(run..run + 2);
         let port = told.iter().position(|word| word == "--metrics-port").context("no --metrics-port")?;
         "0".clone_into(&mut told[port + 1]);
         let token = environment(learner).get("COMIC_TOKEN_FILE").map(|file| place(file)).context("no token")?;
         told.extend(["--token-file".to_owned(), token]);
-        // This learner was built for a CPU: it takes the word, names it, and is none the worse without.
+        // This learner was built for a CPU. It parses the device, names it in its error, and runs without the option.
         if let Some(device) = told.iter().position(|word| word == "--device") {
             let words: Vec<String> = told.drain(device..device + 2).collect();
             let run = tempfile::tempdir()?;

@@ -1,4 +1,4 @@
-//! Pods of every overlay, held against what a cluster should ask of them: who runs them, what they take, what they keep.
+//! Compares the pods of every overlay with the rules of a careful cluster: their user, their resources, their volumes.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -10,7 +10,7 @@ use comic_tests::repository::root;
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
 #[test]
-fn what_is_taken_is_asked_for_and_limited() -> Result<()> {
+fn resources_are_requested_and_limited() -> Result<()> {
     each(|cluster| {
         for pod in cluster.pods()? {
             let resources = container(pod)?.resources.as_ref().context("no resources")?;
@@ -34,38 +34,54 @@ fn pods_are_restricted() -> Result<()> {
         ensure!(labels.get("pod-security.kubernetes.io/enforce").is_some_and(|level| level == "restricted"));
         for pod in cluster.pods()? {
             let whole = pod.security_context.as_ref().context("no security context")?;
-            ensure!(whole.run_as_non_root == Some(true) && whole.run_as_user == Some(user), "who runs it?");
-            ensure!(whole.fs_group.is_some() && whole.fs_group == whole.run_as_group, "it cannot read its Secret");
-            ensure!(whole.seccomp_profile.as_ref().is_some_and(|profile| profile.type_ == "RuntimeDefault"), "seccomp");
-            ensure!([pod.host_network, pod.host_pid, pod.host_ipc].iter().all(Option::is_none), "a share of the host");
-            ensure!(pod.automount_service_account_token == Some(false), "a token for the cluster");
+            ensure!(
+                whole.run_as_non_root == Some(true) && whole.run_as_user == Some(user),
+                "the pod names no user of its own"
+            );
+            ensure!(whole.fs_group.is_some() && whole.fs_group == whole.run_as_group, "the pod cannot read its Secret");
+            ensure!(
+                whole.seccomp_profile.as_ref().is_some_and(|profile| profile.type_ == "RuntimeDefault"),
+                "the pod has another seccomp profile"
+            );
+            ensure!(
+                [pod.host_network, pod.host_pid, pod.host_ipc].iter().all(Option::is_none),
+                "the pod shares a namespace of the host"
+            );
+            ensure!(pod.automount_service_account_token == Some(false), "the pod gets a token for the cluster");
             let container = container(pod)?;
             let own = container.security_context.as_ref().context("no security context")?;
-            ensure!(own.allow_privilege_escalation == Some(false) && own.privileged.is_none(), "privileges");
-            // What a container says goes before what its pod says.
+            ensure!(
+                own.allow_privilege_escalation == Some(false) && own.privileged.is_none(),
+                "the container may gain privileges"
+            );
+            // A container's setting overrides its pod's.
             let overruled = own.run_as_user.is_some() || own.run_as_non_root.is_some() || own.run_as_group.is_some();
-            ensure!(!overruled && own.seccomp_profile.is_none(), "the pod is overruled");
-            ensure!(own.read_only_root_filesystem == Some(true), "it writes into its image");
+            ensure!(!overruled && own.seccomp_profile.is_none(), "the container overrides its pod");
+            ensure!(own.read_only_root_filesystem == Some(true), "the container can write into its image");
             let capabilities = own.capabilities.as_ref().context("capabilities")?;
             ensure!(
                 capabilities.drop.as_deref() == Some(&["ALL".to_owned()]) && capabilities.add.is_none(),
                 "capabilities"
             );
             for volume in pod.volumes.iter().flatten() {
-                ensure!(volume.secret.is_some() || volume.empty_dir.is_some(), "what is {}?", volume.name);
+                ensure!(
+                    volume.secret.is_some() || volume.empty_dir.is_some(),
+                    "volume {} is neither a Secret nor an empty directory",
+                    volume.name
+                );
             }
         }
         Ok(())
     })
 }
 
-/// The number of the one user as whom every image with a program runs.
+/// The number of the user of every image with a program.
 fn user_of_the_images() -> Result<i64> {
     let dockerfile = fs::read_to_string(root().join("deploy/Dockerfile"))?;
     let stages = dockerfile.split("\nFROM ").filter(|stage| stage.contains("\nENTRYPOINT "));
     let users = stages.map(|stage| {
         let user = stage.lines().find_map(|line| line.strip_prefix("USER ")?.split(':').next());
-        Ok(user.with_context(|| format!("nobody in FROM {}", stage.lines().next().unwrap_or_default()))?.parse()?)
+        Ok(user.with_context(|| format!("no user in FROM {}", stage.lines().next().unwrap_or_default()))?.parse()?)
     });
     let users = users.collect::<Result<Vec<i64>>>()?;
     let [user, others @ ..] = &users[..] else { bail!("no image") };
@@ -85,7 +101,7 @@ fn a_run_outlives_its_pod() -> Result<()> {
         let claim = claim.and_then(|claim| claim.spec.as_ref()).context("the volume is the pod's own")?;
         ensure!(claim.access_modes.as_deref() == Some(&["ReadWriteOnce".to_owned()]), "{claim:?}");
         let requests = claim.resources.as_ref().and_then(|resources| resources.requests.as_ref());
-        ensure!(amount(&requests.context("how large?")?["storage"])? > 0.0, "{requests:?}");
+        ensure!(amount(&requests.context("the claim has no size")?["storage"])? > 0.0, "{requests:?}");
         ensure!(mount.read_only.is_none() && mount.sub_path.is_none(), "{mount:?}");
         Ok(())
     })
@@ -101,7 +117,7 @@ fn a_learner_has_time_for_its_last_checkpoint_and_an_actor_for_its_unrolls() -> 
 }
 
 #[test]
-fn who_computes_on_an_accelerator_asks_for_one_and_tolerates_its_nodes() -> Result<()> {
+fn a_learner_on_an_accelerator_requests_one_and_tolerates_its_nodes() -> Result<()> {
     each(|cluster| {
         let pod = cluster.learner_pod()?;
         let learner = container(pod)?;
@@ -109,7 +125,7 @@ fn who_computes_on_an_accelerator_asks_for_one_and_tolerates_its_nodes() -> Resu
         let taken: Vec<_> = limits.iter().filter(|(name, _)| name.contains('/')).collect();
         let tolerated: Vec<_> = pod.tolerations.iter().flatten().filter_map(|node| node.key.as_deref()).collect();
         match option(learner, "--device").ok() {
-            None => ensure!(taken.is_empty() && tolerated.is_empty(), "{taken:?} for nothing"),
+            None => ensure!(taken.is_empty() && tolerated.is_empty(), "{taken:?}, but the learner computes on a CPU"),
             Some(device) => {
                 let resource = BTreeMap::from([("cuda", "nvidia.com/gpu"), ("xla", "google.com/tpu")])[device];
                 let [(name, Quantity(count))] = taken[..] else { bail!("{taken:?}") };

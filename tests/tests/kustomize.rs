@@ -1,4 +1,4 @@
-//! The rendering that the other tests go by is kustomize's own.
+//! The other tests render the manifests themselves. kustomize gives the same result.
 
 use std::path::Path;
 use std::process::Command;
@@ -16,7 +16,7 @@ fn kustomize_renders_the_same() -> Result<()> {
     Ok(())
 }
 
-/// What kustomize makes of a directory, or kubectl, which has it built in.
+/// Renders a directory with kustomize, or with kubectl, which contains it.
 fn kustomize(directory: &Path) -> Result<String> {
     let alone = Command::new("kustomize").arg("build").arg(directory).output();
     let output = alone.or_else(|_| Command::new("kubectl").arg("kustomize").arg(directory).output());

@@ -1,4 +1,4 @@
-//! On an address that others can reach the learner does not start without protection, and says what to do.
+//! The learner does not start without protection on an address that other machines can reach. Its error names the remedy.
 
 use std::process::Command;
 
@@ -6,7 +6,7 @@ use anyhow::{Result, ensure};
 use comic_tests::system::program;
 
 #[test]
-fn the_learner_does_not_serve_strangers_unless_told() -> Result<()> {
+fn the_learner_serves_other_machines_without_protection_only_when_told() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let mut command = Command::new(program("comic-learner")?);
     command.args(["--preset", "quickstart", "--address", "0.0.0.0", "--port", "0", "--run"]).arg(directory.path());

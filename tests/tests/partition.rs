@@ -1,6 +1,6 @@
-//! A learner and an actor on hosts of their own, and a network between them that loses everything for a while.
+//! A learner and an actor on separate hosts. The network between them loses everything for a while.
 //!
-//! Hosts are network namespaces, which take root: where they cannot be made, `cargo xtask test` says so and leaves these out.
+//! Hosts are network namespaces, which need root. Without it, `cargo xtask test` says that these tests are not run.
 
 use std::net::Ipv4Addr;
 use std::process::Command;
@@ -10,7 +10,7 @@ use anyhow::{Context as _, Result, ensure};
 use comic_tests::steps::{LIMIT, leaves, the_accounting_balances_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
 
-/// What is promised.
+/// The documented time in which a silent peer is noticed.
 const NOTICED: Duration = Duration::from_secs(30);
 
 /// The actor's host, at the other end of a cable.
@@ -23,11 +23,11 @@ struct Host {
 }
 
 impl Host {
-    /// `number` keeps the tests' hosts apart.
+    /// `number` is different in every test, so their hosts are different.
     fn new(number: u8) -> Result<Self> {
         let name = format!("comic-{}-{number}", std::process::id());
         let (cable, end) = (format!("cl{}{number}", std::process::id()), format!("ca{}{number}", std::process::id()));
-        // Four addresses of 10.128.0.0/9 that are this test's alone; what an interrupted run left behind has others.
+        // Only this test uses these four addresses of 10.128.0.0/9. Hosts of an interrupted run have others.
         let block = (std::process::id().wrapping_mul(4) + u32::from(number)) % (1 << 21);
         let address = |end: u32| Ipv4Addr::from_bits(0x0a80_0000 + 4 * block + end).to_string();
         let host = Self { learner: address(1), actor: address(2), name, cable };
@@ -46,12 +46,12 @@ impl Host {
         Ok(host)
     }
 
-    /// What is sent to this host gets lost from now on, or no more.
+    /// From now on the network loses packets to this host, or delivers them again.
     fn lose_what_comes(&self, lost: bool) -> Result<()> {
         ip(&format!("neighbour {} dev {}", misdirected(&self.actor, lost), self.cable))
     }
 
-    /// What this host sends gets lost from now on, or no more.
+    /// From now on the network loses packets from this host, or delivers them again.
     fn lose_what_goes(&self, lost: bool) -> Result<()> {
         ip(&format!("-n {} neighbour {} dev cable", self.name, misdirected(&self.learner, lost)))
     }
@@ -59,12 +59,12 @@ impl Host {
 
 impl Drop for Host {
     fn drop(&mut self) {
-        // The cable goes with it.
+        // This also removes the cable.
         let _ = ip(&format!("netns delete {}", self.name));
     }
 }
 
-/// Packets for a hardware address that nobody has vanish without a word.
+/// Packets to a hardware address that no host has are lost without an error.
 fn misdirected(address: &str, lost: bool) -> String {
     match lost {
         true => format!("replace {address} lladdr 02:00:00:00:00:99 nud permanent"),
@@ -80,7 +80,7 @@ fn ip(arguments: &str) -> Result<()> {
     Ok(())
 }
 
-/// Cuts the network, waits until both sides have given the other up, mends it, and sees that nothing was lost.
+/// Cuts the network, waits until both sides have closed the connection, mends it, and checks that nothing was lost.
 async fn a_partition_heals(number: u8, cut: impl Fn(&Host, bool) -> Result<()>) -> Result<()> {
     let host = Host::new(number)?;
     let mut system = System::new(&[&SMALL[..], &["--address", &host.learner, "--insecure"]].concat())?;
@@ -113,11 +113,11 @@ async fn a_network_that_is_cut_heals() -> Result<()> {
 }
 
 #[tokio::test]
-async fn a_network_that_loses_what_the_actor_sends_heals() -> Result<()> {
+async fn a_network_that_loses_packets_of_the_actor_heals() -> Result<()> {
     a_partition_heals(2, Host::lose_what_goes).await
 }
 
 #[tokio::test]
-async fn a_network_that_loses_what_the_learner_sends_heals() -> Result<()> {
+async fn a_network_that_loses_packets_of_the_learner_heals() -> Result<()> {
     a_partition_heals(3, Host::lose_what_comes).await
 }

@@ -1,5 +1,5 @@
-//! `comic-learner export` end to end: what a run has learnt acts in `comic-actor evaluate` as the checkpoint does, and in
-//! dm_control's own environment, driven by a script of ten statements, as it does here.
+//! `comic-learner export` end to end: the exported policy acts in `comic-actor evaluate` as its checkpoint does, and gets
+//! the same rewards in dm_control's own environment, which a script of ten statements drives.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -12,13 +12,13 @@ use serde_json::Value;
 
 /// Steps of each episode that are compared.
 const STEPS: usize = 20;
-/// Frames of the clip at which they start.
+/// Start frames of the episodes.
 const STARTS: [&str; 4] = ["0", "13", "37", "50"];
-/// Difference of a step's mean reward: two programs in double precision, a policy in single.
+/// Largest difference of a step's mean reward. Both programs use double precision, the policy single precision.
 const TOLERANCE: f64 = 1e-6;
-/// Enough for statistics of observations, and a policy that is not what it began as.
+/// Enough for statistics of observations and for a policy that differs from the initial one.
 const UPDATES: &str = "budget.updates=20";
-/// In lockstep, one for each unroll of a batch.
+/// Environments in lockstep: one for each unroll of a batch.
 const ENVIRONMENTS: u32 = 8;
 
 fn succeeds(command: &mut Command) -> Result<Output> {
@@ -27,8 +27,8 @@ fn succeeds(command: &mut Command) -> Result<Output> {
     Ok(output)
 }
 
-/// A run that learnt a little and has ended; always the same.
-async fn learnt(low_level: &str) -> Result<System> {
+/// A short run that has ended. Its parameters are always the same.
+async fn trained_run(low_level: &str) -> Result<System> {
     let low_level = format!("network.low_level={low_level}");
     let more = [
         low_level.as_str(),
@@ -36,7 +36,7 @@ async fn learnt(low_level: &str) -> Result<System> {
         "network.primitives.torso=[32]",
         "network.primitives.hidden=16",
         "network.primitives.gate=[16]",
-        // Who learnt for a few seconds falls at once, and is to be paid for a while all the same.
+        // A policy after a few seconds of training falls at once; the comparison needs rewards for longer.
         "tracking.termination_threshold=100",
         UPDATES,
     ];
@@ -47,7 +47,7 @@ async fn learnt(low_level: &str) -> Result<System> {
     for ended in
         [actor.until_it_ends(LIMIT).await?, system.learner.take().context("no learner")?.until_it_ends(LIMIT).await?]
     {
-        ensure!(ended.success(), "one of the two ends with {ended}");
+        ensure!(ended.success(), "the actor or the learner ended with {ended}");
     }
     Ok(system)
 }
@@ -58,14 +58,14 @@ fn export(run: &Path, part: &str, out: &Path) -> Result<Output> {
     succeeds(&mut command)
 }
 
-/// The report of an evaluation, as it is printed.
+/// The JSON report that an evaluation prints.
 fn evaluate(policy: &Path, more: &[&str]) -> Result<Value> {
     let mut command = Command::new(program("comic-actor")?);
     command.args(["evaluate", "--deterministic", "--json", "--policy"]).arg(policy).args(more);
     serde_json::from_slice(&succeeds(&mut command)?.stdout).context("evaluate printed no JSON")
 }
 
-/// Rewards of the first steps, start by start: of lines that are episodes.
+/// Rewards of the first steps for every start frame. Each line is an episode.
 fn rewards(lines: &str) -> Result<Vec<(String, Vec<f64>)>> {
     let mut episodes = Vec::new();
     for line in lines.lines() {
@@ -76,7 +76,7 @@ fn rewards(lines: &str) -> Result<Vec<(String, Vec<f64>)>> {
     Ok(episodes)
 }
 
-/// The same of lines that are steps.
+/// The same, where each line is a step.
 fn rewards_by_step(lines: &str) -> Result<Vec<(String, Vec<f64>)>> {
     let mut episodes: Vec<(String, Vec<f64>)> = Vec::new();
     for line in lines.lines() {
@@ -91,9 +91,9 @@ fn rewards_by_step(lines: &str) -> Result<Vec<(String, Vec<f64>)>> {
     Ok(episodes)
 }
 
-/// Exports what a low level has learnt, lets it act here and there, and compares the mean reward of each step.
-async fn dm_control_pays_what_we_pay(low_level: &str) -> Result<()> {
-    let system = learnt(low_level).await?;
+/// Exports a policy with this low level, runs it in both environments, and compares the mean reward of each step.
+async fn rewards_are_equal(low_level: &str) -> Result<()> {
+    let system = trained_run(low_level).await?;
     let directory = tempfile::tempdir()?;
     let file = |name: &str| -> PathBuf { directory.path().join(name) };
     let (whole, script, clips, ours) =
@@ -103,7 +103,7 @@ async fn dm_control_pays_what_we_pay(low_level: &str) -> Result<()> {
     succeeds(Command::new(program("comic-actor")?).args(["clips", "merge", "builtin:walk", "--out"]).arg(&clips))?;
 
     let report = evaluate(&whole, &["--rewards", &ours.display().to_string()])?;
-    ensure!(report == evaluate(&system.run(), &[])?, "the file and its checkpoint are paid differently: {report}");
+    ensure!(report == evaluate(&system.run(), &[])?, "the file and its checkpoint get different rewards: {report}");
     let mut driver = Command::new(python()?);
     driver.arg(root().join("docs/drive_policy.py")).args([&script, &clips]).args(STARTS);
     let theirs = rewards_by_step(&String::from_utf8(succeeds(&mut driver)?.stdout)?)?;
@@ -126,28 +126,28 @@ async fn dm_control_pays_what_we_pay(low_level: &str) -> Result<()> {
 }
 
 #[tokio::test]
-async fn dm_control_pays_an_exported_mlp_what_we_pay_it() -> Result<()> {
-    dm_control_pays_what_we_pay("mlp").await
+async fn an_exported_mlp_gets_the_same_rewards_in_dm_control() -> Result<()> {
+    rewards_are_equal("mlp").await
 }
 
 #[tokio::test]
-async fn dm_control_pays_an_exported_lstm_what_we_pay_it() -> Result<()> {
-    dm_control_pays_what_we_pay("lstm").await
+async fn an_exported_lstm_gets_the_same_rewards_in_dm_control() -> Result<()> {
+    rewards_are_equal("lstm").await
 }
 
 #[tokio::test]
-async fn dm_control_pays_an_exported_mixture_what_we_pay_it() -> Result<()> {
-    dm_control_pays_what_we_pay("mixture").await
+async fn an_exported_mixture_gets_the_same_rewards_in_dm_control() -> Result<()> {
+    rewards_are_equal("mixture").await
 }
 
 #[tokio::test]
-async fn dm_control_pays_an_exported_product_what_we_pay_it() -> Result<()> {
-    dm_control_pays_what_we_pay("product").await
+async fn an_exported_product_gets_the_same_rewards_in_dm_control() -> Result<()> {
+    rewards_are_equal("product").await
 }
 
 #[tokio::test]
-async fn what_is_no_policy_is_refused_with_its_remedy() -> Result<()> {
-    let system = learnt("mlp").await?;
+async fn a_file_that_is_no_policy_is_refused_and_the_error_names_the_remedy() -> Result<()> {
+    let system = trained_run("mlp").await?;
     let directory = tempfile::tempdir()?;
     let low_level = directory.path().join("low-level.safetensors");
     export(&system.run(), "low-level", &low_level)?;

@@ -1,4 +1,4 @@
-//! An actor at the end of a slow line: it gets whole versions, newer ones each time, and holds up nobody.
+//! An actor at the end of a slow line gets whole versions, each newer than the last, and delays no one.
 
 use anyhow::{Context as _, Result, ensure};
 use comic_proto::v1::learner_client::LearnerClient;
@@ -8,14 +8,14 @@ use comic_tests::relay::Relay;
 use comic_tests::steps::{LIMIT, leaves, parameters_arrive, the_accounting_balances_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
 
-/// A version of so small a policy takes seconds at this pace, and there are dozens of new ones meanwhile.
+/// At this rate a version of the small policy takes seconds, and the learner publishes dozens of versions meanwhile.
 const BYTES_PER_SECOND: f64 = 100_000.0;
 const VERSIONS: usize = 3;
-/// RFC 9113's own, bytes.
+/// Bytes: the default of RFC 9113.
 const WINDOW: u32 = 65_535;
 
 #[tokio::test]
-async fn a_slow_reader_gets_whole_versions_and_holds_up_nobody() -> Result<()> {
+async fn a_slow_reader_gets_whole_versions_and_delays_no_one() -> Result<()> {
     let mut system = System::new(&SMALL)?;
     system.start_learner(LIMIT).await?;
     let actor = system.start_actor()?;
@@ -24,18 +24,18 @@ async fn a_slow_reader_gets_whole_versions_and_holds_up_nobody() -> Result<()> {
     let relay = Relay::start(system.address(), BYTES_PER_SECOND).await?;
     let reading = tokio::spawn(read(relay.url.clone()));
     parameters_arrive(&mut system, "the other gets new parameters all the time").await?;
-    let versions = tokio::time::timeout(LIMIT, reading).await.context("the slow reader does not get on")???;
-    ensure!(versions.is_sorted_by(|one, next| one < next), "not newer each time: {versions:?}");
+    let versions = tokio::time::timeout(LIMIT, reading).await.context("the slow reader gets no versions")???;
+    ensure!(versions.is_sorted_by(|one, next| one < next), "a version is not newer than the last: {versions:?}");
     let (first, last) = (versions[0], versions[VERSIONS - 1]);
-    ensure!(last - first > VERSIONS as u64, "nothing is skipped, so nothing was slow: {versions:?}");
+    ensure!(last - first > VERSIONS as u64, "the reader skipped no version, so it was not slow: {versions:?}");
 
     leaves(actor).await?;
     the_accounting_balances_at_the_end(system).await
 }
 
-/// The first few versions that are whole.
+/// Reads the first whole versions.
 async fn read(url: String) -> Result<Vec<u64>> {
-    // No windows that hold several versions.
+    // The flow-control windows are too small for several versions.
     let endpoint =
         Access::default().endpoint(&url)?.initial_stream_window_size(WINDOW).initial_connection_window_size(WINDOW);
     let mut client = LearnerClient::new(endpoint.connect().await?);

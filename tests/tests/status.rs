@@ -11,7 +11,7 @@ use serde_json::Value;
 const LIMIT: Duration = Duration::from_secs(120);
 
 #[tokio::test]
-async fn a_running_learner_is_asked_how_it_is() -> Result<()> {
+async fn status_and_health_describe_a_running_learner() -> Result<()> {
     let authority = Authority::new()?;
     authority.issue("server", 60)?;
     let token = authority.path("token");
@@ -42,7 +42,7 @@ async fn a_running_learner_is_asked_how_it_is() -> Result<()> {
     for word in ["run ", "updates/s", "environment steps/s", "queue ", "ages ", "accounting ", "1 alive"] {
         ensure!(text.contains(word), "no `{word}` in {text}");
     }
-    ensure!(system.ask(&["health"])?.status.code() == Some(0), "it serves");
+    ensure!(system.ask(&["health"])?.status.code() == Some(0), "health must succeed while the learner serves");
     let page = system.metrics_page()?;
     ensure!(
         page.contains("comic_actors{state=\"alive\"} 1\n") && page.contains("comic_update_seconds_count"),
@@ -50,24 +50,30 @@ async fn a_running_learner_is_asked_how_it_is() -> Result<()> {
     );
 
     let token = system.access.token_file.take();
-    ensure!(system.ask(&["health"])?.status.code() == Some(0), "whether it serves is no secret");
-    ensure!(system.ask(&["status"])?.status.code() == Some(2), "the token is missing, and will be the next time");
+    ensure!(system.ask(&["health"])?.status.code() == Some(0), "health must need no token");
+    ensure!(
+        system.ask(&["status"])?.status.code() == Some(2),
+        "status without a token must end with 2: a retry would not help"
+    );
     system.access.token_file = token;
     system.learner.take().context("no learner")?.kill()?;
-    ensure!(system.ask(&["health"])?.status.code() == Some(1), "it does not serve");
-    ensure!(system.ask(&["status"])?.status.code() == Some(1), "it may serve again");
+    ensure!(system.ask(&["health"])?.status.code() == Some(1), "health must fail when no learner serves");
+    ensure!(
+        system.ask(&["status"])?.status.code() == Some(1),
+        "status must end with 1 when no learner serves: a retry may help"
+    );
     Ok(())
 }
 
 #[tokio::test]
-async fn who_watches_sees_how_it_goes_on_and_waits_for_a_learner_that_is_away() -> Result<()> {
+async fn status_watch_follows_a_run_and_waits_for_an_absent_learner() -> Result<()> {
     let mut system = System::new(&SMALL)?;
     let mut watching = system.start_watching()?;
     watching.until_log_holds(&system.address(), LIMIT).await?;
-    ensure!(!watching.log().contains("accounting "), "nobody serves yet: {}", watching.log());
+    ensure!(!watching.log().contains("accounting "), "no learner serves yet: {}", watching.log());
     system.start_learner(LIMIT).await?;
     let _actor = system.start_actor()?;
-    // On paper one state follows the other.
+    // In a file, one status follows the other.
     watching
         .until_log("two states, and the actor in one of them", LIMIT, |log| {
             log.matches("accounting ").count() >= 2 && log.contains("1 alive")

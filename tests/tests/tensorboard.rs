@@ -1,5 +1,5 @@
-//! What a run writes for TensorBoard, read by TensorBoard: the curves are `metrics.jsonl`'s, and go on where a killed
-//! learner's next life does.
+//! TensorBoard reads the curves of a run. They equal those of `metrics.jsonl`, also after the learner was killed and
+//! restarted.
 
 use std::fs;
 
@@ -14,11 +14,11 @@ async fn tensorboard_reads_the_curves_of_a_run_that_was_killed_once() -> Result<
     let mut system = System::new(&SMALL)?;
     system.start_learner(LIMIT).await?;
     let _actor = system.start_actor()?;
-    trains_on(&mut system, "something is learnt").await?;
+    trains_on(&mut system, "the learner trains").await?;
     kill_and_restart_the_learner(&mut system).await?;
-    trains_on(&mut system, "training goes on after the restart").await?;
+    trains_on(&mut system, "training continues after the restart").await?;
     let status = system.learner.take().context("no learner")?.terminate(LIMIT).await?;
-    ensure!(status.success(), "the learner leaves with {status}");
+    ensure!(status.success(), "the learner ended with {status}");
 
     let curves = curves(&system.run().join("tensorboard"))?;
     let text = fs::read_to_string(system.run().join("metrics.jsonl"))?;
@@ -26,7 +26,7 @@ async fn tensorboard_reads_the_curves_of_a_run_that_was_killed_once() -> Result<
 
     let epoch = lines.last().context("no line of metrics")?["learner_epoch"].clone();
     let (before, after): (Vec<&Value>, Vec<&Value>) = lines.iter().partition(|line| line["learner_epoch"] != epoch);
-    ensure!(!before.is_empty() && !after.is_empty(), "the run had two lives");
+    ensure!(!before.is_empty() && !after.is_empty(), "the run had no two learner epochs");
     for (tag, pointer) in [("updates", "/updates"), ("losses/latent_kl", "/losses/latent_kl")] {
         let curve = curves.get(tag).with_context(|| format!("no curve of {tag}"))?;
         let points = |lines: &[&Value]| -> Vec<(u64, f32)> {
@@ -36,9 +36,9 @@ async fn tensorboard_reads_the_curves_of_a_run_that_was_killed_once() -> Result<
         };
         let curve: Vec<_> = curve.iter().map(|(step, value)| (*step, *value as f32)).collect();
         let own = points(&after);
-        ensure!(curve.ends_with(&own), "{tag} of the last life: {own:?} is not the end of {curve:?}");
+        ensure!(curve.ends_with(&own), "{tag} of the last epoch: {own:?} is not the end of {curve:?}");
         let earlier = &curve[..curve.len() - own.len()];
-        ensure!(points(&before).starts_with(earlier), "{tag} of the first life: {earlier:?}");
+        ensure!(points(&before).starts_with(earlier), "{tag} of the first epoch: {earlier:?}");
         ensure!(curve.is_sorted_by_key(|(step, _)| *step), "{tag} goes back: {curve:?}");
     }
     Ok(())

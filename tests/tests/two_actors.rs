@@ -1,4 +1,4 @@
-//! One learner and two actors, real processes and real sockets, through every death a run must survive.
+//! One learner and two actors as real processes with real sockets. Each of them is killed once, and the run survives.
 
 use anyhow::{Result, ensure};
 use comic_tests::steps::{
@@ -7,11 +7,11 @@ use comic_tests::steps::{
 use comic_tests::system::{SMALL, System};
 
 #[tokio::test]
-async fn two_actors_and_a_learner_survive_every_death_and_their_accounting_balance() -> Result<()> {
+async fn two_actors_and_a_learner_survive_kills_and_the_accounting_balances() -> Result<()> {
     let mut system = System::new(&SMALL)?;
     let first = system.start_learner(LIMIT).await?;
 
-    // Alone, the first actor's unrolls are the only ones there are to train on.
+    // Only the first actor's unrolls are there to train on.
     let killed = system.start_actor()?;
     trains_on(&mut system, "the first actor's unrolls are trained on").await?;
     parameters_arrive(&mut system, "the first actor acts with new parameters").await?;
@@ -24,10 +24,10 @@ async fn two_actors_and_a_learner_survive_every_death_and_their_accounting_balan
 
     let mut third = system.start_actor()?;
     third.until_log_holds("joined the learner", LIMIT).await?;
-    trains_on(&mut system, "training goes on with a new actor").await?;
+    trains_on(&mut system, "training continues with a new actor").await?;
 
     let resumed = kill_and_restart_the_learner(&mut system).await?;
-    ensure!(resumed.learner_epoch > first.learner_epoch, "a restarted learner lives in a new epoch");
+    ensure!(resumed.learner_epoch > first.learner_epoch, "a restarted learner must begin a new epoch");
     for actor in [&mut second, &mut third] {
         actor.until_log_holds(&format!("learner_epoch={}", resumed.learner_epoch), LIMIT).await?;
     }

@@ -1,6 +1,6 @@
-//! One learner and two actors, real processes and real sockets, with every other low level and with two tasks: both
-//! actors' unrolls are trained on, new parameters reach them, and a killed learner goes on from its checkpoint, whatever
-//! was remembered in flight.
+//! One learner and two actors as real processes with real sockets, with every other low level and with two tasks. The
+//! learner trains on the unrolls of both actors, new parameters reach them, and a killed learner resumes from its
+//! checkpoint, whatever recurrent states are in flight.
 
 use anyhow::{Result, ensure};
 use comic_proto::v1::Status;
@@ -21,11 +21,11 @@ async fn two_actors_learn(overrides: &[&str], check: fn(&Status) -> Option<()>) 
     parameters_arrive(&mut system, "the actors act with new parameters").await?;
     system.until("the metrics say so", LIMIT, check).await?;
     let resumed = kill_and_restart_the_learner(&mut system).await?;
-    ensure!(resumed.learner_epoch > begun.learner_epoch, "a restarted learner lives in a new epoch");
+    ensure!(resumed.learner_epoch > begun.learner_epoch, "a restarted learner must begin a new epoch");
     for actor in &mut actors {
         actor.until_log_holds(&format!("learner_epoch={}", resumed.learner_epoch), LIMIT).await?;
     }
-    trains_on(&mut system, "training goes on after the restart").await?;
+    trains_on(&mut system, "training continues after the restart").await?;
     system.until("the metrics say so again", LIMIT, check).await?;
     for actor in actors {
         leaves(actor).await?;

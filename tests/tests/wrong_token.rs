@@ -1,4 +1,4 @@
-//! An actor with a wrong token ends at first contact, with the exit code that says: do not try again. One that was let in
+//! An actor with a wrong token ends at first contact with exit code 2: a retry would not help. An actor that had joined
 //! before waits for the renewed token.
 
 use std::fs;
@@ -11,7 +11,7 @@ use comic_tests::system::{SMALL, System};
 const LIMIT: Duration = Duration::from_secs(120);
 
 #[tokio::test]
-async fn a_wrong_token_ends_an_actor_unless_it_was_let_in_before() -> Result<()> {
+async fn a_wrong_token_ends_an_actor_unless_it_had_joined_before() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let [accepted, shown, wrong] = ["accepted", "shown", "wrong"].map(|name| directory.path().join(name));
     fs::write(&accepted, "first-token\n")?;
@@ -31,7 +31,7 @@ async fn a_wrong_token_ends_an_actor_unless_it_was_let_in_before() -> Result<()>
 
     let mut actor = system.start_actor()?;
     actor.until_log_holds("joined the learner", LIMIT).await?;
-    // The learner's token changes, and the actor's not yet.
+    // The learner's token changes; the actor's changes later.
     fs::write(&accepted, "second-token\n")?;
     system.access = Access { token_file: Some(accepted), ..Access::default() };
     system.learner.take().context("no learner")?.kill()?;

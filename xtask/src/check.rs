@@ -1,18 +1,18 @@
 //! `cargo xtask test` and `cargo xtask lint`.
 
-use std::process::{Command, Stdio};
+use std::process::Command;
 
 use anyhow::Result;
 
-use crate::workspace::{cargo, cargo_has, run};
+use crate::workspace::{answers, cargo, cargo_has, run};
 use crate::{images, python, setup, workspace};
 
 #[derive(clap::Args)]
 pub(crate) struct TestOptions {
-    /// Build the images and test the containers, too; that takes a Docker engine, and on two cores a quarter of an hour the first time
+    /// Also build the images and test the containers; needs a Docker engine, and on two cores 15 minutes the first time
     #[arg(long)]
     docker: bool,
-    /// Test the update on XLA instead, on what PJRT_DEVICE names or a CPU: torch_xla, and the learner built with it
+    /// Test the update on XLA instead, on the device that PJRT_DEVICE names or on a CPU; needs torch_xla
     #[arg(long, conflicts_with = "docker")]
     xla: bool,
     /// Arguments for the test runner, for instance a part of a test's name
@@ -22,25 +22,23 @@ pub(crate) struct TestOptions {
 
 /// Tests that not every machine can run.
 struct Demanding {
-    /// A file in `tests/tests`.
-    binary: &'static str,
-    /// What all of its tests' names begin with.
+    /// The prefix of the names of these tests, and of no others.
     prefix: &'static str,
-    /// What they do, and what that takes.
+    /// What the tests do, and what they need.
     what: &'static str,
-    /// Whether it is there.
+    /// Whether this machine has what they need.
     possible: bool,
 }
 
-/// Sets up and runs every test: by cargo-nextest where it is installed, else by cargo itself.
+/// Sets up and runs every test, by cargo-nextest where it is installed, otherwise by cargo itself.
 pub(crate) fn test(options: &TestOptions) -> Result<()> {
     if options.xla {
         return test_xla(&options.arguments);
     }
     setup::run(&setup::Options::default())?;
-    // Files written here are read by dm_control's own loader and by TensorBoard, and policies act in dm_control's environment.
+    // dm_control's own loader and TensorBoard read files of these programs, and policies act in dm_control's environment.
     python::prepare_tests()?;
-    // The whole-system tests start the programs, so these are built first.
+    // The whole-system tests start the programs.
     workspace::build()?;
     if options.docker {
         images::build()?;
@@ -56,21 +54,25 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
     command.args(["--release", "--workspace"]).args(&options.arguments);
     let mut left_out = demanding(options);
     left_out.retain(|tests| !tests.possible);
-    for Demanding { binary, what, .. } in &left_out {
-        eprintln!("NOT RUN: tests/tests/{binary}.rs, which {what}");
+    for Demanding { prefix, what, .. } in &left_out {
+        eprintln!("NOT RUN: the tests {prefix}…, which {what}");
     }
     if nextest && !left_out.is_empty() {
-        let binaries: Vec<_> = left_out.iter().map(|tests| format!("not binary({})", tests.binary)).collect();
-        command.args(["--filterset", &binaries.join(" and ")]);
+        let names: Vec<_> = left_out.iter().map(|tests| format!("not test(/(^|::){}/)", tests.prefix)).collect();
+        command.args(["--filterset", &names.join(" and ")]);
     } else if !left_out.is_empty() {
         command.arg("--").args(left_out.iter().map(|tests| format!("--skip={}", tests.prefix)));
     }
     eprintln!("running `{}`", workspace::describe(&command));
-    run(&mut command)
+    let ended = run(&mut command);
+    if !left_out.is_empty() {
+        let names: Vec<_> = left_out.iter().map(|tests| tests.prefix).collect();
+        eprintln!("NOT RUN: {} groups of tests ({}), as explained above", names.len(), names.join(", "));
+    }
+    ended
 }
 
-/// The tests of devices, of the learner's parts, and of its program with XLA in it. Built beside everything else, which has
-/// none.
+/// The tests of devices, of the learner's modules and of its program, built with XLA in a directory of their own.
 fn test_xla(arguments: &[String]) -> Result<()> {
     setup::run(&setup::Options::xla())?;
     let mut command = cargo();
@@ -80,7 +82,7 @@ fn test_xla(arguments: &[String]) -> Result<()> {
     };
     command.args(["--release", "--package", "comic-learner", "--features", "xla", "--target-dir", "target/xla"]);
     command.args(["--lib", "--test", "devices", "--test", "xla"]).args(arguments);
-    // Where tests are threads of one process, a step's end is every test's.
+    // Under `cargo test` the tests are threads of one process, and the end of a step is the end of every thread's step.
     command.env("RUST_TEST_THREADS", "1");
     if std::env::var_os("PJRT_DEVICE").is_none() {
         command.env("PJRT_DEVICE", "CPU");
@@ -92,56 +94,67 @@ fn test_xla(arguments: &[String]) -> Result<()> {
 fn demanding(options: &TestOptions) -> Vec<Demanding> {
     vec![
         Demanding {
-            binary: "partition",
-            prefix: "a_network_that",
-            what: "cuts networks: that takes root and iproute2",
-            possible: makes_hosts(),
+            prefix: "a_network_that_",
+            what: "cut networks: they need root and iproute2",
+            possible: can_make_namespaces(),
         },
         Demanding {
-            binary: "disk_full",
-            prefix: "a_full_disk",
-            what: "fills a disk of its own: that takes root and util-linux",
-            // A disk that this process alone sees.
+            prefix: "opengl_",
+            what: "draw pictures: they need OpenGL, for instance Debian's libegl1 and libgl1-mesa-dri",
+            possible: can_draw(),
+        },
+        Demanding {
+            prefix: "on_a_full_disk_",
+            what: "fill a disk of their own: they need root and util-linux",
+            // A mount that this process alone sees.
             possible: answers("unshare", &["--mount", "mount", "-t", "tmpfs", "tmpfs", "/mnt"]),
         },
         Demanding {
-            binary: "compose",
             prefix: "containers_",
-            what: "runs the images: that takes `cargo xtask test --docker`",
+            what: "run the images: they need `cargo xtask test --docker`",
             possible: options.docker,
         },
         Demanding {
-            binary: "kustomize",
             prefix: "kustomize_",
-            what: "renders the Kubernetes manifests a second time: that takes kustomize or kubectl",
+            what: "render the Kubernetes manifests a second time: they need kustomize or kubectl",
             possible: answers("kustomize", &["version"]) || answers("kubectl", &["version", "--client"]),
         },
     ]
 }
 
-fn answers(program: &str, arguments: &[&str]) -> bool {
-    let asked = Command::new(program).args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).status();
-    asked.is_ok_and(|status| status.success())
+/// Whether the actor finds OpenGL. The tests report every other error.
+fn can_draw() -> bool {
+    let film = std::env::temp_dir().join(format!("comic-probe-{}.gif", std::process::id()));
+    let Ok(actor) = workspace::program("comic-actor") else { return true };
+    let arguments = ["render", "--task", "get-up", "--seconds", "0.03", "--size", "16x16", "--out"];
+    let asked = Command::new(actor).args(arguments).arg(&film).output();
+    let _ = std::fs::remove_file(film);
+    !asked.is_ok_and(|output| String::from_utf8_lossy(&output.stderr).contains("no OpenGL"))
 }
 
-/// Whether network namespaces can be made here.
-fn makes_hosts() -> bool {
+/// Whether this machine allows network namespaces.
+fn can_make_namespaces() -> bool {
     let name = format!("comic-probe-{}", std::process::id());
     answers("ip", &["netns", "add", &name]) && answers("ip", &["netns", "delete", &name])
 }
 
-/// Formatting and clippy, as far as the toolchain has them.
+/// Checks formatting, code, and the licences and sources of dependencies, each where its tool is installed.
 pub(crate) fn lint() -> Result<()> {
     setup::run(&setup::Options::default())?;
     if cargo_has("fmt") {
         run(cargo().args(["fmt", "--all", "--check"]))?;
     } else {
-        eprintln!("formatting is not checked: `rustup component add rustfmt`");
+        eprintln!("NOT RUN: the check of formatting: `rustup component add rustfmt`");
     }
     if cargo_has("clippy") {
         run(cargo().args(["clippy", "--release", "--workspace", "--all-targets", "--", "--deny", "warnings"]))?;
     } else {
-        eprintln!("clippy is not run: `rustup component add clippy`");
+        eprintln!("NOT RUN: clippy: `rustup component add clippy`");
+    }
+    if cargo_has("deny") {
+        run(cargo().args(["deny", "check", "licenses", "bans", "sources"]))?;
+    } else {
+        eprintln!("NOT RUN: the check of licences, of banned crates and of sources: `cargo install cargo-deny`");
     }
     Ok(())
 }

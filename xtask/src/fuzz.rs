@@ -1,8 +1,8 @@
-//! `cargo xtask fuzz`: hostile bytes for everything that reads some, guided by the code they reach.
+//! `cargo xtask fuzz`: random bytes for everything that reads bytes from outside, guided by the code that they reach.
 //!
-//! libFuzzer does the guiding. Its counters are compiled in by rustc's own options, so the toolchain at hand is enough;
-//! crates are built anew for that, in a directory of their own. Seeds are what each target writes of the present
-//! formats; what a run finds out about them is kept in `target/fuzz/corpus`, and the next run begins there.
+//! libFuzzer guides. rustc's own options compile its counters in, so the stable toolchain is enough. The crates are built
+//! for this in a directory of their own. Seeds are valid files of the present formats, which each target writes. Inputs
+//! that reach new code are kept in `target/fuzz/corpus`, where the next run starts.
 
 use std::fs;
 use std::path::PathBuf;
@@ -16,10 +16,10 @@ use crate::workspace::{cargo, root, run};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
-    /// What reads the bytes; everything by default
+    /// The targets [default: all]
     #[arg(value_enum)]
     targets: Vec<Target>,
-    /// Minutes for each
+    /// Minutes for each target
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     minutes: u64,
 }
@@ -28,17 +28,17 @@ pub(crate) struct Options {
 enum Target {
     /// Messages of unrolls
     Unroll,
-    /// Pieces of parameters, and what they make
+    /// Pieces of parameters, and the policy that they make
     Parameters,
     /// Experiments and overrides
     Experiment,
-    /// Checkpoints with one part of any bytes
+    /// Checkpoints with one random part
     Checkpoint,
     /// Motion capture: HDF5, ASF and AMC
     Clips,
 }
 
-/// Coverage as libFuzzer reads it: what `-fsanitize=fuzzer-no-link` means to clang.
+/// Coverage counters for libFuzzer: what `-fsanitize=fuzzer-no-link` does in clang.
 const COUNTERS: [&str; 7] = [
     "-Cpasses=sancov-module",
     "-Cllvm-args=-sanitizer-coverage-level=4",
@@ -49,17 +49,17 @@ const COUNTERS: [&str; 7] = [
     "--cfg=fuzzing",
 ];
 const HOST: &str = "x86_64-unknown-linux-gnu";
-/// Above libtorch's own few hundred.
+/// The limit of resident memory. libtorch alone needs a few hundred.
 const MEGABYTES: usize = 2048;
-/// A second is plenty for any input; a machine may be busy.
+/// An input takes less than a second; the machine may be busy.
 const SECONDS_OF_AN_INPUT: usize = 20;
 
-/// Builds the targets and runs each for its time; the first finding ends it.
+/// Builds the targets and runs each for its time. The first finding ends the run.
 pub(crate) fn fuzz(options: &Options) -> Result<()> {
     setup::run(&setup::Options::default())?;
     let directory = root().join("target/fuzz");
     let mut build = cargo();
-    // Named, the target keeps the counters out of build scripts and macros.
+    // Naming the target keeps the counters out of build scripts and macros.
     build.args(["build", "--release", "--manifest-path", "tests/fuzz/Cargo.toml", "--target", HOST, "--target-dir"]);
     run(build.arg(&directory).env("RUSTFLAGS", COUNTERS.join(" ")))?;
     let all = Target::value_variants();
@@ -83,10 +83,10 @@ pub(crate) fn fuzz(options: &Options) -> Result<()> {
             format!("-artifact_prefix={}/", findings.display()),
             "-print_final_stats=1".into(),
         ]);
-        // One thread: an input's effect must not hang on what another core does.
+        // One thread, so that an input always has the same effect.
         run(fuzzer.env("OMP_NUM_THREADS", "1").current_dir(root())).with_context(|| {
             let (program, findings) = (program.display(), findings.display());
-            format!("{name}: see {findings}, and `{program} {findings}/FILE` for one of them alone")
+            format!("{name}: the findings are in {findings}; `{program} {findings}/FILE` runs one of them")
         })?;
     }
     Ok(())

@@ -1,7 +1,7 @@
-//! The images, built as a user builds them: by `deploy/compose.yaml`.
+//! The images, built as a user builds them: with `deploy/compose.yaml`.
 //!
-//! Their base images come from wherever Docker gets images. Where it gets none, stand-ins are made that have what the
-//! Dockerfile builds on: Debian by debootstrap, and this machine's Rust in it. They bear the real names and a label.
+//! Docker pulls the base images. Where it cannot, substitutes with the same names and a label are made: Debian with
+//! debootstrap, and Debian with this machine's Rust.
 
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
@@ -11,24 +11,24 @@ use anyhow::{Context, Result, ensure};
 
 use crate::workspace::{self, describe, root};
 
-/// What `deploy/Dockerfile` begins with.
+/// The base images of `deploy/Dockerfile`.
 const DEBIAN: &str = "debian:bookworm-slim";
 const RUST: &str = "rust:1.95-bookworm";
-const STAND_IN: &str = "LABEL org.comic.stand-in=true";
-/// What the real one leaves out too.
+const SUBSTITUTE: &str = "LABEL org.comic.substitute=true";
+/// Paths that the real image leaves out as well.
 const LEFT_OUT: [&str; 5] =
     ["./usr/share/doc/*", "./usr/share/locale/*", "./usr/share/man/*", "./var/cache/apt/*", "./var/lib/apt/lists/*"];
 
-/// Builds the images; what has not changed is taken from the engine's layers.
+/// Builds the images. Layers that have not changed come from the engine's cache.
 pub(crate) fn build() -> Result<()> {
-    ensure!(quietly(Command::new("docker").arg("info")), "no Docker engine answers: `docker info` says more");
-    for (image, stand_in) in [(DEBIAN, make_debian as fn() -> Result<()>), (RUST, make_rust)] {
-        if !is_there(image) && workspace::run(Command::new("docker").args(["pull", image])).is_err() {
-            eprintln!("{image} cannot be pulled: making a stand-in");
-            stand_in().with_context(|| format!("there is no {image}, and no stand-in can be made"))?;
+    ensure!(quietly(Command::new("docker").arg("info")), "no Docker engine answers: `docker info` has the reason");
+    for (image, substitute) in [(DEBIAN, make_debian as fn() -> Result<()>), (RUST, make_rust)] {
+        if !exists(image) && workspace::run(Command::new("docker").args(["pull", image])).is_err() {
+            eprintln!("{image} cannot be pulled: making a substitute");
+            substitute().with_context(|| format!("{image} does not exist and cannot be replaced by a substitute"))?;
         }
     }
-    trust_whom_this_machine_trusts()?;
+    copy_authorities()?;
     workspace::run(
         compose().args(["--file", "deploy/compose.yaml", "--profile", "tensorboard", "build"]).current_dir(root()),
     )
@@ -44,17 +44,17 @@ fn compose() -> Command {
     second
 }
 
-/// Whether a command ends well; what it says nobody reads.
+/// Whether a command ends well. Its output is discarded.
 fn quietly(command: &mut Command) -> bool {
     command.stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|status| status.success())
 }
 
-fn is_there(image: &str) -> bool {
+fn exists(image: &str) -> bool {
     quietly(Command::new("docker").args(["image", "inspect", image]))
 }
 
-/// Where a proxy answers for the registries, SSL_CERT_FILE names whom to trust.
-fn trust_whom_this_machine_trusts() -> Result<()> {
+/// Copies the certificate authorities that SSL_CERT_FILE names, if it is set, so that the build trusts a proxy.
+fn copy_authorities() -> Result<()> {
     let Some(authorities) = env::var_os("SSL_CERT_FILE") else { return Ok(()) };
     let place = root().join("deploy/ca-certificates/ssl-cert-file.crt");
     let known =
@@ -68,7 +68,7 @@ fn make_debian() -> Result<()> {
     let mut debootstrap = Command::new("debootstrap");
     debootstrap.args(["--variant=minbase", "bookworm"]).arg(&directory).arg(format!("{mirror}/debian"));
     let made = workspace::run(debootstrap.stdout(Stdio::null()));
-    made.context("debootstrap takes root, and Debian's package of that name")?;
+    made.context("debootstrap needs root, and Debian's package debootstrap")?;
     let mut archive = Command::new("tar");
     archive
         .arg("--create")
@@ -76,16 +76,16 @@ fn make_debian() -> Result<()> {
         .arg("--directory")
         .arg(&directory)
         .arg(".");
-    feed(&mut archive, Command::new("docker").args(["import", "--change", STAND_IN, "-", DEBIAN]))?;
+    feed(&mut archive, Command::new("docker").args(["import", "--change", SUBSTITUTE, "-", DEBIAN]))?;
     fs::remove_dir_all(&directory).with_context(|| format!("cannot remove {}", directory.display()))
 }
 
 fn make_rust() -> Result<()> {
     let (version, toolchain) = (rustc(&["--version"])?, rustc(&["--print", "sysroot"])?);
-    ensure!(version.starts_with("rustc 1.95."), "this machine has {version}, which is no {RUST}");
+    ensure!(version.starts_with("rustc 1.95."), "this machine has {version}, not the one of {RUST}");
     let directory = scratch("rust")?;
     let recipe = format!(
-        "FROM {DEBIAN}\n{STAND_IN}\nRUN apt-get update && apt-get install --yes --no-install-recommends gcc libc6-dev \
+        "FROM {DEBIAN}\n{SUBSTITUTE}\nRUN apt-get update && apt-get install --yes --no-install-recommends gcc libc6-dev \
          && rm -r /var/lib/apt/lists/*\nCOPY bin /usr/local/bin\nCOPY lib /usr/local/lib\n"
     );
     fs::write(directory.join("Dockerfile"), recipe).context("cannot write a Dockerfile")?;
@@ -96,7 +96,7 @@ fn make_rust() -> Result<()> {
     fs::remove_dir_all(&directory).with_context(|| format!("cannot remove {}", directory.display()))
 }
 
-/// What the Rust of this machine says.
+/// The output of this machine's rustc.
 fn rustc(arguments: &[&str]) -> Result<String> {
     let output = Command::new("rustc").args(arguments).current_dir(root()).output().context("cannot start rustc")?;
     Ok(String::from_utf8(output.stdout)?.trim().to_owned())
@@ -110,10 +110,10 @@ fn scratch(name: &str) -> Result<PathBuf> {
     Ok(directory)
 }
 
-/// Runs both, what the first writes being what the second reads.
+/// Runs both commands; the second reads the output of the first.
 fn feed(from: &mut Command, to: &mut Command) -> Result<()> {
     let mut writer = from.stdout(Stdio::piped()).spawn().with_context(|| format!("cannot start {}", describe(from)))?;
-    let pipe = writer.stdout.take().context("no pipe")?;
+    let pipe = writer.stdout.take().context("a child without standard output")?;
     workspace::run(to.stdin(pipe))?;
     let ended = writer.wait().with_context(|| format!("cannot wait for {}", describe(from)))?;
     ensure!(ended.success(), "{} ended with {ended}", describe(from));

@@ -1,19 +1,23 @@
-//! `cargo xtask`: set-up, tests, training, benchmarks and plots from one entry.
+//! `cargo xtask`: set-up, tests, training, benchmarks and plots from one program.
 //!
 //! # Layout
 //! - [`setup`] fills `.deps` with the native libraries; everything else calls it first.
-//! - [`check`] runs the tests and the linters; [`images`] builds what some of them run.
-//! - [`fuzz`] feeds hostile bytes to whatever reads bytes from outside.
-//! - [`train`] runs one learner and its actors on this machine and shows what they do.
-//! - [`sweep`] does so with some of an experiment's fields varied, and compares.
-//! - [`bench`] and [`python`] make the figures of the README, [`plot`] its curves.
+//! - [`check`] runs the tests and the linters; [`images`] builds the Docker images for some of the tests.
+//! - [`documentation`] builds the pages of the crates and the book.
+//! - [`fuzz`] feeds random bytes to everything that reads bytes from outside.
+//! - [`train`] runs one learner and its actors on this machine and shows their progress.
+//! - [`sweep`] trains with varied fields of an experiment, and compares the runs.
+//! - [`mod@bench`] measures; [`python`] runs other people's code for comparison.
+//! - [`plot`] draws learning curves; [`metrics`] reads the files of metrics.
 //!
-//! This program runs before there is a libtorch or a MuJoCo, so it links neither.
+//! This program runs before libtorch and MuJoCo are installed, so it links neither.
 
 mod bench;
 mod check;
+mod documentation;
 mod fuzz;
 mod images;
+mod metrics;
 mod plot;
 mod python;
 mod setup;
@@ -39,30 +43,32 @@ enum Command {
     Setup(setup::Options),
     /// Set up and run every test
     Test(check::TestOptions),
-    /// Check formatting and run clippy, warnings being errors
+    /// Check formatting, run clippy and check the licences of dependencies; a warning is an error
     Lint,
-    /// Feed hostile bytes to everything that reads some, guided by the code that they reach
+    /// Build rustdoc's pages, a warning being an error, and the book of docs/
+    Docs,
+    /// Feed random bytes to everything that reads bytes from outside, guided by the code that they reach
     Fuzz(fuzz::Options),
     /// Set up, build, and train with one learner and its actors on this machine
     Train(train::Options),
-    /// Train an experiment with some of its fields varied, with several seeds, and compare
+    /// Train an experiment with varied fields and several seeds, and compare the runs
     Sweep(sweep::Options),
-    /// Measure; one JSON line per figure
+    /// Measure; one JSON line for each figure
     Bench(bench::Options),
-    /// Draw the curves of runs, or of ../shared/baselines, as one picture
+    /// Draw the curves of runs, or of other files of metrics, in one picture
     Plot {
-        /// Files of metrics, `runs/NAME/metrics.jsonl`; `LABEL=FILE` gives a curve its name, and `#TASK`
-        /// behind it draws one task of joint training
+        /// Files of metrics, such as `runs/NAME/metrics.jsonl`; `LABEL=FILE` names a curve, and `FILE#TASK` draws one task
+        /// of joint training
         #[arg(required = true)]
         metrics: Vec<String>,
-        /// What the curves show; several, with commas between them, are drawn one below the other
+        /// The quantities to draw, separated by commas, one below the other
         #[arg(long = "y", value_enum, value_delimiter = ',', default_value = "episode-return")]
         quantities: Vec<plot::Quantity>,
         /// The picture
         #[arg(long, default_value = "curves.svg")]
         out: PathBuf,
     },
-    /// Make the tests' fixtures anew by the scripts in tests/python
+    /// Make the tests' fixtures again with the scripts in tests/python
     Fixtures(python::FixtureOptions),
 }
 
@@ -71,6 +77,7 @@ fn main() -> ExitCode {
         Command::Setup(options) => setup::run(&options),
         Command::Test(options) => check::test(&options),
         Command::Lint => check::lint(),
+        Command::Docs => documentation::build(),
         Command::Fuzz(options) => fuzz::fuzz(&options),
         Command::Train(options) => train::run(options),
         Command::Sweep(options) => sweep::run(options),

@@ -1,5 +1,5 @@
-//! Learning curves as pictures: runs side by side over wall-clock time and environment steps, or groups of runs as mean
-//! and range over environment steps.
+//! Learning curves as pictures: single runs over wall-clock time and over environment steps, or groups of runs as mean and
+//! range over environment steps.
 
 mod panel;
 mod pool;
@@ -9,21 +9,21 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, anyhow, bail};
 use plotters::prelude::*;
 
-use crate::train::metrics::{self, Line};
+use crate::metrics::{self, Line};
 use panel::{Series, panel};
 use pool::pool;
 
-/// Points a window of smoothing is made of; lines come every few seconds and episodes are short and many.
+/// Points of a smoothing window. The learner writes a line every few seconds.
 const SMOOTHED_OVER: usize = 5;
 
-/// What the curves show.
+/// A quantity that curves show.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Quantity {
-    /// Return of an episode, with the acting policy's noise; baselines have it too.
+    /// Return of an episode, with the acting policy's noise.
     EpisodeReturn,
-    /// Return / (the most a step pays × the steps that were left).
+    /// Return / (the largest reward of a step × the steps that were left).
     NormalisedReward,
-    /// Reward per survived step / the most a step pays.
+    /// Reward per survived step / the largest reward of a step.
     RewardPerStep,
     /// Mean height of the head, m.
     HeadHeight,
@@ -49,24 +49,24 @@ impl Quantity {
     }
 }
 
-/// A file of metrics and what its curve is called.
+/// A file of metrics and the name of its curve.
 pub(crate) struct Source {
     label: String,
     path: PathBuf,
-    /// In joint training the task whose episodes are drawn; all of them otherwise.
+    /// In joint training the task whose episodes are drawn; none draws all episodes.
     task: Option<String>,
 }
 
 impl Source {
-    /// A run's metrics are called after its directory, other files by their own name.
+    /// A run's metrics are named after its directory, other files after themselves.
     pub(crate) fn of(path: PathBuf) -> Self {
         let metrics = path.file_stem().is_some_and(|stem| stem == "metrics");
         let named = if metrics { path.parent().and_then(Path::file_name) } else { path.file_stem() };
         Self { label: named.unwrap_or(path.as_os_str()).to_string_lossy().into_owned(), path, task: None }
     }
 
-    /// `FILE` or `LABEL=FILE`, either with `#TASK` behind it; a file that is there is no label, since a sweep's runs have
-    /// `=` in their names.
+    /// Parses `FILE` or `LABEL=FILE`, either with `#TASK` after it. An existing file has no label, since the names of a
+    /// sweep's runs contain `=`.
     fn parse(argument: &str) -> Self {
         let (file, task) = match argument.rsplit_once('#') {
             Some((file, task)) if !Path::new(argument).exists() => (file, Some(task.to_owned())),
@@ -82,7 +82,7 @@ impl Source {
     }
 }
 
-/// Where a run stood, and what it was worth there.
+/// A quantity's value at a moment of a run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Point {
     minutes: f64,
@@ -122,7 +122,7 @@ fn over_both(sources: &[Source], quantity: Quantity) -> Result<Vec<Panel>> {
     ])
 }
 
-/// Draws each group of runs as their mean over environment steps, with a band from the least to the most of them.
+/// Draws each group of runs as their mean over environment steps, with a band from the minimum to the maximum.
 pub(crate) fn draw_groups(groups: &[(String, Vec<PathBuf>)], quantity: Quantity, out: &Path) -> Result<()> {
     let series = groups.iter().map(|(label, runs)| {
         let curves = runs.iter().map(|path| read(path, None, quantity)).collect::<Result<Vec<_>>>()?;
@@ -140,14 +140,14 @@ fn read(path: &Path, task: Option<&str>, quantity: Quantity) -> Result<Vec<Point
         };
         if let Some(value) = of_task.and_then(|line| quantity.of(line)) {
             let steps = line.environment_steps as f64 / 1e6;
-            // A run that was killed does again what it did after its last checkpoint: the newer line holds.
+            // A killed run repeats the steps after its last checkpoint. The newer lines replace the older ones.
             points.truncate(points.partition_point(|point| point.steps < steps));
             points.push(Point { minutes: line.seconds / 60.0, steps, value });
         }
     }
     if points.is_empty() {
         let of_task = task.map_or_else(String::new, |task| format!(" of {task}"));
-        bail!("{} holds no finished episode{of_task} yet, or none that tells the {}", path.display(), quantity.label());
+        bail!("{} has no finished episode{of_task} yet, or none with the {}", path.display(), quantity.label());
     }
     Ok(smooth(&points))
 }
@@ -162,10 +162,10 @@ fn smooth(points: &[Point]) -> Vec<Point> {
     smoothed.collect()
 }
 
-/// What is written along the x axis, and what is drawn over it.
+/// The label of the x axis, and the series.
 type Panel = (&'static str, Vec<Series>);
 
-/// A row of panels, side by side, for each quantity.
+/// Draws a row of panels for each quantity.
 fn draw(rows: &[(Quantity, Vec<Panel>)], out: &Path) -> Result<()> {
     let root = SVGBackend::new(out, (1000, 400 * rows.len() as u32)).into_drawing_area();
     let drawn = || -> Result<()> {
@@ -211,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn every_quantity_is_a_row_of_its_own_and_one_that_nobody_told_is_refused() {
+    fn every_quantity_has_its_own_row_and_a_missing_one_is_refused() {
         let directory = tempfile::tempdir().unwrap();
         let (path, out) = (directory.path().join("metrics.jsonl"), directory.path().join("curve.svg"));
         std::fs::write(&path, "{\"environment_steps\":1000000,\"episode_return\":9.0,\"head_height\":1.2}\n").unwrap();
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_in_a_directory_with_an_equals_sign_is_no_labelled_file() {
+    fn a_path_with_an_equals_sign_that_exists_has_no_label() {
         let directory = tempfile::tempdir().unwrap();
         let run = metrics(directory.path(), "beta=1e-4,seed=2/metrics.jsonl", &[(1, 1.0)]);
         let source = Source::parse(&run.display().to_string());
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn one_tasks_episodes_are_drawn_where_it_is_named() {
+    fn a_named_tasks_episodes_are_drawn() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("metrics.jsonl");
         let line = r#"{"environment_steps":1000000,"episode_return":9.0,"tasks":{"get-up":{"episode_return":2.0}}}"#;
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_done_again_after_a_crash_is_drawn_once() {
+    fn steps_repeated_after_a_crash_are_drawn_once() {
         let directory = tempfile::tempdir().unwrap();
         let lines = [(1_000_000, 1.0), (2_000_000, 7.0), (3_000_000, 7.0), (2_000_000, 1.0), (4_000_000, 1.0)];
         let points = read(&metrics(directory.path(), "metrics.jsonl", &lines), None, Quantity::EpisodeReturn).unwrap();
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn smoothing_keeps_a_constant_and_never_looks_ahead() {
+    fn smoothing_keeps_a_constant_and_uses_no_later_points() {
         let points = |values: &[f64]| -> Vec<Point> {
             values.iter().map(|value| Point { minutes: 0.0, steps: 0.0, value: *value }).collect()
         };

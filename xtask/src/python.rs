@@ -1,4 +1,5 @@
-//! Other people's code, for comparison: virtual environments in `.deps/python`, made only when asked for.
+//! Runs other people's Python code for comparison, in virtual environments in `.deps/python`. Each is made when it is
+//! needed first.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,15 +11,16 @@ use crate::workspace;
 
 #[derive(clap::Args)]
 pub(crate) struct FixtureOptions {
-    /// Seed of everything the scripts draw
+    /// Seed of the scripts' random numbers
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Write below this directory instead of the repository's own fixtures
+    /// Write below this directory instead of tests/fixtures
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
 }
 
-/// The scripts that make fixtures: script, its requirements, the directory of its fixtures; all under `tests/`.
+/// The scripts that make fixtures: the script and its requirements in `tests/python`, and the directory in
+/// `tests/fixtures`.
 const FIXTURES: [(&str, &str, &str); 4] = [
     ("make_tracking_fixtures.py", "requirements-tracking.txt", "golden"),
     ("make_task_fixtures.py", "requirements-tracking.txt", "golden"),
@@ -26,7 +28,7 @@ const FIXTURES: [(&str, &str, &str); 4] = [
     ("make_distribution_fixtures.py", "requirements-vmpo.txt", "vmpo"),
 ];
 
-/// Makes the tests' fixtures anew.
+/// Makes the tests' fixtures again.
 pub(crate) fn fixtures(options: &FixtureOptions) -> Result<()> {
     let tests = workspace::root().join("tests");
     for (script, requirements, name) in FIXTURES {
@@ -38,24 +40,24 @@ pub(crate) fn fixtures(options: &FixtureOptions) -> Result<()> {
     Ok(())
 }
 
-/// Makes the environment in which tests run dm_control, torch and TensorBoard; under a second when it is there.
+/// Makes the environment in which tests run dm_control, torch and TensorBoard. Takes less than a second if it exists.
 pub(crate) fn prepare_tests() -> Result<()> {
     environment(&workspace::root().join("tests/python/requirements-export.txt")).map(drop)
 }
 
-/// A command that runs `tests/python/SCRIPT` with what `tests/python/REQUIREMENTS` names.
+/// A command that runs `tests/python/SCRIPT` with the packages of `tests/python/REQUIREMENTS`.
 pub(crate) fn script_command(script: &str, requirements: &str) -> Result<Command> {
     let directory = workspace::root().join("tests/python");
     let script = directory.join(script);
     if !script.exists() {
-        bail!("there is no {}", script.display());
+        bail!("{} does not exist", script.display());
     }
     let mut command = Command::new(environment(&directory.join(requirements))?);
     command.arg(script).current_dir(workspace::root());
     Ok(command)
 }
 
-/// The Python of the environment for `requirements`, made if it is not there or was made from others.
+/// The Python of the environment for `requirements`. It is made if it does not exist or has other requirements.
 fn environment(requirements: &Path) -> Result<PathBuf> {
     let wanted = fs::read_to_string(requirements).with_context(|| format!("cannot read {}", requirements.display()))?;
     let name = requirements.file_stem().unwrap_or_default();
@@ -74,8 +76,8 @@ fn environment(requirements: &Path) -> Result<PathBuf> {
     Ok(python)
 }
 
-/// torch comes as the one wheel PyPI has for Linux, CUDA's, without the gigabytes of CUDA beside it;
-/// `tests/python/bare_torch.py` makes it importable.
+/// Installs the packages. PyPI's only wheel of torch for Linux is the one for CUDA. It is installed without the gigabytes
+/// of NVIDIA's libraries, and `tests/python/bare_torch.py` makes it importable.
 fn install(python: &Path, directory: &Path, requirements: &str) -> Result<()> {
     let pip = |arguments: &[&str]| {
         let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"];

@@ -1,4 +1,4 @@
-//! `cargo xtask setup`: what the crate comic-setup does, into this repository's `.deps`.
+//! `cargo xtask setup`: the crate comic-setup with this repository's `.deps`.
 
 use anyhow::Result;
 
@@ -6,7 +6,7 @@ use crate::workspace;
 
 pub(crate) use comic_setup::Options;
 
-/// Brings `.deps` to what the pins say; under a second when it is already.
+/// Brings `.deps` to the state that the pins describe. Takes less than a second if it is already.
 pub(crate) fn run(options: &Options) -> Result<()> {
     comic_setup::run(options, &workspace::dependencies())
 }

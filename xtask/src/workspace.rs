@@ -1,19 +1,19 @@
-//! Where things lie in this repository, and how cargo is called.
+//! Paths in this repository, and how cargo and other programs are started.
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
 
 use anyhow::{Context, Result, bail};
 
 /// The repository's root.
 pub(crate) fn root() -> PathBuf {
-    // Cargo says at run time where this package lies; the compiled-in path is for a copied binary.
+    // Cargo sets the variable when it starts this program. A copied program knows only the path at compile time.
     let package =
         std::env::var_os("CARGO_MANIFEST_DIR").map_or_else(|| env!("CARGO_MANIFEST_DIR").into(), PathBuf::from);
     package.parent().map_or_else(|| PathBuf::from("."), Path::to_path_buf)
 }
 
-/// The directory set-up fills.
+/// The directory that set-up fills.
 pub(crate) fn dependencies() -> PathBuf {
     root().join(".deps")
 }
@@ -25,9 +25,15 @@ pub(crate) fn cargo() -> Command {
     command
 }
 
-/// Whether cargo has the sub-command `name` installed.
+/// Whether cargo has the subcommand `name`.
 pub(crate) fn cargo_has(name: &str) -> bool {
     cargo().args([name, "--version"]).output().is_ok_and(|output| output.status.success())
+}
+
+/// Whether `program` can be started with these arguments and ends well. Its output is discarded.
+pub(crate) fn answers(program: &str, arguments: &[&str]) -> bool {
+    let status = Command::new(program).args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).status();
+    status.is_ok_and(|status| status.success())
 }
 
 /// Runs `command` to its end with this program's own input and output.
@@ -45,14 +51,14 @@ pub(crate) fn describe(command: &Command) -> String {
     std::iter::once(program).chain(command.get_args()).map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
 }
 
-/// Builds every program in the release profile: always all of them, since cargo compiles a crate anew when it is
-/// built together with others that ask for more features of what they share.
+/// Builds every program in the release profile. Building a part of them would compile crates again, since cargo chooses
+/// the features of shared dependencies for all crates of one build.
 pub(crate) fn build() -> Result<()> {
     run(cargo().args(["build", "--release", "--workspace", "--bins"]))
 }
 
-/// A program of this workspace; they all stand beside this one.
+/// The path of a program of this workspace. All of them lie beside this one.
 pub(crate) fn program(name: &str) -> Result<PathBuf> {
-    let own = std::env::current_exe().context("cannot tell where this program lies")?;
+    let own = std::env::current_exe().context("cannot find the path of this program")?;
     Ok(own.with_file_name(format!("{name}{}", std::env::consts::EXE_SUFFIX)))
 }

@@ -14,7 +14,7 @@ use comic_actor::worker::{Progress, Worker};
 use comic_experiment::seed::derive;
 use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
-use comic_tasks::floor::RawFloor;
+use comic_tasks::raw_physics::RawPhysics;
 use comic_tasks::{Environment, Simulated};
 
 use super::figure::{Figure, interleave};
@@ -25,7 +25,7 @@ use super::{ENVIRONMENTS, Subject};
 pub(super) fn policy(subject: &Subject) -> Result<Figure> {
     let (environments, tapes): (Vec<_>, Vec<_>) = environments(subject, 1)?.into_iter().map(Recorded::new).unzip();
     let mut worker = worker(subject, environments, 1)?;
-    let mut floors: Vec<_> = tapes.iter().map(|_| RawFloor::default()).collect();
+    let mut floors: Vec<_> = tapes.iter().map(|_| RawPhysics::default()).collect();
     let medians = interleave(subject.budget, || {
         let value = unroll_rate(&mut worker)?;
         let begin = Instant::now();

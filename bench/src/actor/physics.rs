@@ -4,7 +4,7 @@ use std::convert::Infallible;
 use std::time::Instant;
 
 use anyhow::Result;
-use comic_tasks::floor::{FloorState, RawFloor};
+use comic_tasks::raw_physics::{PhysicsState, RawPhysics};
 use comic_tasks::{Environment as _, Outcome};
 use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
@@ -22,7 +22,7 @@ const RESETS: usize = 32;
 pub(super) fn environment(subject: &Subject) -> Result<Figure> {
     let spec = subject.task.spec();
     let (mut environment, tape) = Recorded::new(subject.environment(1)?);
-    let mut floor = RawFloor::default();
+    let mut floor = RawPhysics::default();
     let mut rng = Pcg64::seed_from_u64(1);
     let mut actions = vec![0.0_f32; STEPS * spec.action];
     let (mut proprioception, mut task) = (vec![0.0; spec.proprioception], vec![0.0; spec.task]);
@@ -51,7 +51,7 @@ pub(super) fn environment(subject: &Subject) -> Result<Figure> {
 pub(super) fn reset(subject: &Subject) -> Result<Figure> {
     let spec = subject.task.spec();
     let mut environment = subject.environment(1)?;
-    let mut floor = RawFloor::default();
+    let mut floor = RawPhysics::default();
     let (mut proprioception, mut task) = (vec![0.0; spec.proprioception], vec![0.0; spec.task]);
     let mut states = Vec::with_capacity(RESETS);
     let medians = infallible(interleave(subject.budget, || {
@@ -60,7 +60,7 @@ pub(super) fn reset(subject: &Subject) -> Result<Figure> {
         for _ in 0..RESETS {
             environment.reset();
             environment.observe(&mut proprioception, &mut task);
-            states.push(FloorState::of(environment.as_ref()));
+            states.push(PhysicsState::of(environment.as_ref()));
         }
         let value = begin.elapsed().as_secs_f64();
         let begin = Instant::now();

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use comic_tasks::floor::{FloorState, RawFloor};
+use comic_tasks::raw_physics::{PhysicsState, RawPhysics};
 use comic_tasks::{Environment, Episode, Simulated, Step};
 use parking_lot::Mutex;
 
@@ -13,7 +13,7 @@ pub(super) const SUBSTEPS: usize = 6;
 #[derive(Debug, Default)]
 struct Recording {
     /// A state after a reset, or none for a step, which takes the next action.
-    events: Vec<Option<FloorState>>,
+    events: Vec<Option<PhysicsState>>,
     actions: Vec<f32>,
     width: usize,
 }
@@ -24,7 +24,7 @@ pub(super) struct Tape(Arc<Mutex<Recording>>);
 
 impl Tape {
     /// Plays what was recorded since the last call, and returns the number of steps.
-    pub(super) fn play(&self, floor: &mut RawFloor) -> usize {
+    pub(super) fn play(&self, floor: &mut RawPhysics) -> usize {
         let recording = std::mem::take(&mut *self.0.lock());
         let mut actions = recording.actions.chunks_exact(recording.width.max(1));
         let mut steps = 0;
@@ -65,7 +65,7 @@ impl Recorded {
 impl Environment for Recorded {
     fn reset(&mut self) {
         self.environment.reset();
-        self.record(|recording| recording.events.push(Some(FloorState::of(self.environment.as_ref()))));
+        self.record(|recording| recording.events.push(Some(PhysicsState::of(self.environment.as_ref()))));
     }
     fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), comic_tasks::Error> {
         self.environment.reset_to(clip, start)

@@ -87,7 +87,7 @@ impl Crowd {
     /// Standard input or output that fails.
     pub fn run(&self) -> Result<()> {
         let actors = Arc::new(Actors::new(self));
-        comic_learner::run::allow_descriptors(self.actors as u64 + OTHER_FILES);
+        comic_learner::service::process::allow_descriptors(self.actors as u64 + OTHER_FILES);
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
         for index in 0..self.actors {
             runtime.spawn(actors.clone().run(index));

@@ -11,10 +11,11 @@ use anyhow::{Context as _, Result};
 use bytes::Bytes;
 use clap::{Args, ValueEnum};
 use comic_learner::publish::Publisher;
-use comic_learner::run::{allow_descriptors, service_runtime};
 use comic_learner::security::{ConnectionLimits, Security, Tls};
-use comic_learner::service::quarantine::QuarantineOptions;
-use comic_learner::service::{Setup, Shared, serve, server, window};
+use comic_learner::service::http2::{server, window};
+use comic_learner::service::process::{allow_descriptors, runtime};
+use comic_learner::service::quarantine::QuarantineArguments;
+use comic_learner::service::{Service, Setup, serve};
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
 use comic_proto::v1::{self, Behaviour, UnrollAck, UnrollMessage, Verdict};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Next, Phase};
@@ -69,13 +70,13 @@ impl Host {
     /// # Errors
     /// An address that cannot be used; standard input or output that fails.
     pub fn run(&self) -> Result<()> {
-        let runtime = service_runtime()?;
+        let runtime = runtime()?;
         let listener = runtime.block_on(TcpListener::bind((Ipv4Addr::LOCALHOST, 0)))?;
         println!("{}", json!({ "listening": listener.local_addr()?.to_string() }));
         match self.kind {
             Kind::Learner => {
                 let stand_in = StandIn::new(self)?;
-                runtime.spawn(serve(listener, stand_in.shared.clone(), std::future::pending()));
+                runtime.spawn(serve(listener, stand_in.service.clone(), std::future::pending()));
                 stand_in.start(self)?;
                 answer_requests(|request| stand_in.answer(request))
             }
@@ -106,7 +107,7 @@ impl Host {
 /// The learner with a thread that takes batches in place of the trainer.
 #[derive(Clone, Debug)]
 struct StandIn {
-    shared: Arc<Shared>,
+    service: Service,
     batcher: Batcher,
     publisher: Publisher,
     payload: Bytes,
@@ -130,7 +131,7 @@ impl StandIn {
             ..ConnectionLimits::default()
         };
         allow_descriptors(16_384);
-        let shared = Shared::new(Setup {
+        let service = Service::new(Setup {
             run: "runs/bench".into(),
             id: 0,
             security: security(options.tls.as_deref())?,
@@ -140,9 +141,9 @@ impl StandIn {
             assets: Vec::new(),
             batcher: batcher.clone(),
             publisher: publisher.clone(),
-            quarantine: QuarantineOptions::default(),
+            quarantine: QuarantineArguments::default(),
         })?;
-        Ok(Self { shared, batcher, publisher, payload: Bytes::from(vec![1; options.parameters]) })
+        Ok(Self { service, batcher, publisher, payload: Bytes::from(vec![1; options.parameters]) })
     }
 
     fn start(&self, options: &Host) -> Result<()> {
@@ -177,7 +178,7 @@ impl StandIn {
                         self.publish();
                     }
                     self.batcher.trained(batch);
-                    self.shared.telemetry.count_update(began.elapsed(), ages);
+                    self.service.trainer().telemetry.count_update(began.elapsed(), ages);
                 }
                 Next::Elapsed => {}
                 Next::Closed => return,

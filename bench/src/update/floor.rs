@@ -138,6 +138,6 @@ impl Floor {
         let made: Vec<Tensor> = products.chain(self.lstms.iter().flat_map(FusedLstm::run)).collect();
         backend.end_step()?;
         drop(made);
-        backend.wait()
+        Ok(backend.wait()?)
     }
 }

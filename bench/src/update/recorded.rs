@@ -17,18 +17,17 @@ pub(super) struct Recorded {
 
 impl Recorded {
     pub(super) fn new(spec: &TaskSpec, experiment: &Experiment) -> Result<Self> {
-        let shape = UnrollShape::new(spec, experiment);
-        let layout = UnrollLayout::new(shape);
-        let unrolls = experiment.unroll.batch;
-        let mut floats = PerField::<Vec<f32>>::default();
+        let layout = UnrollLayout::new(UnrollShape::new(spec, experiment));
+        let (unroll, unrolls) = (*layout.shape(), experiment.unroll.batch);
+        let mut floats = PerField::from_fn(|_| Vec::new());
         for (field, values) in floats.iter_mut() {
-            let count = unrolls * layout.elements(field);
+            let count = layout.elements(field) * unrolls;
             *values = match field {
-                Field::Clip | Field::Image => Vec::new(),
-                Field::Std => vec![0.7; count],
-                Field::LogWeights => vec![-(shape.components as f32).ln(); count],
                 Field::Discount | Field::Valid => vec![1.0; count],
+                Field::Std => vec![0.7; count],
+                Field::LogWeights => vec![-(unroll.components as f32).ln(); count],
                 Field::First | Field::State => vec![0.0; count],
+                Field::Clip | Field::Image => Vec::new(),
                 Field::Proprioception
                 | Field::Task
                 | Field::PreviousLatent
@@ -36,16 +35,16 @@ impl Recorded {
                 | Field::Action
                 | Field::Mean
                 | Field::Reward => Vec::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu)))
-                    .context("cannot read random numbers")?,
+                    .context("cannot copy random numbers")?,
             };
         }
         // The tasks take turns; each has one clip here.
-        let tasks: Vec<usize> = (0..unrolls).map(|unroll| unroll % spec.tasks.len()).collect();
+        let tasks: Vec<usize> = (0..unrolls).map(|index| index % spec.tasks.len()).collect();
         Ok(Self {
             floats,
-            clips: tasks.iter().flat_map(|task| vec![*task as u32; shape.length + 1]).collect(),
+            clips: tasks.iter().flat_map(|task| vec![*task as u32; layout.rows(Field::Clip)]).collect(),
             tasks,
-            shape: MinibatchShape { unrolls, tasks: spec.tasks.len(), unroll: shape },
+            shape: MinibatchShape { unrolls, tasks: spec.tasks.len(), unroll },
         })
     }
 

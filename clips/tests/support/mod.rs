@@ -1,6 +1,6 @@
-//! Where the fixtures are.
+//! Finds the fixtures, and opens them.
 #![allow(dead_code, reason = "no test uses all of it")]
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use comic_clips::import::{Constants, Floor, Take};
 use comic_clips::{Catalogue, Error};
 use comic_experiment::ClipSource;
 
-/// A failing case is printed, not kept in a file.
+/// Settings of every property test: a failing case is printed, not kept in a file.
 pub(crate) fn law() -> proptest::test_runner::Config {
     proptest::test_runner::Config { failure_persistence: None, ..Default::default() }
 }
@@ -17,12 +17,11 @@ pub(crate) fn tiny() -> String {
     fixture("tiny.h5")
 }
 
-/// A recording of the CMU database beside these tests: a run of subject 2.
+/// A recording of the CMU database: a run of subject 2.
 pub(crate) fn run_take() -> Take {
-    let file = |name: &str| path(["tests", "data", "cmu", name]);
     let constants =
         Constants { sole_degrees: Some([13.5, 12.0]), floor: Some(Floor::DRIFTING), ..Constants::default() };
-    Take { name: "CMU_002_03".into(), asf: file("02.asf"), amc: file("02_03.amc"), constants }
+    Take { name: "CMU_002_03".into(), asf: recordings("02.asf"), amc: recordings("02_03.amc"), constants }
 }
 
 pub(crate) fn defects() -> String {
@@ -33,27 +32,27 @@ fn fixture(name: &str) -> String {
     path(["tests", "data", name]).display().to_string()
 }
 
-/// A file of the folder that lies beside the repository on the machines this was developed on; `None`, saying so,
-/// where it does not.
-pub(crate) fn shared(file: &str) -> Option<PathBuf> {
-    optional(path(["..", "..", "shared", file]))
+/// A file beside the recordings, for instance `clips.h5`: the clips that MuJoCo and dm_control made of them.
+pub(crate) fn recordings(name: &str) -> PathBuf {
+    path(["tests", "data", "cmu", name])
 }
 
-/// The wheel's own test clips, there after `cargo xtask setup`.
-pub(crate) fn wheel_clips() -> Option<PathBuf> {
-    optional(path(["..", ".deps", "dm_control", "test_trajectories.h5"]))
+/// Numbers that dm_control computed.
+pub(crate) fn golden(name: &str) -> PathBuf {
+    path(["..", "tests", "fixtures", "golden", name])
+}
+
+/// dm_control's own test clips, from its wheel.
+pub(crate) fn wheel_clips() -> PathBuf {
+    let workspace = path([".."]);
+    let folder = std::env::var_os("COMIC_DM_CONTROL_DIR").unwrap_or_else(|| ".deps/dm_control".into());
+    let file = workspace.join(folder).join("test_trajectories.h5");
+    assert!(file.is_file(), "no file {}; run `cargo xtask setup`", file.display());
+    file
 }
 
 fn path<const N: usize>(parts: [&str; N]) -> PathBuf {
     std::iter::once(env!("CARGO_MANIFEST_DIR")).chain(parts).collect()
-}
-
-fn optional(path: PathBuf) -> Option<PathBuf> {
-    if path.exists() {
-        return Some(path);
-    }
-    eprintln!("skipped: {} is not here", path.display());
-    None
 }
 
 pub(crate) fn whole(source: impl AsRef<Path>) -> ClipSource {
@@ -68,12 +67,12 @@ pub(crate) fn names(catalogue: &Catalogue) -> Vec<&str> {
     catalogue.entries().iter().map(|entry| entry.name.as_str()).collect()
 }
 
-/// What opening says.
+/// The message of the error that opening gives.
 pub(crate) fn refused(source: ClipSource) -> String {
     Catalogue::open(&[source]).expect_err("must be refused").to_string()
 }
 
-/// What opening and loading one clip says.
+/// Opens a file and loads one clip.
 pub(crate) fn load_one(file: &str, name: &str) -> Result<comic_clips::Clip, Error> {
     Catalogue::open(&[with_ids(file, &[name])])?.load(0)
 }

@@ -1,15 +1,17 @@
 //! Crashes in the middle of writing a checkpoint, with whatever a disk may lose then.
 //!
-//! The model is the pessimist's: what a sync has not covered when the machine stops is there, or is not, or, of a file's
-//! contents, is there in half, each by itself.
+//! The model is pessimistic. When the machine stops, each change that was not synced is either kept or lost, and a file's
+//! contents may be cut in half, independently of all other changes.
 
 use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
 use tempfile::TempDir;
 
-use super::steps::{Step, carry_out};
-use super::{Name, Snapshot, Store, making};
+use crate::checkpoint::name::Name;
+use crate::checkpoint::snapshot::Snapshot;
+use crate::checkpoint::steps::{Step, carry_out, making};
+use crate::checkpoint::store::Store;
 
 const KEPT: usize = 1;
 
@@ -41,11 +43,11 @@ fn owned(step: &Step<'_>) -> Step<'static> {
     }
 }
 
-/// What of a step can be lost by itself.
+/// What can happen to one step.
 #[derive(Clone, Copy, PartialEq)]
 enum Fate {
     Lasts,
-    /// A file is there, and what was in it is not, or half of it.
+    /// The file exists, with half of its contents.
     Torn,
     Lost,
 }
@@ -67,7 +69,7 @@ fn contents_last(step: &Step<'_>, later: &[Step<'_>]) -> bool {
     later.iter().any(|step| matches!(step, Step::SyncFile(synced) if synced == path))
 }
 
-/// Leaves the disk as it may be after `done` and a crash. `luck` decides, two bits for each step.
+/// Leaves the disk as it may be after `done` and a crash. `luck` decides, with two bits for each step.
 fn crash(done: &[Step<'_>], luck: u128) {
     for (number, step) in done.iter().enumerate() {
         let (later, bits) = (&done[number + 1..], luck >> (2 * number) & 3);
@@ -77,7 +79,7 @@ fn crash(done: &[Step<'_>], luck: u128) {
             3 if !entry_lasts(step, later) => Fate::Lost,
             _ => Fate::Lasts,
         };
-        // What depends on what was lost is lost with it.
+        // A step that depends on a lost one fails, and is lost too.
         let _ = match (fate, step) {
             (Fate::Lost, _) => Ok(()),
             (Fate::Torn, Step::Write(path, bytes)) => {
@@ -88,7 +90,7 @@ fn crash(done: &[Step<'_>], luck: u128) {
     }
 }
 
-/// What the next life finds: a whole checkpoint, no other than these; afterwards everything goes on as ever.
+/// What the next start finds: one of these checkpoints, whole. Afterwards everything works as before.
 fn survives(run: &Path, expected: &[&Snapshot]) -> Result<(), TestCaseError> {
     let store = Store::open(run, KEPT).map_err(fail)?;
     let found = store.newest().map_err(fail)?.map(|(_, snapshot)| snapshot);
@@ -97,7 +99,7 @@ fn survives(run: &Path, expected: &[&Snapshot]) -> Result<(), TestCaseError> {
     let left = std::fs::read_dir(run.join("checkpoints")).map_err(fail)?.flatten();
     let hidden: Vec<_> =
         left.map(|entry| entry.file_name()).filter(|name| name.to_string_lossy().starts_with('.')).collect();
-    prop_assert!(hidden.is_empty(), "left half-done: {:?}", hidden);
+    prop_assert!(hidden.is_empty(), "half-finished: {:?}", hidden);
     let third = snapshot("three");
     store.write(Name::Updates(3), &third).map_err(fail)?;
     prop_assert_eq!(store.newest().map_err(fail)?.map(|(_, snapshot)| snapshot), Some(third));
@@ -125,7 +127,7 @@ fn files(directory: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     found
 }
 
-/// Makes a run's checkpoints what they were.
+/// Restores a run's checkpoints.
 fn put_back(run: &Path, files: &[(PathBuf, Vec<u8>)]) {
     std::fs::remove_dir_all(run.join("checkpoints")).unwrap();
     for (path, bytes) in files {
@@ -135,11 +137,11 @@ fn put_back(run: &Path, files: &[(PathBuf, Vec<u8>)]) {
 }
 
 proptest! {
-    // Each of them syncs a few dozen times.
+    // Each case syncs a few dozen times.
     #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn whenever_a_crash_comes_the_former_checkpoint_is_there_or_the_new_one(
+    fn after_a_crash_at_any_moment_there_is_the_former_checkpoint_or_the_new_one(
         next in names(), moment in any::<prop::sample::Index>(), luck in any::<u128>(),
     ) {
         let (run, store, steps) = run_with(next);
@@ -151,16 +153,16 @@ proptest! {
     }
 
     #[test]
-    fn once_it_is_written_it_stays(next in names(), luck in any::<u128>()) {
+    fn a_written_checkpoint_survives_a_crash(next in names(), luck in any::<u128>()) {
         let (run, store, steps) = run_with(next);
         crash(&steps, luck);
         drop(store);
         survives(run.path(), &[&snapshot("two")])?;
     }
 
-    /// A learner is killed, the next one puts right what it left, and the power goes: nothing was synced for the kill.
+    /// A learner is killed, the next one repairs what it left, and the power fails. Nothing was synced because of the kill.
     #[test]
-    fn putting_right_is_no_danger_either(
+    fn a_crash_while_repairing_loses_nothing(
         next in names(), killed in any::<prop::sample::Index>(), moment in any::<prop::sample::Index>(), luck in any::<u128>(),
     ) {
         let (run, store, mut steps) = run_with(next);
@@ -177,16 +179,16 @@ proptest! {
     }
 }
 
-/// A crash right after takes what it can.
+/// A crash comes right after they were made.
 #[test]
-fn a_new_runs_directories_stay() {
+fn a_new_runs_directories_survive_a_crash() {
     let place = tempfile::tempdir().unwrap();
     let directory = place.path().join("runs/first/checkpoints");
     let steps = making(&directory);
     crash(&steps, u128::MAX);
     assert!(directory.is_dir());
-    assert!(making(&directory).is_empty(), "what is there is not made again");
-    carry_out(&steps).expect("two learners that make it at once do not get into each other's way");
+    assert!(making(&directory).is_empty(), "an existing directory is not made again");
+    carry_out(&steps).expect("two learners can make it at the same time");
     let syncs: Vec<_> = (0..steps.len()).filter(|step| matches!(steps[*step], Step::SyncDirectory(_))).collect();
     assert_eq!(syncs.len(), 3);
     for sync in syncs {
@@ -199,10 +201,10 @@ fn a_new_runs_directories_stay() {
     }
 }
 
-/// That the tests above can fail: no sync is there for nothing.
+/// Shows that the tests above can fail: every sync is needed.
 #[test]
-fn without_any_one_of_the_syncs_something_is_lost() {
-    // Each step's worst fate, and every single one's.
+fn without_any_one_of_the_syncs_a_crash_can_lose_data() {
+    // The worst for all steps at once, and the worst for each single step.
     let lucks: Vec<u128> = [u128::MAX, u128::MAX / 3 * 2]
         .into_iter()
         .chain((0..60).flat_map(|step| [2 << (2 * step), 3 << (2 * step)]))

@@ -1,57 +1,57 @@
-//! What is done to a disk, one step after another. A crash may come between any two of them, and takes with it what was
-//! not synced: `crash.rs` tries it.
+//! What is done to a disk, one step after another. A crash may come between any two steps, and loses what was not synced;
+//! `crash.rs` tests this.
 
 use std::borrow::Cow;
 use std::fs::{self, File};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result};
+use crate::error::{Error, Result};
 
-/// One step.
+/// One change of the disk.
 #[derive(Clone, Debug)]
 pub(super) enum Step<'a> {
     MakeDirectory(PathBuf),
-    /// A file, in place of another of this name.
+    /// Writes a file, replacing one of the same name.
     Write(PathBuf, Cow<'a, [u8]>),
-    /// What is in the file lasts.
+    /// Makes the contents of a file last.
     SyncFile(PathBuf),
-    /// Which files are in the directory, and what they are called, lasts.
+    /// Makes the names in a directory last.
     SyncDirectory(PathBuf),
     Rename(PathBuf, PathBuf),
-    /// A symbolic link of this name that leads to the target.
+    /// A symbolic link of this name that points to the target.
     Link(PathBuf, String),
-    /// A file, a link, or a directory with all that is in it; nothing where there is none.
+    /// A file, a link, or a directory and everything in it. It need not exist.
     Remove(PathBuf),
 }
 
 impl Step<'_> {
-    /// Does it.
+    /// Carries out the step.
     ///
     /// # Errors
     /// When the disk refuses, with the path.
     pub(super) fn carry_out(&self) -> Result<()> {
         match self {
-            // Another learner may make the directories of the same run just now: whose it is, the lock decides.
+            // Another learner may make the same directories at this moment; the lock decides which learner continues.
             Self::MakeDirectory(path) => fs::create_dir(path)
                 .or_else(|error| if path.is_dir() { Ok(()) } else { Err(error) })
-                .with_context(|| format!("cannot make {}", path.display())),
-            Self::Write(path, bytes) => File::create(path)
-                .and_then(|mut file| file.write_all(bytes))
-                .with_context(|| format!("cannot write {}", path.display())),
-            Self::SyncFile(path) | Self::SyncDirectory(path) => File::open(path)
-                .and_then(|file| file.sync_all())
-                .with_context(|| format!("cannot sync {}", path.display())),
+                .map_err(Error::file("make", path)),
+            Self::Write(path, bytes) => {
+                File::create(path).and_then(|mut file| file.write_all(bytes)).map_err(Error::file("write", path))
+            }
+            Self::SyncFile(path) | Self::SyncDirectory(path) => {
+                File::open(path).and_then(|file| file.sync_all()).map_err(Error::file("sync", path))
+            }
             Self::Rename(from, to) => rename(from, to),
             Self::Link(path, target) => {
-                std::os::unix::fs::symlink(target, path).with_context(|| format!("cannot link {}", path.display()))
+                std::os::unix::fs::symlink(target, path).map_err(Error::file("make the link", path))
             }
             Self::Remove(path) => remove(path),
         }
     }
 }
 
-/// Does them in order, up to the first that fails.
+/// Carries out steps in order, up to the first that fails.
 ///
 /// # Errors
 /// That one's.
@@ -59,27 +59,27 @@ pub(super) fn carry_out(steps: &[Step<'_>]) -> Result<()> {
     steps.iter().try_for_each(Step::carry_out)
 }
 
-/// Puts a file with these contents in the place of another: after a crash one of the two is there, whole.
+/// Replaces a file by one with these contents. After a crash there is one of the two, and it is whole.
 pub(super) fn replace(path: &Path, bytes: Vec<u8>) -> [Step<'static>; 4] {
     let temporary = hidden("", path);
     let [rename, sync] = put(temporary.clone(), path);
     [Step::Write(temporary.clone(), bytes.into()), Step::SyncFile(temporary), rename, sync]
 }
 
-/// Gives what is whole and synced its name.
+/// Gives a file or directory that is whole and synced its final name.
 pub(super) fn put(temporary: PathBuf, path: &Path) -> [Step<'static>; 2] {
     let directory = path.parent().unwrap_or(path).to_path_buf();
     [Step::Rename(temporary, path.to_path_buf()), Step::SyncDirectory(directory)]
 }
 
-/// A name beside `path` that nothing else has: `.PREFIXname`.
+/// A name beside `path` that nothing else uses: `.PREFIXname`.
 pub(super) fn hidden(prefix: &str, path: &Path) -> PathBuf {
     path.with_file_name(format!(".{prefix}{}", path.file_name().unwrap_or_default().to_string_lossy()))
 }
 
 #[allow(clippy::disallowed_methods, reason = "the one durable rename: contents synced before, directory after")]
 fn rename(from: &Path, to: &Path) -> Result<()> {
-    fs::rename(from, to).with_context(|| format!("cannot put {} in place", to.display()))
+    fs::rename(from, to).map_err(Error::file("rename a file to", to))
 }
 
 fn remove(path: &Path) -> Result<()> {
@@ -89,15 +89,19 @@ fn remove(path: &Path) -> Result<()> {
         Err(error) => Err(error),
     };
     match removed {
-        Err(error) if error.kind() != ErrorKind::NotFound => {
-            Err(error).with_context(|| format!("cannot remove {}", path.display()))
-        }
+        Err(error) if error.kind() != ErrorKind::NotFound => Err(Error::file("remove", path)(error)),
         _ => Ok(()),
     }
 }
 
-/// Whether it is the checkpoint that is at fault, and not a disk that does not answer or a file that may not be read.
-pub(super) fn is_damage(error: &anyhow::Error) -> bool {
-    let failed = error.chain().find_map(|cause| cause.downcast_ref::<std::io::Error>());
-    failed.is_none_or(|failed| failed.kind() == std::io::ErrorKind::NotFound)
+/// Makes a directory, and the missing directories above it. Each is synced in its parent, because a directory that no one
+/// can find after a crash loses everything in it.
+pub(super) fn making(directory: &Path) -> Vec<Step<'static>> {
+    let named = |place: &&Path| !place.as_os_str().is_empty();
+    let missing: Vec<_> = directory.ancestors().take_while(|place| named(place) && !place.is_dir()).collect();
+    let steps = missing.into_iter().rev().flat_map(|place| {
+        let above = place.parent().filter(named).unwrap_or(Path::new("."));
+        [Step::MakeDirectory(place.to_path_buf()), Step::SyncDirectory(above.to_path_buf())]
+    });
+    steps.collect()
 }

@@ -1,6 +1,6 @@
-//! Batches to a card from pinned memory, on a stream of their own: see `cuda.cpp`.
+//! Copies batches to a GPU from pinned memory, on a separate stream: see `cuda.cpp`.
 
-#![allow(unsafe_code, reason = "a function of C++")]
+#![allow(unsafe_code, reason = "calls a C++ function")]
 
 use std::ffi::{c_char, c_void};
 
@@ -19,26 +19,26 @@ unsafe extern "C" {
     ) -> *mut c_void;
 }
 
-/// A tensor on a card. Returns when the values were read, not when they are there: what the calling thread has computed from
-/// now on waits for them.
+/// A tensor on a GPU. Returns when the values were read, not when they were copied. Later operations of the calling thread
+/// wait for the copy.
 ///
 /// # Errors
-/// When there are not as many values as `size` says, or the card refuses.
+/// When there are not as many values as `size` says, or the GPU refuses.
 pub(super) fn upload<T: Element>(values: &[T], size: &[i64], card: usize) -> Result<Tensor, TchError> {
     let elements = size.iter().try_fold(1_usize, |product, width| product.checked_mul(usize::try_from(*width).ok()?));
     if elements != Some(values.len()) {
-        return Err(TchError::Shape(format!("{} values are no tensor of {size:?}", values.len())));
+        return Err(TchError::Shape(format!("{} values do not fill a tensor of size {size:?}", values.len())));
     }
     // c10/core/ScalarType.h.
     let kind = match T::KIND {
         Kind::Uint8 => 0,
         Kind::Int64 => 4,
         Kind::Float => 6,
-        other => return Err(TchError::Kind(format!("no batch has {other:?}"))),
+        other => return Err(TchError::Kind(format!("a batch has no field of {other:?}"))),
     };
     let mut message = [0_u8; 1024];
-    // SAFETY: the pointers lead to as many bytes and sizes as they are said to, and the values are read before it returns. No
-    // exception passes it.
+    // SAFETY: each pointer is valid for the length that is passed with it, and the function reads the values before it
+    // returns. It catches every C++ exception.
     let made = unsafe {
         let (room, message) = (message.len(), message.as_mut_ptr().cast());
         comic_upload(values.as_ptr().cast(), size.as_ptr(), size.len(), kind, card as i64, message, room)
@@ -47,7 +47,7 @@ pub(super) fn upload<T: Element>(values: &[T], size: &[i64], card: usize) -> Res
         let said = String::from_utf8_lossy(&message);
         return Err(TchError::Torch(said.trim_end_matches('\0').to_owned()));
     }
-    // SAFETY: it is a new tensor of libtorch's that is nobody else's, as those are that the bindings make.
+    // SAFETY: it is a new tensor of libtorch that nothing else owns, like those that the bindings make.
     Ok(unsafe { Tensor::from_ptr(made.cast()) })
 }
 
@@ -56,7 +56,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn without_a_card_a_copy_is_an_error_of_libtorchs() {
+    fn without_a_gpu_a_copy_is_an_error_of_libtorch() {
         if tch::Cuda::device_count() > 0 {
             let there = upload(&[1_i64, 2, 3, 4, 5, 6], &[2, 3], 0).unwrap();
             assert_eq!(there.to_device(tch::Device::Cpu), Tensor::from_slice(&[1_i64, 2, 3, 4, 5, 6]).reshape([2, 3]));
@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn a_size_that_is_not_the_values_is_refused() {
+    fn a_size_that_does_not_fit_the_values_is_refused() {
         for size in [&[2_i64, 2][..], &[-3], &[i64::MAX, 3]] {
             assert!(matches!(upload(&[0_u8; 3], size, 0), Err(TchError::Shape(_))), "{size:?}");
         }

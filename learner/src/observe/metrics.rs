@@ -1,5 +1,5 @@
-//! What a person sees of a run: one JSON line every few seconds in `RUN/metrics.jsonl` and for TensorBoard, the newest one
-//! as the status.
+//! The metrics of a run for people: one JSON line every few seconds in `RUN/metrics.jsonl` and for TensorBoard. The newest
+//! line is also the status.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write as _;
@@ -7,13 +7,13 @@ use std::ops::AddAssign;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use anyhow::{Context as _, Result};
-use comic_experiment::TaskSpec;
+use comic_experiment::{TaskPart, TaskSpec};
 use comic_proto::Field;
 use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
 use comic_replay::{AccountingByTask, Batch};
 use serde_json::{Map, Value, json};
 
+use crate::error::{Error, Result};
 use crate::observe::evaluation::Evaluation;
 use crate::observe::tensorboard::Events;
 
@@ -43,12 +43,12 @@ struct Episodes {
     normalised: f64,
     /// Of the share of the clip that was survived.
     survived: f64,
-    /// Of the head's heights, m, in the steps of which they are known.
+    /// Of the head's heights, m, over the steps where they are known.
     head_heights: f64,
     head_steps: u64,
 }
 
-/// What was trained on of one task.
+/// Sums over the unrolls of one task.
 #[derive(Clone, Debug, Default)]
 struct TaskWindow {
     episodes: Episodes,
@@ -56,14 +56,14 @@ struct TaskWindow {
     rows: Rows,
 }
 
-/// What unrolls of one task are made of.
+/// The rows of one task's unrolls.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Rows {
     /// Rows in all.
     pub rows: u64,
     /// Rows with a transition.
     pub environment_steps: u64,
-    /// Rows that repeat an observation, since the next episode is of another task.
+    /// Rows that repeat an observation, because the next episode belongs to another task.
     pub padding: u64,
 }
 
@@ -106,7 +106,7 @@ impl Episodes {
     }
 }
 
-/// Assignments of nothing are absent, not 0.
+/// The mean of nothing is absent, not 0.
 fn per(value: f64, count: u64) -> Value {
     if count == 0 { Value::Null } else { json!(value / count as f64) }
 }
@@ -117,28 +117,28 @@ pub struct Metrics {
     spec: TaskSpec,
     run: PathBuf,
     file: File,
-    /// None where it could not be begun.
+    /// `None` if the file could not be opened.
     events: Option<Events>,
     window: Window,
     since: Instant,
     /// The accounting of the last line.
     accounting: AccountingByTask,
-    /// Whether the last line may have ended half-way.
+    /// Whether the last line may be incomplete.
     torn: bool,
 }
 
-/// Where the run stands, for the line's head.
+/// How far the run is, for the beginning of a line.
 #[derive(Clone, Copy, Debug)]
 pub struct Position {
-    /// Wall-clock seconds since the first unroll, earlier lives included.
+    /// Wall-clock seconds since the first unroll, those of earlier learner epochs included.
     pub seconds: f64,
-    /// Environment steps trained on, over the run's whole life.
+    /// Environment steps trained on, over the whole run.
     pub environment_steps: u64,
-    /// Batches trained on, over the run's whole life.
+    /// Batches trained on, over the whole run.
     pub updates: u64,
     /// Newest published version.
     pub version: u64,
-    /// This life of the learner.
+    /// The learner epoch.
     pub epoch: u64,
 }
 
@@ -162,12 +162,14 @@ impl Metrics {
         })
     }
 
-    /// Begins a life of the learner after so many environment steps: what these accounting say is no news. It can do without
-    /// TensorBoard.
+    /// Begins a learner epoch after so many environment steps, with this accounting. Without TensorBoard's file the epoch
+    /// continues.
     pub fn begin(&mut self, epoch: u64, environment_steps: u64, accounting: AccountingByTask) {
         self.accounting = accounting;
         let begun = Events::begin(&self.run, epoch, environment_steps);
-        self.events = begun.map_err(|error| tracing::error!("nothing is written for TensorBoard: {error:#}")).ok();
+        self.events = begun
+            .map_err(|error| tracing::error!("nothing is written for TensorBoard: {}", comic_proto::chain(&error)))
+            .ok();
     }
 
     /// Seconds since the last line.
@@ -175,18 +177,19 @@ impl Metrics {
         self.since.elapsed().as_secs_f64()
     }
 
-    /// Whether a line would say anything that the last one did not: a learner that nobody feeds writes none.
+    /// Whether a line would differ from the last one: without actors a learner writes none.
     pub fn has_news(&self, accounting: &AccountingByTask) -> bool {
         self.window.unrolls > 0
             || self.window.tasks.iter().any(|task| task.unrolls > 0)
             || self.accounting != *accounting
     }
 
-    /// Appends an actor's evaluation to `RUN/evaluations.jsonl`. A disk that refuses is complained about, and training
-    /// goes on.
+    /// Appends an actor's evaluation to `RUN/evaluations.jsonl`. If the disk refuses, the error is logged, and training
+    /// continues.
     pub fn keep_evaluation(&self, evaluation: &Evaluation) {
         if let Err(error) = self.append_evaluation(evaluation) {
-            tracing::error!(version = evaluation.version, "an evaluation is lost: {error:#}");
+            let error = comic_proto::chain(&error);
+            tracing::error!(version = evaluation.version, "an evaluation is lost: {error}");
         }
     }
 
@@ -196,7 +199,7 @@ impl Metrics {
         let line = json!({ "run": evaluation.run, "learner_epoch": evaluation.epoch, "version": evaluation.version,
             "updates": evaluation.updates, "evaluation": report });
         let mut file = append(&path)?;
-        writeln!(file, "{line}").with_context(|| format!("cannot write {}", path.display()))
+        writeln!(file, "{line}").map_err(Error::file("write", &path))
     }
 
     /// Counts the rows of a batch and returns the counts of each task.
@@ -231,7 +234,7 @@ impl Metrics {
     }
 
     /// Counts a batch's episodes, and the age of its unrolls where `version` is the newest.
-    pub fn absorb(&mut self, headers: &[UnrollHeader], version: u64) {
+    pub fn count_episodes(&mut self, headers: &[UnrollHeader], version: u64) {
         let window = &mut self.window;
         window.returns.resize(self.spec.reward_terms.len(), 0.0);
         window.tasks.resize(self.spec.tasks.len(), TaskWindow::default());
@@ -252,12 +255,30 @@ impl Metrics {
         }
     }
 
-    /// Writes the line, starts a new window, and returns the line for the status. A disk that refuses is complained
-    /// about, and training goes on.
+    /// Writes the line, starts a new window, and returns the line for the status. If the disk refuses, the error is logged,
+    /// and training continues.
     pub fn write(&mut self, position: Position, accounting: AccountingByTask, losses: Map<String, Value>) -> String {
-        let seconds = self.since.elapsed().as_secs_f64().max(1e-9);
-        let window = std::mem::take(&mut self.window);
+        let line = self.line(position, &accounting, losses);
+        self.window = Window::default();
         self.since = Instant::now();
+        self.accounting = accounting;
+        if let Some(Err(error)) = self.events.as_mut().map(|events| events.write(&line)) {
+            tracing::error!("TensorBoard's file lacks a line: {error}");
+        }
+        let line = line.to_string();
+        // A line that a full disk cut off is not continued.
+        let start = if self.torn { "\n" } else { "" };
+        let written = self.file.write_all(format!("{start}{line}\n").as_bytes());
+        self.torn = written.is_err();
+        if let Err(error) = written {
+            tracing::error!("metrics.jsonl lacks a line: {error}");
+        }
+        line
+    }
+
+    fn line(&self, position: Position, accounting: &AccountingByTask, losses: Map<String, Value>) -> Value {
+        let window = &self.window;
+        let seconds = self.elapsed().max(1e-9);
         let environment_steps: u64 = window.tasks.iter().map(|task| task.rows.environment_steps).sum();
         let named = self.spec.reward_terms.iter().zip(&window.returns);
         let terms: Map<String, Value> =
@@ -280,45 +301,32 @@ impl Metrics {
             line[name] = value;
         }
         if self.spec.tasks.len() > 1 {
-            line["tasks"] = self
-                .spec
-                .tasks
-                .iter()
-                .enumerate()
-                .map(|(index, task)| {
-                    // Nothing was trained on since the last line: the accounting may have moved all the same.
-                    let window = window.tasks.get(index).cloned().unwrap_or_default();
-                    let mut entries: Map<String, Value> =
-                        window.episodes.entries().map(|(name, value)| (name.to_string(), value)).into_iter().collect();
-                    entries.insert("unrolls".into(), json!(window.unrolls));
-                    let Rows { rows, environment_steps, padding } = window.rows;
-                    entries.insert("environment_steps".into(), json!(environment_steps));
-                    entries.insert("padding_share".into(), per(padding as f64, rows));
-                    entries.insert("accounting".into(), json!(accounting.tasks.get(&task.name)));
-                    (task.name.clone(), Value::Object(entries))
-                })
-                .collect::<Map<String, Value>>()
-                .into();
-        }
-        self.accounting = accounting;
-        if let Some(Err(error)) = self.events.as_mut().map(|events| events.write(&line)) {
-            tracing::error!("TensorBoard's file lacks a line: {error}");
-        }
-        let line = line.to_string();
-        // What a full disk cut off keeps its own line.
-        let start = if self.torn { "\n" } else { "" };
-        let written = self.file.write_all(format!("{start}{line}\n").as_bytes());
-        self.torn = written.is_err();
-        if let Err(error) = written {
-            tracing::error!("metrics.jsonl lacks a line: {error}");
+            line["tasks"] = self.by_task(accounting).into();
         }
         line
+    }
+
+    /// The entries of each task, by its name.
+    fn by_task(&self, accounting: &AccountingByTask) -> Map<String, Value> {
+        let entries = |(index, task): (usize, &TaskPart)| {
+            // Without an update since the last line, the accounting may have changed all the same.
+            let window = self.window.tasks.get(index).cloned().unwrap_or_default();
+            let mut entries: Map<String, Value> =
+                window.episodes.entries().map(|(name, value)| (name.to_string(), value)).into_iter().collect();
+            let Rows { rows, environment_steps, padding } = window.rows;
+            entries.insert("unrolls".into(), json!(window.unrolls));
+            entries.insert("environment_steps".into(), json!(environment_steps));
+            entries.insert("padding_share".into(), per(padding as f64, rows));
+            entries.insert("accounting".into(), json!(accounting.tasks.get(&task.name)));
+            (task.name.clone(), Value::Object(entries))
+        };
+        self.spec.tasks.iter().enumerate().map(entries).collect()
     }
 }
 
 fn append(path: &Path) -> Result<File> {
     let file = OpenOptions::new().create(true).append(true).open(path);
-    file.with_context(|| format!("cannot write {}", path.display()))
+    file.map_err(Error::file("write", path))
 }
 
 #[cfg(test)]
@@ -328,7 +336,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_head_is_as_high_as_in_the_mean_step_of_the_episodes_that_say_so() {
+    fn the_heads_height_is_the_mean_over_the_steps_where_it_is_known() {
         let mut episodes = Episodes::default();
         for (steps, head_height) in [(30, Some(1.0)), (10, Some(0.2)), (60, None)] {
             episodes.add(&EpisodeStatistics { steps, head_height, ..EpisodeStatistics::default() }, 1.0);
@@ -340,9 +348,9 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_costs_lines_and_nothing_else() {
+    fn a_full_disk_loses_lines_and_nothing_else() {
         let directory = tempfile::tempdir().unwrap();
-        // A device that refuses every byte, for want of space.
+        // A device that is always full.
         std::os::unix::fs::symlink("/dev/full", directory.path().join("metrics.jsonl")).unwrap();
         std::os::unix::fs::symlink("/dev/full", directory.path().join("evaluations.jsonl")).unwrap();
         let spec = TaskSpec::new(&Experiment::default(), vec!["walk".into()]).unwrap();

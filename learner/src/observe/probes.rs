@@ -1,5 +1,5 @@
-//! Plain HTTP for those who watch: `/metrics` for Prometheus, `/healthz` and `/readyz` for a kubelet. It shows counts
-//! and no secret, and takes nothing in.
+//! Plain HTTP for monitoring: `/metrics` for Prometheus, `/healthz` and `/readyz` for a kubelet. It shows counts and no
+//! secret, and accepts no input.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -14,41 +14,47 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 
-use crate::service::Shared;
-
 /// Connections at once; further ones wait to be accepted.
 const CONNECTIONS: usize = 64;
 /// A connection is one request and its answer, and lasts no longer.
 const LIMIT: Duration = Duration::from_secs(10);
-/// Before listening again when the system has no file descriptor to give.
-const BREATH: Duration = Duration::from_millis(100);
+/// The pause before the next attempt when the system has no file descriptor left.
+const RETRY_DELAY: Duration = Duration::from_millis(100);
 const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// Answers for as long as the process lives.
-pub async fn serve(listener: TcpListener, shared: Arc<Shared>) {
+/// What the probes show.
+pub trait Probed: Send + Sync + 'static {
+    /// The metrics, in the OpenMetrics text format.
+    fn metrics_page(&self) -> String;
+    /// Whether the learner is going down, so that no actor can join.
+    fn is_draining(&self) -> bool;
+}
+
+/// Answers until the process ends.
+pub async fn serve(listener: TcpListener, probed: Arc<impl Probed>) {
     let places = Arc::new(Semaphore::new(CONNECTIONS));
     // The semaphore is never closed.
     while let Ok(place) = places.clone().acquire_owned().await {
         match listener.accept().await {
             Ok((stream, _)) => {
-                let shared = shared.clone();
+                let probed = probed.clone();
                 tokio::spawn(async move {
-                    let _ = tokio::time::timeout(LIMIT, answer(stream, shared)).await;
+                    let _ = tokio::time::timeout(LIMIT, answer(stream, probed)).await;
                     drop(place);
                 });
             }
             Err(error) => {
                 tracing::warn!(%error, "a connection to the metrics could not be accepted");
-                tokio::time::sleep(BREATH).await;
+                tokio::time::sleep(RETRY_DELAY).await;
             }
         }
     }
 }
 
-/// An error is the peer's: it went away, or does not speak HTTP.
-async fn answer(stream: TcpStream, shared: Arc<Shared>) -> Result<(), hyper::Error> {
+/// Answers one request. An error means that the peer is gone, or does not speak HTTP.
+async fn answer(stream: TcpStream, probed: Arc<impl Probed>) -> Result<(), hyper::Error> {
     let respond = service_fn(move |request: Request<hyper::body::Incoming>| {
-        let response = respond(request.method(), request.uri().path(), &shared);
+        let response = respond(request.method(), request.uri().path(), probed.as_ref());
         async move { Ok::<_, Infallible>(response) }
     });
     let mut http = hyper::server::conn::http1::Builder::new();
@@ -56,11 +62,11 @@ async fn answer(stream: TcpStream, shared: Arc<Shared>) -> Result<(), hyper::Err
     http.serve_connection(TokioIo::new(stream), respond).await
 }
 
-fn respond(method: &Method, path: &str, shared: &Shared) -> Response<Full<Bytes>> {
+fn respond(method: &Method, path: &str, probed: &impl Probed) -> Response<Full<Bytes>> {
     let (status, kind, body) = match (method, path) {
-        (&Method::GET | &Method::HEAD, "/metrics") => (StatusCode::OK, OPEN_METRICS, shared.metrics_page()),
+        (&Method::GET | &Method::HEAD, "/metrics") => (StatusCode::OK, OPEN_METRICS, probed.metrics_page()),
         (&Method::GET | &Method::HEAD, "/healthz") => (StatusCode::OK, "text/plain", "ok\n".into()),
-        (&Method::GET | &Method::HEAD, "/readyz") if shared.is_draining() => {
+        (&Method::GET | &Method::HEAD, "/readyz") if probed.is_draining() => {
             (StatusCode::SERVICE_UNAVAILABLE, "text/plain", "going down\n".into())
         }
         (&Method::GET | &Method::HEAD, "/readyz") => (StatusCode::OK, "text/plain", "ready\n".into()),

@@ -1,25 +1,25 @@
-//! The lines of `metrics.jsonl` for TensorBoard: `RUN/tensorboard/events.out.tfevents.…`, a file for each life of the
-//! learner.
+//! The lines of `metrics.jsonl` for TensorBoard: `RUN/tensorboard/events.out.tfevents.…`, a file for each learner epoch.
 //!
-//! A file is a sequence of records, a record a length, its checksum, a message and the message's checksum (TensorFlow's
-//! `record_writer.cc`); the messages are `event.proto`'s and `summary.proto`'s, of which four fields are wanted.
+//! A file is a sequence of records. A record is a length, its checksum, a message and the message's checksum (TensorFlow's
+//! `record_writer.cc`). The messages are those of `event.proto` and `summary.proto`, of which four fields are used.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::Write as _;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use anyhow::{Context as _, Result};
 use prost::Message as _;
 use serde_json::Value;
 
-/// What a reader looks for in the first record.
+use crate::error::{Error, Result};
+
+/// The version that a reader expects in the first record.
 const VERSION: &str = "brain.Event:2";
-/// `SessionLog.SessionStatus.START`: what another life wrote of this step and later ones is forgotten.
+/// `SessionLog.SessionStatus.START`: a reader discards what earlier files have of this step and later ones.
 const START: i32 = 1;
-/// Added to a checksum so that one of data that holds checksums is none (`crc32c.h`).
+/// Added to a checksum, so that data may contain checksums of itself (`crc32c.h`).
 const MASK: u32 = 0xa282_ead8;
-/// What a line says of where it stands, and what is no curve.
+/// The fields of a line that give its position, and are not curves.
 const POSITION: [&str; 3] = ["environment_steps", "seconds", "learner_epoch"];
 
 #[derive(Clone, PartialEq, prost::Message)]
@@ -53,12 +53,12 @@ struct Summary {
 struct Scalar {
     #[prost(string, tag = "1")]
     tag: String,
-    /// 0 is written too.
+    /// Optional, so that 0 is written too.
     #[prost(float, optional, tag = "2")]
     value: Option<f32>,
 }
 
-/// The file of one life.
+/// The file of one learner epoch.
 #[derive(Debug)]
 pub(crate) struct Events {
     file: File,
@@ -67,13 +67,13 @@ pub(crate) struct Events {
 }
 
 impl Events {
-    /// Begins the file of life `epoch`, which goes on after so many environment steps.
+    /// Begins the file of learner epoch `epoch`, which continues after so many environment steps.
     ///
     /// # Errors
     /// When it cannot be written.
     pub(crate) fn begin(run: &Path, epoch: u64, environment_steps: u64) -> Result<Self> {
         let directory = run.join("tensorboard");
-        // TensorBoard reads the files of a directory in the order of their names.
+        // TensorBoard reads the files of a directory in alphabetical order.
         let path = directory.join(format!("events.out.tfevents.{epoch:010}"));
         // A checkpoint may claim any number of steps.
         let first = i64::try_from(environment_steps).unwrap_or(i64::MAX).saturating_add(1);
@@ -84,7 +84,7 @@ impl Events {
             events.append(&opening(now(), first))?;
             Ok::<_, std::io::Error>(events)
         };
-        open().with_context(|| format!("cannot write {}", path.display()))
+        open().map_err(Error::file("write", &path))
     }
 
     /// Writes every number of a line, by its path within the line, over environment steps.
@@ -95,7 +95,7 @@ impl Events {
         self.append(&scalars(now(), line))
     }
 
-    /// All of these bytes or none: a reader would stop at half a record for ever.
+    /// Appends all of these bytes or none, because a reader stops at half a record.
     fn append(&mut self, records: &[u8]) -> std::io::Result<()> {
         let written = self.file.write_all(records);
         match &written {
@@ -106,7 +106,7 @@ impl Events {
     }
 }
 
-/// What begins a file; `step` is the first that it can speak of.
+/// The beginning of a file whose first step is `step`.
 fn opening(wall_time: f64, step: i64) -> Vec<u8> {
     let first = Event { wall_time, file_version: Some(VERSION.to_owned()), ..Event::default() };
     let start = Event { wall_time, step, session_log: Some(SessionLog { status: START }), ..Event::default() };
@@ -167,12 +167,11 @@ mod tests {
     fn every_number_of_a_line_is_a_curve_as_tensorboard_writes_it() {
         let line = json!({"environment_steps": 64, "seconds": 1.0, "updates": 0, "episode_return": null,
             "tasks": {"get-up": {"head_height": 0.5}}, "name": "walk"});
-        let hex = |bytes: Vec<u8>| bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
-        assert_eq!(hex([opening(1.5, 64), scalars(1.5, &line)].concat()), THEIRS);
+        assert_eq!(hex::encode([opening(1.5, 64), scalars(1.5, &line)].concat()), THEIRS);
     }
 
     #[test]
-    fn a_life_begins_by_forgetting_every_step_after_its_checkpoint() {
+    fn an_epoch_begins_by_discarding_every_step_after_its_checkpoint() {
         let run = tempfile::tempdir().unwrap();
         Events::begin(run.path(), 2, 4096).unwrap();
         let bytes = fs::read(run.path().join("tensorboard/events.out.tfevents.0000000002")).unwrap();

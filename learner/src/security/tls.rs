@@ -17,7 +17,7 @@ use crate::error::{Error, Result};
 pub struct Tls(Watched<ServerConfig>);
 
 impl Tls {
-    /// Serves with this certificate chain; with an authority for clients, only those get in that it signed.
+    /// Serves with this certificate chain. With `client_ca`, only clients with a certificate of this authority are accepted.
     ///
     /// # Errors
     /// [`Error::Configuration`] when a file cannot be read or used.
@@ -28,7 +28,7 @@ impl Tls {
         Ok(Self(watched))
     }
 
-    /// What a connection that comes now is met with.
+    /// The acceptor for a connection that arrives now.
     pub(crate) fn acceptor(&self) -> TlsAcceptor {
         TlsAcceptor::from(self.0.current())
     }
@@ -60,7 +60,7 @@ fn configuration(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Se
         .map_err(|error| Error::configuration(format!("the key {} cannot be read: {error}", key.display())))?;
     let mut configuration = builder.with_single_cert(certificates(cert)?, private).map_err(unusable)?;
     configuration.alpn_protocols = vec![b"h2".to_vec()];
-    // Every connection proves itself anew: a resumed session would outlive its certificate. Actors connect rarely.
+    // Every connection makes a full handshake, because a resumed session would outlive its certificate. Actors connect rarely.
     configuration.session_storage = Arc::new(NoServerSessionStorage {});
     configuration.send_tls13_tickets = 0;
     Ok(configuration)

@@ -1,4 +1,4 @@
-//! Tokens, compared in a time that tells nothing about them.
+//! Tokens, compared in constant time.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use subtle::{Choice, ConstantTimeEq as _};
 use super::watched::Watched;
 use crate::error::Result;
 
-/// The tokens of a file, or the one of the environment; only their SHA-256 is kept.
+/// The tokens of a file, or the token of the environment. Only their SHA-256 is kept.
 #[derive(Debug)]
 pub struct Tokens(Watched<Vec<[u8; 32]>>);
 
@@ -29,8 +29,8 @@ impl Tokens {
         Ok(if watched.current().is_empty() { None } else { Some(Self(watched)) })
     }
 
-    /// Whether the header `authorization` bears one of the tokens. Hashes have one length and every one is compared
-    /// whole, so the time taken says neither how long a token is, nor how much of it was right, nor which it was.
+    /// Whether the header `authorization` holds one of the tokens. All hashes have the same length, and each is compared as a
+    /// whole. The time taken therefore does not depend on the length of a token, on how much of it was right, or on which it was.
     pub fn accept(&self, authorization: Option<&[u8]>) -> bool {
         let Some(shown) = authorization.and_then(|header| header.strip_prefix(b"Bearer ")) else { return false };
         let shown: [u8; 32] = Sha256::digest(shown).into();
@@ -44,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn any_of_the_tokens_is_accepted_nothing_else_is_and_a_changed_file_counts() {
+    fn only_the_tokens_of_the_file_are_accepted_also_after_it_changed() {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), "first\nsecond\n").unwrap();
         let tokens = Tokens::new(Some(file.path())).unwrap().unwrap();

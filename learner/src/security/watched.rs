@@ -10,11 +10,12 @@ use parking_lot::Mutex;
 
 use crate::error::Result;
 
-/// What tells one state of a file from another: device, inode, size, and the times of the last changes.
+/// Identifies a state of a file: device, inode, size, and the times of its last changes.
 type Stamp = Option<[i64; 7]>;
 
-/// A value made of files. [`current`](Self::current) looks whether they changed, which costs a `stat` each: nobody
-/// polls, and a change counts from the next connection on. What cannot be used is logged, and the old value stays.
+/// A value made of files. [`current`](Self::current) checks whether they changed, which costs one `stat` for each. Nothing
+/// polls them; a change takes effect at the next connection. If changed files cannot be used, this is logged and the old
+/// value stays.
 pub(super) struct Watched<T> {
     files: Vec<PathBuf>,
     load: Box<dyn Fn() -> Result<T> + Send + Sync>,
@@ -25,7 +26,7 @@ impl<T> Watched<T> {
     /// Reads the files for the first time.
     ///
     /// # Errors
-    /// Whatever `load` says of them.
+    /// The errors of `load`.
     pub(super) fn new(files: Vec<PathBuf>, load: impl Fn() -> Result<T> + Send + Sync + 'static) -> Result<Self> {
         let first = (stamps(&files), Arc::new(load()?));
         Ok(Self { files, load: Box::new(load), state: Mutex::new(first) })
@@ -34,7 +35,7 @@ impl<T> Watched<T> {
     /// The value of the files as they are now, or the last one that could be used.
     pub(super) fn current(&self) -> Arc<T> {
         let mut state = self.state.lock();
-        // Before the files are read: a change in between is noticed the next time.
+        // Taken before the files are read, so that a later change is noticed the next time.
         let stamps = stamps(&self.files);
         if state.0 != stamps {
             state.0 = stamps;
@@ -44,7 +45,7 @@ impl<T> Watched<T> {
                     tracing::info!(files = ?self.files, "changed files are in use");
                 }
                 Err(error) => {
-                    tracing::error!(files = ?self.files, "changed files cannot be used, the old ones stay: {}", chain(&error));
+                    tracing::error!(files = ?self.files, "changed files cannot be used; the old ones stay in use: {}", chain(&error));
                 }
             }
         }
@@ -62,7 +63,7 @@ fn stamp(file: &std::fs::Metadata) -> [i64; 7] {
 }
 
 impl<T> fmt::Debug for Watched<T> {
-    /// The files' names alone: what is in them is secret.
+    /// Shows only the files' names, because their contents are secret.
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter.debug_tuple("Watched").field(&self.files).finish()
     }
@@ -74,7 +75,7 @@ mod tests {
     use crate::error::Error;
 
     #[test]
-    fn a_change_counts_at_once_and_a_bad_one_changes_nothing() {
+    fn a_change_takes_effect_at_once_and_an_unusable_one_changes_nothing() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("number");
         std::fs::write(&path, "1").unwrap();
@@ -98,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_reading_has_to_succeed() {
+    fn the_first_reading_must_succeed() {
         let load = || Err::<(), _>(Error::configuration("unusable"));
         assert!(Watched::new(Vec::new(), load).is_err());
     }

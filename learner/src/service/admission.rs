@@ -1,4 +1,4 @@
-//! What every call has to pass before it is looked at: the token, and the limit of calls in flight.
+//! Checks every call before it is answered: its token, and the limit of calls in flight.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -18,18 +18,18 @@ use tower::{Layer, Service};
 use crate::observe::telemetry::Telemetry;
 use crate::security::Tokens;
 
-/// Says whether the learner serves and nothing else, so that container checks need no secret.
-const OPEN: &str = "/grpc.health.v1.Health/Check";
+/// The one call that needs no token, so that the health checks of containers need no secret.
+const PUBLIC: &str = "/grpc.health.v1.Health/Check";
 
-/// Admits calls, for all connections together.
+/// The tower layer that admits calls, for all connections together.
 #[derive(Clone, Debug)]
-pub(super) struct Admission {
+pub(super) struct AdmissionLayer {
     tokens: Option<Arc<Tokens>>,
     places: Arc<Semaphore>,
     telemetry: Arc<Telemetry>,
 }
 
-impl Admission {
+impl AdmissionLayer {
     pub(super) fn new(tokens: Option<Arc<Tokens>>, max_requests: usize, telemetry: Arc<Telemetry>) -> Self {
         let places = Arc::new(Semaphore::new(max_requests.min(Semaphore::MAX_PERMITS)));
         Self { tokens, places, telemetry }
@@ -37,12 +37,12 @@ impl Admission {
 
     fn admit<B>(&self, request: &Request<B>) -> Result<Admitted, Status> {
         let shown = request.headers().get(AUTHORIZATION).map(http::HeaderValue::as_bytes);
-        let open = request.uri().path() == OPEN;
-        if !open && self.tokens.as_ref().is_some_and(|tokens| !tokens.accept(shown)) {
+        let public = request.uri().path() == PUBLIC;
+        if !public && self.tokens.as_ref().is_some_and(|tokens| !tokens.accept(shown)) {
             self.telemetry.requests_refused.of("unauthenticated").inc();
-            let what = if shown.is_none() { "a token, and none was sent" } else { "another token" };
+            let what = if shown.is_none() { "a token, but none was sent" } else { "another token" };
             return Err(Status::unauthenticated(format!(
-                "this learner wants {what}: see --token-file and COMIC_TOKEN"
+                "this learner requires {what}: see --token-file and COMIC_TOKEN"
             )));
         }
         let Ok(place) = self.places.clone().try_acquire_owned() else {
@@ -67,22 +67,22 @@ impl Drop for Admitted {
     }
 }
 
-impl<S> Layer<S> for Admission {
-    type Service = Gated<S>;
+impl<S> Layer<S> for AdmissionLayer {
+    type Service = AdmissionService<S>;
 
-    fn layer(&self, inner: S) -> Gated<S> {
-        Gated { admission: self.clone(), inner }
+    fn layer(&self, inner: S) -> AdmissionService<S> {
+        AdmissionService { layer: self.clone(), inner }
     }
 }
 
-/// A service behind an [`Admission`].
+/// A service behind an [`AdmissionLayer`].
 #[derive(Clone, Debug)]
-pub(super) struct Gated<S> {
-    admission: Admission,
+pub(super) struct AdmissionService<S> {
+    layer: AdmissionLayer,
     inner: S,
 }
 
-impl<S, B> Service<Request<B>> for Gated<S>
+impl<S, B> Service<Request<B>> for AdmissionService<S>
 where
     S: Service<Request<B>, Response = Response<Body>>,
     S::Future: Send + 'static,
@@ -96,7 +96,7 @@ where
     }
 
     fn call(&mut self, request: Request<B>) -> Self::Future {
-        match self.admission.admit(&request) {
+        match self.layer.admit(&request) {
             Err(refused) => Box::pin(async move { Ok(refused.into_http()) }),
             Ok(admitted) => {
                 let answer = self.inner.call(request);
@@ -106,7 +106,7 @@ where
     }
 }
 
-/// An answer, or a stream of them, that keeps its place until its end.
+/// The body of an answer. Its call keeps its place among the calls in flight until the body ends.
 struct Held {
     body: Body,
     _admitted: Admitted,

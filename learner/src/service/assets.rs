@@ -1,4 +1,4 @@
-//! Files that actors lack.
+//! `FetchAsset`: files that actors do not have.
 
 use std::fs::File;
 use std::os::unix::fs::FileExt as _;
@@ -10,36 +10,51 @@ use comic_proto::v1::{self, AssetChunk};
 use futures::stream::{self, Stream};
 use tonic::Status;
 
-use super::{Closing, Shared};
+use super::shutdown::{Shutdown, Signal};
 
-/// Bytes of a piece.
+/// Bytes of a chunk.
 const CHUNK: u64 = 256 * 1024;
+/// Bytes of a SHA-256. A request may hold more, which are not shown.
+const HASH: usize = 32;
 
-/// An asset as `Join` announces it.
-pub(super) fn described(asset: &Asset) -> v1::Asset {
-    v1::Asset { source: asset.source.clone(), sha256: asset.sha256.to_vec(), size: asset.size }
+/// The files of the experiment.
+#[derive(Debug)]
+pub(super) struct Assets {
+    assets: Vec<Asset>,
+    shutdown: Shutdown,
 }
 
-/// The asset with this hash, piece by piece, read as the actor takes it.
-pub(super) async fn open(
-    shared: &Shared,
-    sha256: &[u8],
-) -> Result<impl Stream<Item = Result<AssetChunk, Status>> + use<>, Status> {
-    let Some(asset) = shared.assets.iter().find(|asset| asset.sha256 == sha256).cloned() else {
-        let hash = hex::encode(&sha256[..sha256.len().min(32)]);
-        return Err(Status::not_found(format!("this learner has no asset with the SHA-256 {hash}")));
-    };
-    let path = asset.path.clone();
-    let file = blocking(move || File::open(path)).await.map_err(|error| unreadable(&asset, &error))?;
-    let reading = Reading { asset, file: Arc::new(file), offset: 0, closing: shared.closing() };
-    Ok(stream::try_unfold(reading, Reading::next))
+impl Assets {
+    pub(super) fn new(assets: Vec<Asset>, shutdown: Shutdown) -> Self {
+        Self { assets, shutdown }
+    }
+
+    /// The asset with this hash in chunks, which are read from disk as the actor takes them.
+    pub(super) async fn read(
+        &self,
+        sha256: &[u8],
+    ) -> Result<impl Stream<Item = Result<AssetChunk, Status>> + use<>, Status> {
+        let Some(asset) = self.assets.iter().find(|asset| asset.sha256 == sha256).cloned() else {
+            let hash = hex::encode(&sha256[..sha256.len().min(HASH)]);
+            return Err(Status::not_found(format!("this learner has no asset with the SHA-256 {hash}")));
+        };
+        let path = asset.path.clone();
+        let file = blocking(move || File::open(path)).await.map_err(|error| unreadable(&asset, &error))?;
+        let reading = Reading { asset, file: Arc::new(file), offset: 0, closing: self.shutdown.closing() };
+        Ok(stream::try_unfold(reading, Reading::next))
+    }
+}
+
+/// An asset as `Join` describes it.
+pub(super) fn description(asset: &Asset) -> v1::Asset {
+    v1::Asset { source: asset.source.clone(), sha256: asset.sha256.to_vec(), size: asset.size }
 }
 
 struct Reading {
     asset: Asset,
     file: Arc<File>,
     offset: u64,
-    closing: Closing,
+    closing: Signal,
 }
 
 impl Reading {
@@ -48,7 +63,7 @@ impl Reading {
         if size == 0 {
             return Ok(None);
         }
-        if self.closing.has_begun() {
+        if self.closing.is_given() {
             return Err(Status::unavailable("the learner is going down: fetch the asset again from the next one"));
         }
         let (file, offset) = (self.file.clone(), self.offset);
@@ -69,6 +84,6 @@ async fn blocking<T: Send + 'static>(read: impl FnOnce() -> std::io::Result<T> +
 }
 
 fn unreadable(asset: &Asset, error: &std::io::Error) -> Status {
-    tracing::error!(asset = %asset.path.display(), %error, "asset cannot be read; did it change since the start?");
+    tracing::error!(asset = %asset.path.display(), %error, "an asset cannot be read; did it change since the start?");
     Status::data_loss(format!("the learner cannot read its asset {}: {error}", asset.source))
 }

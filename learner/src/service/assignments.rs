@@ -1,45 +1,45 @@
-//! Lockstep: which actor simulates which of the run's environments.
+//! Lockstep: which actor simulates which environments of the run.
 
 use std::ops::Range;
-use std::sync::Mutex;
 
-use super::lock;
+use parking_lot::Mutex;
 
-/// The environments of a run in lockstep, each one actor's at most.
+/// The environments of a run in lockstep. Each is assigned to one actor at most.
 #[derive(Debug)]
 pub(super) struct Assignments {
-    /// By number: the incarnation that simulates it, or did before it went.
+    /// For each environment, the incarnation of the actor that simulates it, or did until it left.
     owners: Mutex<Vec<Option<u64>>>,
 }
 
-/// Environments that an actor got.
+/// The environments of one actor.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Assignment {
-    /// Their numbers, one at least.
+    /// Their numbers; there is at least one.
     pub(super) environments: Range<u32>,
-    /// Some of them were another actor's before, which is gone.
+    /// Whether some of them belonged to another actor, which is gone.
     pub(super) inherited: bool,
-    /// Environments that are still nobody's.
+    /// Environments that are still free.
     pub(super) left: usize,
 }
 
-/// Why an actor gets none.
+/// Why an actor gets no environments.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Denied {
-    /// Others simulate all of them.
+    /// Other actors simulate all of them.
     Taken,
-    /// It comes back, and what it simulated was begun anew: by another actor, or in another life of the learner.
+    /// The actor comes back, but its environments began anew: with another actor, or in another learner epoch.
     Lost,
 }
 
 impl Assignments {
-    /// So many environments, all nobody's.
+    /// So many free environments.
     pub(super) fn new(environments: usize) -> Self {
         Self { owners: Mutex::new(vec![None; environments]) }
     }
 
-    /// What an actor has, or else the first stretch of free environments, up to `wanted` of them. Free is also, when
-    /// nothing else is, what belongs to an actor that is not `expected` any more. An actor that `returns` gets what it had or nothing.
+    /// The environments that the actor has, or else the first free ones that lie together, at most `wanted`. If no environment
+    /// is free, those of an actor that is not `expected` any more count as free. An actor that `returns` gets the environments
+    /// that it had, or none.
     pub(super) fn claim(
         &self,
         incarnation: u64,
@@ -47,7 +47,7 @@ impl Assignments {
         returns: bool,
         expected: impl Fn(u64) -> bool,
     ) -> Result<Assignment, Denied> {
-        let mut owners = lock(&self.owners);
+        let mut owners = self.owners.lock();
         let own = |owner: &Option<u64>| *owner == Some(incarnation);
         let free = |owner: &Option<u64>| owner.is_none_or(|owner| !expected(owner));
         let mut inherited = false;
@@ -55,13 +55,13 @@ impl Assignments {
             if returns {
                 return Err(Denied::Lost);
             }
-            let nobodys = owners.iter().position(Option::is_none);
-            let first = nobodys.or_else(|| owners.iter().position(free)).ok_or(Denied::Taken)?;
+            let unassigned = owners.iter().position(Option::is_none);
+            let first = unassigned.or_else(|| owners.iter().position(free)).ok_or(Denied::Taken)?;
             let wanted = usize::try_from(wanted.max(1)).unwrap_or(usize::MAX);
             let count = owners[first..].iter().take(wanted).take_while(|owner| free(owner)).count();
             let gone: Vec<_> = owners[first..first + count].iter().copied().flatten().collect();
             inherited = !gone.is_empty();
-            // Whoever lost a part has lost all.
+            // An actor that loses one environment loses all of them.
             for owner in owners.iter_mut().filter(|owner| owner.is_some_and(|owner| gone.contains(&owner))) {
                 *owner = None;
             }
@@ -73,9 +73,9 @@ impl Assignments {
         Ok(Assignment { environments: first as u32..(first + count) as u32, inherited, left })
     }
 
-    /// Whether an environment is this actor's.
+    /// Whether an environment is assigned to this actor.
     pub(super) fn owns(&self, incarnation: u64, environment: u32) -> bool {
-        lock(&self.owners).get(environment as usize).is_some_and(|owner| *owner == Some(incarnation))
+        self.owners.lock().get(environment as usize).is_some_and(|owner| *owner == Some(incarnation))
     }
 }
 
@@ -85,47 +85,55 @@ mod tests {
 
     use super::*;
 
-    fn everybody(_: u64) -> bool {
+    fn all(_: u64) -> bool {
         true
     }
 
-    fn share(environments: Range<u32>, inherited: bool, left: usize) -> Result<Assignment, Denied> {
+    fn assigned(environments: Range<u32>, inherited: bool, left: usize) -> Result<Assignment, Denied> {
         Ok(Assignment { environments, inherited, left })
     }
 
     #[test]
-    fn actors_get_what_is_left_in_turn_and_one_too_many_gets_nothing() {
+    fn actors_get_free_environments_in_turn_until_none_is_left() {
         let assignments = Assignments::new(8);
-        assert_eq!(assignments.claim(70, 3, false, everybody), share(0..3, false, 5));
-        assert_eq!(assignments.claim(71, 3, false, everybody), share(3..6, false, 2));
-        assert_eq!(assignments.claim(72, 3, false, everybody), share(6..8, false, 0));
-        assert_eq!(assignments.claim(73, 3, false, everybody), Err(Denied::Taken));
+        assert_eq!(assignments.claim(70, 3, false, all), assigned(0..3, false, 5));
+        assert_eq!(assignments.claim(71, 3, false, all), assigned(3..6, false, 2));
+        assert_eq!(assignments.claim(72, 3, false, all), assigned(6..8, false, 0));
+        assert_eq!(assignments.claim(73, 3, false, all), Err(Denied::Taken));
     }
 
     #[test]
-    fn who_comes_back_gets_what_it_had_and_nothing_else() {
+    fn an_actor_that_comes_back_gets_the_environments_that_it_had() {
         let assignments = Assignments::new(8);
-        assignments.claim(70, 3, false, everybody).unwrap();
-        assert_eq!(assignments.claim(70, 8, true, everybody), share(0..3, false, 5));
-        assert_eq!(assignments.claim(70, 8, false, everybody), share(0..3, false, 5), "its reply was lost on the way");
-        assert_eq!(assignments.claim(71, 3, true, everybody), Err(Denied::Lost), "of an earlier life of the learner");
+        assignments.claim(70, 3, false, all).unwrap();
+        assert_eq!(assignments.claim(70, 8, true, all), assigned(0..3, false, 5));
+        assert_eq!(
+            assignments.claim(70, 8, false, all),
+            assigned(0..3, false, 5),
+            "the reply to its first request was lost"
+        );
+        assert_eq!(
+            assignments.claim(71, 3, true, all),
+            Err(Denied::Lost),
+            "it was assigned in an earlier learner epoch"
+        );
     }
 
     #[test]
-    fn what_a_lost_actor_had_is_inherited_and_lost_for_it_as_a_whole() {
+    fn the_environments_of_a_lost_actor_are_inherited_and_it_loses_all_of_them() {
         let assignments = Assignments::new(8);
-        assignments.claim(70, 4, false, everybody).unwrap();
-        assignments.claim(71, 4, false, everybody).unwrap();
+        assignments.claim(70, 4, false, all).unwrap();
+        assignments.claim(71, 4, false, all).unwrap();
         let without = |incarnation| incarnation != 70;
-        assert_eq!(assignments.claim(72, 2, false, without), share(0..2, true, 2));
-        assert_eq!(assignments.claim(70, 4, true, everybody), Err(Denied::Lost));
-        assert_eq!(assignments.claim(73, 4, false, everybody), share(2..4, false, 0));
+        assert_eq!(assignments.claim(72, 2, false, without), assigned(0..2, true, 2));
+        assert_eq!(assignments.claim(70, 4, true, all), Err(Denied::Lost));
+        assert_eq!(assignments.claim(73, 4, false, all), assigned(2..4, false, 0));
     }
 
     proptest! {
-        /// Whoever comes, goes and comes back: an environment is simulated by one of those who are there, at most.
+        /// Actors join, leave and come back. At most one present actor simulates an environment.
         #[test]
-        fn no_environment_is_two_actors(
+        fn no_environment_has_two_actors(
             environments in 1_usize..12,
             claims in prop::collection::vec((0_u64..6, 0_u64..6, any::<bool>(), 0_u64..6), 0..40),
         ) {
@@ -134,17 +142,17 @@ mod tests {
             for (incarnation, wanted, returns, absent) in claims {
                 let claimed = assignments.claim(incarnation, wanted, returns, |owner| owner != absent || owner == incarnation);
                 match claimed {
-                    Ok(share) => {
-                        prop_assert!(!share.environments.is_empty());
-                        prop_assert!(share.environments.end as usize <= environments);
+                    Ok(assigned) => {
+                        prop_assert!(!assigned.environments.is_empty());
+                        prop_assert!(assigned.environments.end as usize <= environments);
                         let overlaps = |other: &Range<u32>| {
-                            other.start < share.environments.end && share.environments.start < other.end
+                            other.start < assigned.environments.end && assigned.environments.start < other.end
                         };
                         for (other, theirs) in &simulated {
                             prop_assert!(*other == incarnation || *other == absent || !overlaps(theirs));
                         }
                         simulated.retain(|_, theirs| !overlaps(theirs));
-                        simulated.insert(incarnation, share.environments);
+                        simulated.insert(incarnation, assigned.environments);
                     }
                     Err(Denied::Lost) => prop_assert!(returns),
                     Err(Denied::Taken) => {}

@@ -1,37 +1,37 @@
-//! How much memory the learner's buffers can take at most. Each is bounded by configuration, whatever peers do.
+//! How much memory the learner's buffers can take at most. The configuration bounds each of them, whatever peers do.
 
 use std::fmt;
 
 use comic_proto::Pieces;
 
+use super::http2::FRAME_SIZE;
 use crate::publish::VERSIONS;
-use crate::service::FRAME_SIZE;
 
-/// Bytes of a call's answers that its peer does not take: hyper's send buffer, and the largest piece beside it, an asset's.
+/// Bytes of a call's answers that its peer does not read: hyper's send buffer, and the largest answer, a chunk of an asset.
 const ANSWER: usize = (400 + 256) * 1024;
 
-/// A message is not copied out of the buffers that the socket was read to. One has at most twice the bytes of a frame, which
-/// is how it grows, and at least [`Pieces::KEPT`] of them are the message's.
-const BUFFERS: usize = 2 * FRAME_SIZE as usize / Pieces::KEPT;
+/// Bytes of buffers for each byte of a message. A message stays in the buffers to which the socket was read. A buffer grows to
+/// at most twice the bytes of a frame, and at least [`Pieces::KEPT`] of them belong to the message.
+const BUFFER_RATIO: usize = 2 * FRAME_SIZE as usize / Pieces::KEPT;
 
-/// What bounds the bytes that peers have on their way.
+/// The limits on the bytes that peers send.
 #[derive(Clone, Copy, Debug)]
-pub struct Ingest {
+pub struct IngestLimits {
     /// Connections at once.
     pub connections: usize,
-    /// Bytes that one of them may have on its way unread.
+    /// Bytes that one connection may have unread.
     pub window: usize,
     /// Bytes of messages that were read, of all connections together.
     pub room: usize,
     /// Calls in flight at once.
     pub requests: usize,
-    /// Bytes of the largest message that is taken.
+    /// Bytes of the largest message that is accepted.
     pub message: usize,
     /// Refused messages that may wait for the disk.
     pub quarantined: usize,
 }
 
-/// What decides how large the buffers get.
+/// The sizes that decide how large the buffers get.
 #[derive(Clone, Copy, Debug)]
 pub struct Sizes {
     /// Batches that are assembled while one is trained on.
@@ -40,8 +40,8 @@ pub struct Sizes {
     pub batch: usize,
     /// Bytes of an unroll.
     pub unroll: usize,
-    /// What peers have on their way.
-    pub ingest: Ingest,
+    /// The limits on what peers send.
+    pub ingest: IngestLimits,
     /// Bytes of the parameters that actors get.
     pub parameters: usize,
     /// Bytes of a checkpoint.
@@ -51,35 +51,35 @@ pub struct Sizes {
 /// The most that each buffer holds, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Bounds {
-    /// Unrolls in batches: those ahead, and the one at the trainer.
+    /// Batches: those assembled ahead, and the trainer's.
     pub batches: u64,
-    /// Bytes on their way in that nobody read yet: a window for each connection.
+    /// Bytes that were sent and not read yet: a window for each connection.
     pub windows: u64,
-    /// Messages that are read, half or whole, and wait for a place in a batch, with what a peer can make of its buffers by
-    /// frames of no use.
+    /// Messages that were read, in part or as a whole, and are not in a batch yet, with the memory that a peer can make their
+    /// buffers take by useless frames.
     pub messages: u64,
-    /// What came with the end of a message, and waits until that is answered: a frame for each call.
+    /// Bytes that came in one frame with the end of a message and wait until it is answered: a frame for each call.
     pub frames: u64,
     /// Versions of the parameters that are held for readers.
     pub parameters: u64,
-    /// Answers on their way out: see [`ANSWER`].
+    /// Answers that their peers have not read yet.
     pub answers: u64,
-    /// Refused messages on their way to the disk.
+    /// Refused messages that wait for the disk.
     pub quarantine: u64,
-    /// Checkpoints: one being written, one that waits, and the newest, to turn back to.
+    /// Checkpoints: one being written, one that waits, and the newest, which the trainer can restore.
     pub snapshots: u64,
 }
 
 impl Bounds {
-    /// The bounds of these sizes.
+    /// The bounds that follow from these sizes.
     pub fn new(sizes: &Sizes) -> Self {
         let product = |factors: &[usize]| factors.iter().fold(1u64, |all, factor| all.saturating_mul(*factor as u64));
         let Sizes { ahead, batch, unroll, ingest, parameters, snapshot } = *sizes;
-        let Ingest { connections, window, room, requests, message, quarantined } = ingest;
+        let IngestLimits { connections, window, room, requests, message, quarantined } = ingest;
         Self {
             batches: product(&[ahead + 1, batch, unroll]),
             windows: product(&[connections, window]),
-            messages: product(&[room, BUFFERS]),
+            messages: product(&[room, BUFFER_RATIO]),
             frames: product(&[requests, 2 * FRAME_SIZE as usize]),
             parameters: product(&[VERSIONS, parameters]),
             answers: product(&[requests, ANSWER]),
@@ -128,7 +128,7 @@ mod tests {
         ahead: 1,
         batch: 128,
         unroll: 200_000,
-        ingest: Ingest {
+        ingest: IngestLimits {
             connections: 100,
             window: 1 << 19,
             room: 64 << 20,
@@ -141,7 +141,7 @@ mod tests {
     };
 
     #[test]
-    fn each_part_is_what_its_buffers_hold_and_the_sum_is_theirs() {
+    fn each_bound_follows_from_its_sizes_and_the_sum_adds_them() {
         let bounds = Bounds::new(&SIZES);
         let expected = Bounds {
             batches: 2 * 128 * 200_000,
@@ -162,8 +162,8 @@ mod tests {
     }
 
     #[test]
-    fn limits_that_limit_nothing_give_a_bound_that_is_none() {
-        let bounds = Bounds::new(&Sizes { ingest: Ingest { room: usize::MAX, ..SIZES.ingest }, ..SIZES });
+    fn unlimited_sizes_give_the_largest_bound() {
+        let bounds = Bounds::new(&Sizes { ingest: IngestLimits { room: usize::MAX, ..SIZES.ingest }, ..SIZES });
         assert_eq!((bounds.messages, bounds.sum()), (u64::MAX, u64::MAX));
     }
 }

@@ -1,7 +1,7 @@
-//! Unrolls that were refused as invalid, on disk for whoever wants to know what was wrong with them.
+//! Keeps invalid unrolls on disk, so that an operator can find out what is wrong with them.
 //!
-//! One file each, `EPOCH-ACTOR-SEQUENCE.unroll`: eight bytes, little-endian, with the length of a JSON object; that object,
-//! which is the header in words and the reason; and the payload as it came.
+//! Each unroll is one file `EPOCH-ACTOR-SEQUENCE.unroll`: eight bytes, little-endian, with the length of a JSON object; the
+//! object, which holds the header and the reason; and the payload as it was received.
 
 use std::fs::{self, File};
 use std::io::Write as _;
@@ -19,18 +19,18 @@ use crate::error::{Error, Result};
 use crate::log_limiter::LogLimiter;
 use crate::observe::telemetry::Telemetry;
 
-/// Unrolls that may wait for the disk; one more is let go of.
+/// Unrolls that may wait for the disk; others are discarded.
 const QUEUE: usize = 8;
-/// Of a layout hash that may be anything.
+/// Bytes of a layout hash that are kept; the peer may send any number.
 const HASH: usize = 32;
 
-/// Where refused unrolls go.
+/// Where invalid unrolls go.
 #[derive(Clone, Debug, Default, Args)]
-pub struct QuarantineOptions {
-    /// Directory for unrolls that are refused as invalid, so that somebody can look at them; off unless given.
+pub struct QuarantineArguments {
+    /// Directory that keeps the unrolls refused as invalid, for inspection [default: they are not kept].
     #[arg(long, value_name = "DIR", help_heading = "Quarantine")]
     pub quarantine: Option<PathBuf>,
-    /// Bytes they may take there in all, earlier ones included.
+    /// Bytes that these unrolls may take in all, including those of earlier starts.
     #[arg(long, value_name = "BYTES", default_value_t = 64 << 20, requires = "quarantine", help_heading = "Quarantine")]
     pub quarantine_bytes: u64,
 }
@@ -43,42 +43,42 @@ struct Refused {
     reason: String,
 }
 
-/// The thread that writes them. Dropped, it writes what still waits.
+/// The thread that writes invalid unrolls. Its drop waits until all are written.
 #[derive(Debug)]
 pub(crate) struct Quarantine {
-    /// `None` only while it is dropped.
+    /// `None` only during the drop.
     queue: Option<SyncSender<Refused>>,
     thread: Option<JoinHandle<()>>,
     telemetry: Arc<Telemetry>,
 }
 
 impl Quarantine {
-    /// Unrolls held in memory at most: those that wait, and the one being written.
+    /// The most unrolls in memory: those that wait, and the one being written.
     pub(crate) const HELD: usize = QUEUE + 1;
 
-    /// Starts the thread, if refused unrolls are to be kept.
+    /// Starts the thread, if invalid unrolls are kept at all.
     ///
     /// # Errors
     /// When the directory cannot be made or read, or the system gives no thread.
-    pub(crate) fn start(options: &QuarantineOptions, telemetry: &Arc<Telemetry>) -> Result<Option<Self>> {
+    pub(crate) fn start(options: &QuarantineArguments, telemetry: &Arc<Telemetry>) -> Result<Option<Self>> {
         let Some(directory) = options.quarantine.clone() else { return Ok(None) };
         fs::create_dir_all(&directory).map_err(Error::file("make", &directory))?;
         let taken = taken(&directory).map_err(Error::file("list", &directory))?;
         let (queue, refused) = sync_channel(QUEUE);
-        let mut cell = Cell { room: options.quarantine_bytes.saturating_sub(taken), directory };
+        let mut store = Store { room: options.quarantine_bytes.saturating_sub(taken), directory };
         let thread = std::thread::Builder::new()
             .name("quarantine".into())
             .spawn({
                 let telemetry = telemetry.clone();
-                move || cell.keep_all(&refused, &telemetry)
+                move || store.keep_all(&refused, &telemetry)
             })
             .map_err(Error::system("cannot start the quarantine's thread"))?;
         Ok(Some(Self { queue: Some(queue), thread: Some(thread), telemetry: telemetry.clone() }))
     }
 
-    /// Has an unroll kept; never waits.
+    /// Queues an unroll for the disk, or counts it as discarded. Never waits.
     pub(crate) fn offer(&self, header: &UnrollHeader, payload: &Pieces, reason: &Invalid) {
-        // A copy: the pieces keep larger buffers, for as long as the disk takes.
+        // A copy, because the pieces would keep larger buffers in memory until the disk is ready.
         let mut bytes = vec![0; payload.len()];
         payload.copy_to(0, &mut bytes);
         let refused = Refused { header: header.clone(), payload: bytes, reason: reason.to_string() };
@@ -92,20 +92,21 @@ impl Drop for Quarantine {
     fn drop(&mut self) {
         drop(self.queue.take());
         if let Some(thread) = self.thread.take() {
-            // A thread that panicked has nothing more to write.
+            // If the thread panicked, it has nothing more to write.
             let _ = thread.join();
         }
     }
 }
 
-/// The directory, and the bytes that are left there.
+/// The directory, and the bytes that it may still take.
 #[derive(Debug)]
-struct Cell {
+struct Store {
     directory: PathBuf,
     room: u64,
 }
 
-impl Cell {
+impl Store {
+    /// Writes the unrolls of the queue until it is closed.
     fn keep_all(&mut self, queue: &Receiver<Refused>, telemetry: &Telemetry) {
         let log_limiter = LogLimiter::default();
         while let Ok(refused) = queue.recv() {
@@ -114,7 +115,7 @@ impl Cell {
                 Ok(false) => "full",
                 Err(error) => {
                     if let Some(unreported) = log_limiter.due(()) {
-                        tracing::error!(unreported, "a refused unroll is not kept: {}", chain(&error));
+                        tracing::error!(unreported, "an invalid unroll is not kept: {}", chain(&error));
                     }
                     "failed"
                 }
@@ -123,7 +124,7 @@ impl Cell {
         }
     }
 
-    /// False when there is no room.
+    /// Writes one unroll. False when there is no room for it.
     fn keep(&mut self, refused: &Refused) -> Result<bool> {
         let Refused { header, payload, reason } = refused;
         let hash = hex::encode(&header.layout_hash[..header.layout_hash.len().min(HASH)]);
@@ -147,7 +148,7 @@ impl Cell {
         let path = self.directory.join(format!("{learner_epoch}-{actor}-{sequence}.unroll"));
         let written = write(&path, &[&length, label.as_bytes(), payload]);
         if written.is_err() {
-            // Half of it helps nobody.
+            // A part of an unroll is of no use.
             let _ = fs::remove_file(&path);
         } else {
             self.room = room;
@@ -161,7 +162,7 @@ fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
     parts.iter().try_for_each(|part| file.write_all(part))
 }
 
-/// Bytes of the unrolls that are there.
+/// Bytes of the unrolls that are in the directory.
 fn taken(directory: &Path) -> std::io::Result<u64> {
     let mut bytes = 0u64;
     for entry in fs::read_dir(directory)? {
@@ -177,19 +178,19 @@ fn taken(directory: &Path) -> std::io::Result<u64> {
 mod tests {
     use super::*;
 
-    fn options(directory: &Path, bytes: u64) -> QuarantineOptions {
-        QuarantineOptions { quarantine: Some(directory.to_path_buf()), quarantine_bytes: bytes }
+    fn options(directory: &Path, bytes: u64) -> QuarantineArguments {
+        QuarantineArguments { quarantine: Some(directory.to_path_buf()), quarantine_bytes: bytes }
     }
 
     fn header(sequence: u64) -> UnrollHeader {
         UnrollHeader { actor: 7, sequence, learner_epoch: 3, layout_hash: vec![0xab; 1000], ..Default::default() }
     }
 
-    /// Offers unrolls of 1000 bytes one by one; how many were kept.
+    /// Offers unrolls of 1000 bytes one by one, and returns how many were kept.
     fn kept(directory: &Path, bytes: u64, sequences: std::ops::Range<u64>) -> u64 {
         let telemetry = Arc::<Telemetry>::default();
         for sequence in sequences {
-            // Each on its own, so that none finds the thread busy.
+            // One quarantine for each, so that the thread is never busy.
             let quarantine = Quarantine::start(&options(directory, bytes), &telemetry).unwrap().unwrap();
             quarantine.offer(
                 &header(sequence),
@@ -215,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn all_together_never_take_more_than_they_may_not_even_after_a_restart() {
+    fn all_unrolls_together_stay_below_the_limit_also_after_a_restart() {
         let directory = tempfile::tempdir().unwrap();
         assert_eq!(kept(directory.path(), 4000, 0..2), 2);
         assert_eq!(kept(directory.path(), 4000, 2..9), 1);
@@ -223,18 +224,18 @@ mod tests {
     }
 
     #[test]
-    fn a_disk_that_refuses_costs_the_unroll_and_nothing_else() {
+    fn a_disk_error_costs_only_the_unroll() {
         let directory = tempfile::tempdir().unwrap();
-        // Where the file should be there is a directory.
+        // A directory has the name of the file.
         fs::create_dir(directory.path().join("3-7-0.unroll")).unwrap();
         assert_eq!(kept(directory.path(), 1 << 20, 0..2), 1);
         assert!(directory.path().join("3-7-1.unroll").is_file());
     }
 
     #[test]
-    fn one_that_finds_the_disk_busy_is_let_go_of_and_counted() {
+    fn an_unroll_is_discarded_and_counted_while_the_disk_is_busy() {
         let telemetry = Arc::<Telemetry>::default();
-        // A thread that never takes one.
+        // No thread takes an unroll from the queue.
         let (queue, _waiting) = sync_channel(QUEUE);
         let quarantine = Quarantine { queue: Some(queue), thread: None, telemetry: telemetry.clone() };
         for sequence in 0..QUEUE as u64 + 3 {

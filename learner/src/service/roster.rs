@@ -1,27 +1,28 @@
-//! Which actors are there, and how they are.
+//! Which actors are present, and in which state.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::lock;
+use parking_lot::Mutex;
+use tonic::Status;
 
-/// An actor that joined has so long to open its streams, and one whose connection ended to come back before its
-/// environments of a run in lockstep are given away.
-const JOINING: Duration = Duration::from_secs(30);
-/// Silence after which an actor that the learner waits for is slow.
+/// An actor that joined must open its streams within this time. An actor whose connection ended must come back within it, or
+/// in lockstep another actor gets its environments.
+const GRACE: Duration = Duration::from_secs(30);
+/// An actor is slow when the learner waits for it and hears nothing for this time.
 const SLOW: Duration = Duration::from_secs(60);
-/// How long a lost actor is spoken of.
+/// How long a lost actor is reported.
 const REMEMBERED: Duration = Duration::from_secs(600);
-/// Lost actors spoken of at most.
-const LOST: usize = 65_536;
+/// The largest number of actors that are remembered.
+const CAPACITY: usize = 65_536;
 
-/// Actors by how they are.
+/// Numbers of actors by their state.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Census {
-    /// Connected, and heard of lately or waiting for the learner.
+    /// Connected, and heard lately or waiting for the learner.
     pub(crate) alive: u64,
-    /// Connected, and silent although the learner waits.
+    /// Connected, and silent although the learner waits for them.
     pub(crate) slow: u64,
     /// Not connected any more.
     pub(crate) lost: u64,
@@ -36,39 +37,39 @@ pub(super) struct Roster {
     actors: Mutex<HashMap<u64, Actor>>,
 }
 
-/// Whether an actor may come in.
+/// Whether an actor may join.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Admission {
+pub(super) enum Joined {
     Welcome,
-    /// There are too many.
+    /// There are too many actors.
     Full,
-    /// A newer process of its name took its place.
+    /// A newer process of the same name took its place.
     Superseded,
 }
 
 #[derive(Clone, Debug)]
 struct Actor {
-    /// Who it is over its restarts; empty is nobody.
+    /// The same name identifies the actor after its restarts. An actor may have no name: the empty one.
     name: String,
-    /// Processes of a name take each other's place in this order: of their indices, and before it has one a process is the
+    /// The order in which processes of the same name replace each other: their indices. A process without an index is the
     /// newest.
     order: u64,
-    /// A newer process of its name came.
+    /// A newer process of the same name joined.
     superseded: bool,
-    /// It came in and found nothing to do: it comes again, and is nobody until then.
+    /// It found no free environment. It will join again, and does not count as present until then.
     standing_by: bool,
-    /// Streams of parameters that are open.
+    /// Open streams of parameters.
     streams: u32,
-    /// Unrolls of it that wait for a place in a batch.
+    /// Its unrolls that wait for a place in a batch.
     waiting: u32,
     heard: Instant,
-    /// When its last stream ended, if that is all that is known of it.
+    /// When its last stream ended, if nothing was heard of it since.
     gone: Option<Instant>,
 }
 
 impl Actor {
     fn is_present(&self, now: Instant) -> bool {
-        let lately = self.gone.is_none() && now.duration_since(self.heard) < JOINING;
+        let lately = self.gone.is_none() && now.duration_since(self.heard) < GRACE;
         !self.superseded && !self.standing_by && (self.streams > 0 || lately)
     }
 
@@ -86,15 +87,16 @@ impl Roster {
         Self { limit, actors: Mutex::default() }
     }
 
-    /// Lets an actor in, in the place of an older one of its name, or says why not; one that is in already always stays. Who
-    /// comes back says which index it had: after a restart of the learner that is all that tells the older from the newer.
-    pub(super) fn join(&self, incarnation: u64, name: &str, had: Option<u64>, now: Instant) -> Admission {
-        let mut actors = lock(&self.actors);
+    /// Lets an actor join and supersedes older processes of its name, or says why it cannot join. An actor that is present
+    /// always stays. An actor that comes back names the index that it had: after a restart of the learner only the indices
+    /// tell which of two processes is the newer.
+    pub(super) fn join(&self, incarnation: u64, name: &str, had: Option<u64>, now: Instant) -> Joined {
+        let mut actors = self.actors.lock();
         match actors.get_mut(&incarnation) {
-            Some(actor) if actor.superseded => return Admission::Superseded,
+            Some(actor) if actor.superseded => return Joined::Superseded,
             Some(actor) if actor.is_present(now) => {
                 actor.heard = now;
-                return Admission::Welcome;
+                return Joined::Welcome;
             }
             _ => {}
         }
@@ -102,12 +104,12 @@ impl Roster {
         let namesake = |other: u64, actor: &Actor| other != incarnation && !name.is_empty() && actor.name == name;
         let mut namesakes = actors.iter().filter(|(other, actor)| namesake(**other, actor));
         if namesakes.any(|(_, actor)| actor.order > order && !actor.superseded) {
-            return Admission::Superseded;
+            return Joined::Superseded;
         }
         let older = |other: u64, actor: &Actor| namesake(other, actor) && actor.order <= order;
         let rivals = actors.iter().filter(|(other, actor)| actor.is_present(now) && !older(**other, actor));
         if rivals.count() >= self.limit {
-            return Admission::Full;
+            return Joined::Full;
         }
         for (other, actor) in actors.iter_mut() {
             if older(*other, actor) && !actor.superseded {
@@ -120,7 +122,7 @@ impl Roster {
                 );
             }
         }
-        if actors.len() >= LOST {
+        if actors.len() >= CAPACITY {
             actors.retain(|_, actor| actor.streams > 0 || actor.is_present(now));
         } else {
             actors.retain(|_, actor| actor.is_remembered(now));
@@ -138,64 +140,67 @@ impl Roster {
         };
         let actor = actors.entry(incarnation).or_insert(actor);
         (actor.heard, actor.gone, actor.standing_by) = (now, None, false);
-        Admission::Welcome
+        Joined::Welcome
     }
 
-    /// Notes that an actor that came in finds nothing to do. It keeps its place among the processes of its name alone.
-    pub(super) fn turn_away(&self, incarnation: u64) {
-        if let Some(actor) = lock(&self.actors).get_mut(&incarnation) {
+    /// Marks an actor that joined and found no free environment. It no longer counts as present, but it still supersedes older
+    /// processes of its name.
+    pub(super) fn stand_by(&self, incarnation: u64) {
+        if let Some(actor) = self.actors.lock().get_mut(&incarnation) {
             actor.standing_by = true;
         }
     }
 
-    /// Notes the index that an actor got, unless it had one before.
-    pub(super) fn number(&self, incarnation: u64, index: u64) {
-        if let Some(actor) = lock(&self.actors).get_mut(&incarnation) {
+    /// Sets the index of an actor, unless it had a smaller one before.
+    pub(super) fn set_index(&self, incarnation: u64, index: u64) {
+        if let Some(actor) = self.actors.lock().get_mut(&incarnation) {
             actor.order = actor.order.min(index);
         }
     }
 
-    /// Whether a newer process of its name took its place.
+    /// Whether a newer process of the same name took the place of this one.
     pub(super) fn is_superseded(&self, incarnation: u64) -> bool {
-        lock(&self.actors).get(&incarnation).is_some_and(|actor| actor.superseded)
+        self.actors.lock().get(&incarnation).is_some_and(|actor| actor.superseded)
     }
 
-    /// Whether an actor is there, or went so lately that it may be on its way back.
+    /// Whether an actor is present, or left so lately that it may come back.
     pub(super) fn expects(&self, incarnation: u64, now: Instant) -> bool {
-        let lately = |gone: Instant| now.duration_since(gone) < JOINING;
-        lock(&self.actors)
+        let lately = |gone: Instant| now.duration_since(gone) < GRACE;
+        self.actors
+            .lock()
             .get(&incarnation)
             .is_some_and(|actor| actor.is_present(now) || (!actor.superseded && actor.gone.is_some_and(lately)))
     }
 
-    /// Notes that something came from an actor, which is there then, whatever became of its stream of parameters. False if it
-    /// is superseded.
+    /// Notes that an actor sent something. It is then present, even if its stream of parameters ended. False if it is
+    /// superseded.
     pub(super) fn heard(&self, incarnation: u64, now: Instant) -> bool {
-        let mut actors = lock(&self.actors);
+        let mut actors = self.actors.lock();
         let Some(actor) = actors.get_mut(&incarnation) else { return true };
         (actor.heard, actor.gone) = (now, None);
         !actor.superseded
     }
 
-    /// Notes a stream of parameters, until what is returned is dropped. `None` of an actor that has not joined.
-    pub(super) fn watch(self: &Arc<Self>, incarnation: u64) -> Option<Presence> {
-        let mut actors = lock(&self.actors);
+    /// Counts a stream of parameters until the returned value is dropped. `None` if the actor has not joined.
+    pub(super) fn open_stream(self: &Arc<Self>, incarnation: u64) -> Option<Presence> {
+        let mut actors = self.actors.lock();
         let actor = actors.get_mut(&incarnation).filter(|actor| !actor.standing_by)?;
         (actor.streams, actor.gone) = (actor.streams + 1, None);
         Some(Presence { roster: self.clone(), incarnation, kind: Kind::Stream })
     }
 
-    /// Notes an unroll that waits for a place, until what is returned is dropped.
-    pub(super) fn wait(self: &Arc<Self>, incarnation: u64) -> Presence {
-        if let Some(actor) = lock(&self.actors).get_mut(&incarnation) {
+    /// Counts an unroll that waits for a place in a batch, until the returned value is dropped.
+    pub(super) fn begin_waiting(self: &Arc<Self>, incarnation: u64) -> Presence {
+        if let Some(actor) = self.actors.lock().get_mut(&incarnation) {
             actor.waiting += 1;
         }
         Presence { roster: self.clone(), incarnation, kind: Kind::Waiting }
     }
 
+    /// Counts the actors by their state.
     pub(super) fn census(&self, now: Instant) -> Census {
         let mut census = Census::default();
-        for actor in lock(&self.actors).values().filter(|actor| actor.is_remembered(now) && !actor.standing_by) {
+        for actor in self.actors.lock().values().filter(|actor| actor.is_remembered(now) && !actor.standing_by) {
             census.waiting += u64::from(actor.waiting);
             *match (actor.is_present(now), actor.is_slow(now)) {
                 (false, _) => &mut census.lost,
@@ -207,7 +212,7 @@ impl Roster {
     }
 }
 
-/// Something of an actor that is counted while it lasts.
+/// A stream or an unroll of an actor, which is counted until this is dropped.
 #[derive(Debug)]
 pub(super) struct Presence {
     roster: Arc<Roster>,
@@ -215,7 +220,7 @@ pub(super) struct Presence {
     kind: Kind,
 }
 
-/// What is counted of an actor.
+/// What a [`Presence`] counts.
 #[derive(Clone, Copy, Debug)]
 enum Kind {
     Stream,
@@ -224,8 +229,8 @@ enum Kind {
 
 impl Drop for Presence {
     fn drop(&mut self) {
-        // It may have joined only after this began: then this was not counted.
-        match (lock(&self.roster.actors).get_mut(&self.incarnation), self.kind) {
+        // If the actor joined only after this began, this was not counted.
+        match (self.roster.actors.lock().get_mut(&self.incarnation), self.kind) {
             (Some(actor), Kind::Waiting) => actor.waiting = actor.waiting.saturating_sub(1),
             (Some(actor), Kind::Stream) => {
                 actor.streams = actor.streams.saturating_sub(1);
@@ -238,6 +243,11 @@ impl Drop for Presence {
     }
 }
 
+/// The status for an actor whose place another process took.
+pub(super) fn superseded() -> Status {
+    Status::aborted("a newer process of the same name took this one's place")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -248,18 +258,18 @@ mod tests {
     }
 
     fn joins(roster: &Roster, incarnation: u64, now: Instant) -> bool {
-        roster.join(incarnation, "", None, now) == Admission::Welcome
+        roster.join(incarnation, "", None, now) == Joined::Welcome
     }
 
     #[test]
-    fn actors_are_alive_then_slow_then_lost_then_forgotten() {
+    fn an_actor_is_alive_then_slow_then_lost_then_forgotten() {
         let (roster, start) = (Arc::new(Roster::new(10)), Instant::now());
         assert!(joins(&roster, 1, start));
         assert_eq!(census(&roster, start), (1, 0, 0, 0));
-        let watching = roster.watch(1);
+        let watching = roster.open_stream(1);
         assert_eq!(census(&roster, start + SLOW), (0, 1, 0, 0));
-        let waiting = roster.wait(1);
-        assert_eq!(census(&roster, start + SLOW), (1, 0, 0, 1), "it waits for the learner, not the learner for it");
+        let waiting = roster.begin_waiting(1);
+        assert_eq!(census(&roster, start + SLOW), (1, 0, 0, 1), "the actor waits for the learner");
         drop(waiting);
         roster.heard(1, start + SLOW);
         assert_eq!(census(&roster, start + SLOW), (1, 0, 0, 0));
@@ -269,99 +279,99 @@ mod tests {
     }
 
     #[test]
-    fn the_limit_counts_those_who_are_there_and_never_those_who_come_back() {
+    fn the_limit_counts_present_actors_and_lets_them_reconnect() {
         let (roster, start) = (Arc::new(Roster::new(2)), Instant::now());
         assert!(joins(&roster, 1, start) && joins(&roster, 2, start));
         assert!(!joins(&roster, 3, start));
         assert!(joins(&roster, 1, start), "a reconnection");
-        assert!(joins(&roster, 3, start + JOINING), "who joins and opens no stream gives up the place");
+        assert!(joins(&roster, 3, start + GRACE), "an actor that joins and opens no stream loses its place");
     }
 
     #[test]
-    fn a_newer_process_of_a_name_takes_the_older_ones_place_for_ever() {
+    fn a_newer_process_supersedes_older_ones_of_its_name_for_ever() {
         let (roster, start) = (Arc::new(Roster::new(2)), Instant::now());
-        assert_eq!(roster.join(1, "pod-0", None, start), Admission::Welcome);
-        assert_eq!(roster.join(2, "pod-1", None, start), Admission::Welcome);
-        let _watching = roster.watch(1);
-        assert_eq!(roster.join(3, "pod-2", None, start), Admission::Full);
-        assert_eq!(roster.join(4, "pod-0", None, start), Admission::Welcome, "there is one less");
+        assert_eq!(roster.join(1, "pod-0", None, start), Joined::Welcome);
+        assert_eq!(roster.join(2, "pod-1", None, start), Joined::Welcome);
+        let _watching = roster.open_stream(1);
+        assert_eq!(roster.join(3, "pod-2", None, start), Joined::Full);
+        assert_eq!(roster.join(4, "pod-0", None, start), Joined::Welcome, "it replaces an actor that counted");
         assert!(!roster.heard(1, start) && roster.heard(4, start));
-        roster.number(4, 4);
+        roster.set_index(4, 4);
         assert!(roster.is_superseded(1) && !roster.is_superseded(2) && !roster.is_superseded(4));
         assert!(!roster.expects(1, start) && roster.expects(4, start));
-        assert_eq!(roster.join(1, "pod-0", None, start), Admission::Superseded);
-        assert_eq!(roster.join(4, "pod-0", None, start), Admission::Welcome, "a reconnection");
-        assert_eq!(roster.join(2, "pod-1", None, start), Admission::Welcome);
+        assert_eq!(roster.join(1, "pod-0", None, start), Joined::Superseded);
+        assert_eq!(roster.join(4, "pod-0", None, start), Joined::Welcome, "a reconnection");
+        assert_eq!(roster.join(2, "pod-1", None, start), Joined::Welcome);
     }
 
     #[test]
-    fn which_process_of_a_name_is_the_newer_is_known_after_everything_else_was_forgotten() {
+    fn the_indices_tell_the_newer_process_after_the_roster_forgot_both() {
         let later = Instant::now() + REMEMBERED * 2;
         for order in [[(1, 3), (2, 7)], [(2, 7), (1, 3)]] {
             let roster = Roster::new(2);
             let joined = order.map(|(incarnation, had)| roster.join(incarnation, "pod-0", Some(had), later));
-            assert_eq!(joined[0], Admission::Welcome);
+            assert_eq!(joined[0], Joined::Welcome);
             assert_eq!(roster.is_superseded(1), order[0].0 == 1, "the older one goes");
-            assert_eq!(joined[1], if order[1].0 == 2 { Admission::Welcome } else { Admission::Superseded });
+            assert_eq!(joined[1], if order[1].0 == 2 { Joined::Welcome } else { Joined::Superseded });
             assert!(!roster.is_superseded(2) && roster.heard(2, later));
         }
     }
 
     #[test]
-    fn who_has_no_name_is_in_nobodys_place() {
+    fn actors_without_a_name_do_not_supersede_each_other() {
         let (roster, start) = (Roster::new(2), Instant::now());
         assert!(joins(&roster, 1, start) && joins(&roster, 2, start));
         assert!(roster.heard(1, start) && roster.heard(2, start));
     }
 
     #[test]
-    fn who_sends_is_there_although_it_reads_no_parameters_any_more() {
+    fn an_actor_that_sends_is_present_without_a_stream_of_parameters() {
         let (roster, start) = (Arc::new(Roster::new(1)), Instant::now());
         assert!(joins(&roster, 1, start));
-        drop(roster.watch(1));
+        drop(roster.open_stream(1));
         let later = Instant::now();
         roster.heard(1, later);
-        assert_eq!(roster.join(2, "", None, later), Admission::Full);
+        assert_eq!(roster.join(2, "", None, later), Joined::Full);
     }
 
     #[test]
-    fn an_actor_is_expected_while_it_is_there_and_a_little_longer() {
+    fn an_actor_is_expected_while_it_is_present_and_for_the_grace_period() {
         let (roster, start) = (Arc::new(Roster::new(10)), Instant::now());
         assert!(!roster.expects(1, start));
         assert!(joins(&roster, 1, start) && roster.expects(1, start));
-        let watching = roster.watch(1);
-        assert!(roster.expects(1, start + JOINING * 2));
+        let watching = roster.open_stream(1);
+        assert!(roster.expects(1, start + GRACE * 2));
         drop(watching);
         let gone = Instant::now();
-        assert!(roster.expects(1, gone) && !roster.expects(1, gone + JOINING));
+        assert!(roster.expects(1, gone) && !roster.expects(1, gone + GRACE));
     }
 
     #[test]
-    fn who_stands_by_is_not_there_and_gives_way_to_a_newer_process_of_its_name() {
+    fn an_actor_that_stands_by_is_not_present_and_can_be_superseded() {
         let (roster, start) = (Arc::new(Roster::new(1)), Instant::now());
         let join = |incarnation| roster.join(incarnation, "comic-actor-0", None, start);
-        assert_eq!(join(1), Admission::Welcome);
-        roster.turn_away(1);
+        assert_eq!(join(1), Joined::Welcome);
+        roster.stand_by(1);
         assert_eq!(census(&roster, start), (0, 0, 0, 0));
-        assert!(roster.watch(1).is_none() && !roster.expects(1, start));
-        assert!(joins(&roster, 2, start), "it takes nobody's place");
-        roster.turn_away(2);
-        assert_eq!(join(1), Admission::Welcome, "it comes again");
-        roster.turn_away(1);
-        assert_eq!(join(3), Admission::Welcome);
-        assert_eq!(join(1), Admission::Superseded);
-        assert!(roster.watch(3).is_some());
+        assert!(roster.open_stream(1).is_none() && !roster.expects(1, start));
+        assert!(joins(&roster, 2, start), "an actor that stands by takes no place");
+        roster.stand_by(2);
+        assert_eq!(join(1), Joined::Welcome, "it joins again");
+        roster.stand_by(1);
+        assert_eq!(join(3), Joined::Welcome);
+        assert_eq!(join(1), Joined::Superseded);
+        assert!(roster.open_stream(3).is_some());
     }
 
     #[test]
-    fn who_has_not_joined_is_not_counted_and_memory_is_bounded() {
+    fn an_actor_that_has_not_joined_is_not_counted_and_memory_is_bounded() {
         let roster = Arc::new(Roster::new(10));
-        drop((roster.watch(7), roster.wait(7)));
-        assert_eq!(lock(&roster.actors).len(), 0);
+        drop((roster.open_stream(7), roster.begin_waiting(7)));
+        assert_eq!(roster.actors.lock().len(), 0);
         let start = Instant::now();
         for incarnation in 0..100 {
-            assert!(joins(&roster, incarnation, start + (JOINING + REMEMBERED) * incarnation as u32));
+            assert!(joins(&roster, incarnation, start + (GRACE + REMEMBERED) * incarnation as u32));
         }
-        assert!(lock(&roster.actors).len() < 3);
+        assert!(roster.actors.lock().len() < 3);
     }
 }

@@ -1,44 +1,76 @@
-//! The state of the learner, as `GetStatus` and `/metrics` tell it.
+//! The state of the learner, as `GetStatus`, `/metrics` and `/readyz` show it.
 
+use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Instant;
 
 use comic_proto::v1;
+use comic_replay::Batcher;
+use parking_lot::Mutex;
 
-use super::roster::Census;
-use super::{Shared, lock};
-use crate::observe::telemetry::Sample;
+use super::room::Room;
+use super::roster::{Census, Roster};
+use super::shutdown::Shutdown;
+use crate::observe::probes::Probed;
+use crate::observe::telemetry::{Sample, Telemetry};
+use crate::publish::Publisher;
 
-/// What `GetStatus` answers.
-pub(super) fn of(shared: &Shared) -> v1::Status {
-    let accounting = shared.batcher.accounting();
-    let Census { alive, slow, lost, waiting } = shared.roster.census(Instant::now());
-    let ages = shared.telemetry.ages();
-    v1::Status {
-        learner_epoch: shared.publisher.epoch(),
-        accounting: Some(v1::Accounting {
-            produced: accounting.produced,
-            trained: accounting.trained,
-            dropped_stale: accounting.dropped.stale,
-            dropped_invalid: accounting.dropped.invalid,
-            dropped_superseded: accounting.dropped.superseded,
-            dropped_lost_at_restart: accounting.dropped.lost_at_restart,
-            in_flight: accounting.in_flight,
-            duplicates: accounting.duplicates,
-            unattributed: accounting.unattributed,
-        }),
-        metrics_json: lock(&shared.metrics).clone(),
-        run: shared.run.display().to_string(),
-        experiment: shared.name.clone(),
-        uptime_seconds: shared.since.elapsed().as_secs_f64(),
-        queue: Some(v1::Queue { unrolls: accounting.in_flight, capacity: shared.capacity, waiting }),
-        ages: Some(v1::Ages { median: ages.median, p99: ages.p99, max: ages.max }),
-        actors: Some(v1::Actors { alive, slow, lost }),
+/// What an operator can ask.
+#[derive(Debug)]
+pub(super) struct StatusBoard {
+    pub(super) run: PathBuf,
+    /// The experiment's name.
+    pub(super) experiment: String,
+    pub(super) started: Instant,
+    /// Unrolls that the batches have room for: those of the open batch, of full ones, and of the trainer's.
+    pub(super) capacity: u64,
+    /// The newest metrics, JSON.
+    pub(super) metrics: Mutex<String>,
+    pub(super) batcher: Batcher,
+    pub(super) publisher: Publisher,
+    pub(super) roster: Arc<Roster>,
+    pub(super) room: Room,
+    pub(super) telemetry: Arc<Telemetry>,
+    pub(super) shutdown: Shutdown,
+}
+
+impl StatusBoard {
+    /// Replaces the metrics that `GetStatus` answers with, JSON.
+    pub(super) fn set_metrics(&self, json: String) {
+        *self.metrics.lock() = json;
+    }
+
+    /// What `GetStatus` answers.
+    pub(super) fn status(&self) -> v1::Status {
+        let accounting = self.batcher.accounting();
+        let Census { alive, slow, lost, waiting } = self.roster.census(Instant::now());
+        let ages = self.telemetry.ages();
+        v1::Status {
+            learner_epoch: self.publisher.epoch(),
+            accounting: Some(v1::Accounting {
+                produced: accounting.produced,
+                trained: accounting.trained,
+                dropped_stale: accounting.dropped.stale,
+                dropped_invalid: accounting.dropped.invalid,
+                dropped_superseded: accounting.dropped.superseded,
+                dropped_lost_at_restart: accounting.dropped.lost_at_restart,
+                in_flight: accounting.in_flight,
+                duplicates: accounting.duplicates,
+                unattributed: accounting.unattributed,
+            }),
+            metrics_json: self.metrics.lock().clone(),
+            run: self.run.display().to_string(),
+            experiment: self.experiment.clone(),
+            uptime_seconds: self.started.elapsed().as_secs_f64(),
+            queue: Some(v1::Queue { unrolls: accounting.in_flight, capacity: self.capacity, waiting }),
+            ages: Some(v1::Ages { median: ages.median, p99: ages.p99, max: ages.max }),
+            actors: Some(v1::Actors { alive, slow, lost }),
+        }
     }
 }
 
-impl Shared {
-    /// What `/metrics` answers.
-    pub fn metrics_page(&self) -> String {
+impl Probed for StatusBoard {
+    fn metrics_page(&self) -> String {
         let Census { alive, slow, lost, waiting } = self.roster.census(Instant::now());
         self.telemetry.page(&Sample {
             accounting: self.batcher.accounting_by_task(),
@@ -49,5 +81,9 @@ impl Shared {
             version: self.publisher.newest_version(),
             epoch: self.publisher.epoch(),
         })
+    }
+
+    fn is_draining(&self) -> bool {
+        self.shutdown.has_begun()
     }
 }

@@ -1,46 +1,47 @@
 //! From a batch as the wire has it to minibatches on the device.
 
-use anyhow::Result;
+use comic_experiment::Experiment;
 use comic_proto::{Field, PerField};
 use comic_replay::Batch;
+use rand::Rng;
 use rand::seq::SliceRandom as _;
+use tch::Device;
 
 use crate::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
 use crate::algorithm::shape::MinibatchShape;
-use crate::train::trainer::Trainer;
+use crate::error::Result;
 
-impl Trainer {
-    /// The batch on the device, `[B, T(+1), …]`.
-    pub(crate) fn tensors(&self, batch: &Batch) -> Result<MinibatchTensors> {
-        self.masked_tensors(batch, batch.f32(Field::Valid))
-    }
+/// A batch of unrolls of any of `tasks` tasks on the device.
+///
+/// # Errors
+/// When the device refuses.
+pub(super) fn to_device(batch: &Batch, tasks: usize, device: Device) -> Result<MinibatchTensors> {
+    masked_to_device(batch, batch.f32(Field::Valid), tasks, device)
+}
 
-    /// The same, of which only those rows count, `[B, T]`, whose `valid` is 1.
-    pub(crate) fn masked_tensors(&self, batch: &Batch, valid: &[f32]) -> Result<MinibatchTensors> {
-        let shape =
-            MinibatchShape { unrolls: batch.unrolls, tasks: self.spec.tasks.len(), unroll: *batch.layout.shape() };
-        let floats = PerField::from_fn(|field| if field == Field::Valid { valid } else { batch.f32(field) });
-        let source = MinibatchSource { floats, clip: batch.clip(), image: batch.image(), tasks: &batch.tasks() };
-        Ok(MinibatchTensors::new(&source, &shape, self.learner.device())?)
-    }
+/// As [`to_device`], with `valid`, `[B, T]`, in place of the batch's own: a row counts only where it is 1.
+///
+/// # Errors
+/// When the device refuses.
+pub(super) fn masked_to_device(batch: &Batch, valid: &[f32], tasks: usize, device: Device) -> Result<MinibatchTensors> {
+    let shape = MinibatchShape { unrolls: batch.unrolls, tasks, unroll: *batch.layout.shape() };
+    let floats = PerField::from_fn(|field| if field == Field::Valid { valid } else { batch.f32(field) });
+    let source = MinibatchSource { floats, clip: batch.clip(), image: batch.image(), tasks: &batch.tasks() };
+    Ok(MinibatchTensors::new(&source, &shape, device)?)
+}
 
-    /// The gradient steps' minibatches: every unroll once before any comes again.
-    pub(crate) fn minibatches<'a>(
-        &mut self,
-        tensors: &'a MinibatchTensors,
-    ) -> impl Iterator<Item = MinibatchTensors> + use<'a> {
-        let unrolls = self.experiment.unroll.batch;
-        let size = self.experiment.vmpo.minibatch_unrolls;
-        let steps = self.experiment.vmpo.gradient_steps;
-        let mut order: Vec<usize> = Vec::new();
-        while order.len() < steps * size {
-            let mut pass: Vec<usize> = (0..unrolls).collect();
-            // With the whole batch in each step, order means nothing; keep it, so that sums are those of the batch.
-            if size < unrolls {
-                pass.shuffle(&mut self.progress.random);
-            }
-            order.extend(pass);
+/// The unrolls of each gradient step on a batch: every unroll once before any comes again.
+pub(super) fn draw(experiment: &Experiment, random: &mut impl Rng) -> Vec<Vec<usize>> {
+    let unrolls = experiment.unroll.batch;
+    let (size, steps) = (experiment.vmpo.minibatch_unrolls.max(1), experiment.vmpo.gradient_steps);
+    let mut order: Vec<usize> = Vec::new();
+    while order.len() < steps * size {
+        let mut pass: Vec<usize> = (0..unrolls).collect();
+        // If each step takes the whole batch, the order does not matter; without a shuffle the sums are the batch's own.
+        if size < unrolls {
+            pass.shuffle(random);
         }
-        (0..steps).map(move |step| tensors.select(&order[step * size..(step + 1) * size]))
+        order.extend(pass);
     }
+    order.chunks_exact(size).take(steps).map(<[usize]>::to_vec).collect()
 }

@@ -1,88 +1,111 @@
-//! The trainer's whole state as a snapshot, and back: everything that changes the future.
+//! What changes in training and decides its future: what a checkpoint holds and restores.
 
-use std::sync::Arc;
-use std::time::Instant;
-
-use anyhow::{Context as _, Result};
 use bytes::Bytes;
-use comic_networks::to_safetensors;
+use comic_experiment::{Experiment, TaskSpec};
+use rand::SeedableRng as _;
+use rand_pcg::Pcg64;
+use tch::Device;
 
-use crate::algorithm::Algorithm as _;
-use crate::checkpoint::{Name, PROGRESS, Snapshot};
-use crate::service::memory::{Bounds, Sizes};
-use crate::train::trainer::{Progress, Trainer};
+use crate::algorithm::Algorithm;
+use crate::checkpoint::progress::{PROGRESS, Progress};
+use crate::checkpoint::snapshot::Snapshot;
+use crate::error::{Error, Result};
+use crate::tensors;
+use crate::train::statistics::ObservationStatistics;
+use crate::vmpo::VmpoLearner;
 
-impl Trainer {
-    /// Hands a snapshot to the writer; while it is still busy with the last one, only a `final_one` waits.
-    pub(crate) fn checkpoint(&mut self, final_one: bool) -> Result<()> {
-        let name = Name::Updates(self.progress.updates);
-        match final_one {
-            // A step that was skipped at the very end changed nothing.
-            true if self.learner.is_finite() => self.write(name),
-            false if self.writer.is_busy() => Ok(()),
-            _ => self.keep(name),
-        }
+/// The algorithm and what is saved with it.
+#[derive(Debug)]
+pub(super) struct State {
+    pub(super) algorithm: Box<dyn Algorithm>,
+    /// Of the observations, for the normaliser.
+    pub(super) statistics: ObservationStatistics,
+    pub(super) progress: Progress,
+    /// The parameters that actors act with, as published.
+    pub(super) target: Bytes,
+}
+
+impl State {
+    /// The state at the beginning of run number `run`. `pose` is the action at which the policy's mean starts, `[A]`.
+    ///
+    /// # Errors
+    /// When the networks cannot be made.
+    pub(super) fn new(
+        experiment: &Experiment,
+        spec: &TaskSpec,
+        pose: &[f32],
+        device: Device,
+        run: u64,
+        epoch: u64,
+    ) -> Result<Self> {
+        tch::manual_seed(experiment.seed as i64);
+        let algorithm = Box::new(VmpoLearner::new(spec, experiment, pose, device)?);
+        let progress = Progress {
+            run: Some(run),
+            epoch,
+            updates: 0,
+            environment_steps: 0,
+            seconds: 0.0,
+            version: 0,
+            warm_started: experiment.warm_start.steps == 0,
+            random: Pcg64::seed_from_u64(experiment.seed),
+        };
+        let target = Bytes::from(algorithm.policy_parameters()?);
+        Ok(Self { algorithm, statistics: ObservationStatistics::new(spec), progress, target })
     }
 
-    /// Has the state written, and keeps it in memory to turn back to; only a sound one.
-    pub(crate) fn keep(&mut self, name: Name) -> Result<()> {
-        if !self.is_sound() {
-            tracing::warn!(checkpoint = %name, "not written: the last gradient steps were not finite");
-            return Ok(());
-        }
-        self.write(name)
+    /// Normalises by the statistics of the observations seen so far.
+    ///
+    /// # Errors
+    /// When libtorch refuses.
+    pub(super) fn set_normaliser(&mut self) -> Result<()> {
+        Ok(self.algorithm.set_normaliser(&self.statistics.to_normaliser()?)?)
     }
 
-    fn write(&mut self, name: Name) -> Result<()> {
-        self.good = Arc::new(self.snapshot()?);
-        self.checkpointed = Instant::now();
-        self.writer.write(name, self.good.clone())
-    }
-
-    /// How much memory the learner's buffers can take, now that every size is known.
-    pub(crate) fn memory(&self) -> Bounds {
-        Bounds::new(&Sizes {
-            ahead: self.experiment.unroll.ahead,
-            batch: self.experiment.unroll.batch,
-            unroll: self.batcher.layout().size(),
-            ingest: self.shared.ingest(),
-            parameters: self.target.len(),
-            snapshot: self.good.parts.values().map(Vec::len).sum(),
-        })
-    }
-
-    pub(crate) fn snapshot(&self) -> Result<Snapshot> {
-        let mut tensors = self.learner.state();
-        tensors.extend(self.statistics.state());
-        let run = Some(self.shared.id());
-        let progress = Progress { run, epoch: self.epoch, seconds: self.seconds(), ..self.progress.clone() };
-        let mut snapshot = Snapshot::default();
-        for (name, bytes) in [
-            ("experiment.toml", self.experiment.to_toml()?.into_bytes()),
-            ("task.json", serde_json::to_vec_pretty(&self.spec)?),
-            ("policy.safetensors", to_safetensors(self.learner.policy_store())?),
+    /// The state as a checkpoint, with the documents by which a resumed run is compared.
+    ///
+    /// # Errors
+    /// When a part cannot be read from the device or written as a document.
+    pub(super) fn snapshot(
+        &self,
+        experiment: &Experiment,
+        spec: &TaskSpec,
+        accounting: &comic_replay::LedgerSnapshot,
+    ) -> Result<Snapshot> {
+        let mut learned = self.algorithm.state();
+        learned.extend(self.statistics.state());
+        let json = |name: &str| Error::json(format!("{name} of the checkpoint"));
+        let parts = [
+            ("experiment.toml", experiment.to_toml()?.into_bytes()),
+            ("task.json", serde_json::to_vec_pretty(spec).map_err(json("task.json"))?),
+            ("policy.safetensors", self.algorithm.policy_parameters()?),
             ("target.safetensors", self.target.to_vec()),
-            ("learner.safetensors", crate::tensors::to_bytes(&tensors)?),
-            (PROGRESS, serde_json::to_vec_pretty(&progress)?),
-            ("accounting.json", serde_json::to_vec_pretty(&self.batcher.snapshot())?),
-        ] {
-            snapshot.parts.insert(name.to_string(), bytes);
-        }
-        Ok(snapshot)
+            ("learner.safetensors", tensors::to_bytes(&learned)?),
+            (PROGRESS, serde_json::to_vec_pretty(&self.progress).map_err(json(PROGRESS))?),
+            ("accounting.json", serde_json::to_vec_pretty(accounting).map_err(json("accounting.json"))?),
+        ];
+        Ok(Snapshot { parts: parts.map(|(name, bytes)| (name.to_string(), bytes)).into() })
     }
 
-    pub(crate) fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        self.restore_learner(snapshot)?;
+    /// Restores a checkpoint, as learner epoch `epoch` of run number `run`.
+    ///
+    /// # Errors
+    /// When a part is missing or damaged, or does not fit the experiment.
+    pub(super) fn restore(&mut self, snapshot: &Snapshot, run: u64, epoch: u64) -> Result<()> {
+        self.restore_learned(snapshot)?;
         self.target = Bytes::copy_from_slice(snapshot.part("target.safetensors")?);
-        self.progress =
-            serde_json::from_slice(snapshot.part(PROGRESS)?).context("the checkpoint's progress is damaged")?;
+        self.progress = Progress { run: Some(run), epoch, ..Progress::of(snapshot)? };
         Ok(())
     }
 
-    /// What was learnt, without what counts.
-    pub(crate) fn restore_learner(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let mut tensors = crate::tensors::from_bytes(snapshot.part("learner.safetensors")?)?;
+    /// Restores what was learned, and leaves the progress as it is.
+    ///
+    /// # Errors
+    /// As of [`restore`](Self::restore).
+    pub(super) fn restore_learned(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let mut tensors = tensors::from_bytes(snapshot.part("learner.safetensors")?)?;
         self.statistics.restore(&mut tensors)?;
-        self.learner.load_state(&tensors).context("the checkpoint does not fit the experiment's networks")
+        let loaded = self.algorithm.load_state(&tensors);
+        loaded.map_err(Error::within("the checkpoint does not fit the experiment's networks"))
     }
 }

@@ -1,16 +1,17 @@
 //! Mean and standard deviation of the observations, for the normaliser.
 
-use anyhow::{Context as _, Result};
 use comic_experiment::TaskSpec;
 use comic_networks::NormaliserStatistics;
 use comic_proto::Field;
 use comic_replay::Batch;
 use tch::{Kind, Tensor};
 
-/// Of proprioception, which every task assignments, and of each task's own observation.
+use crate::error::{Error, Result};
+
+/// The statistics of proprioception, which all tasks share, and of each task's own observation.
 #[derive(Debug)]
 pub struct ObservationStatistics {
-    /// Rows of the batches seen, whatever stands in them.
+    /// Rows of the batches seen, padding included.
     rows: f64,
     proprioception: Statistics,
     /// By the task's name.
@@ -33,15 +34,14 @@ impl ObservationStatistics {
         self.rows
     }
 
-    /// Whether there is nothing yet by which one of these tasks could be normalised.
+    /// Whether there are no statistics yet for one of these tasks.
     pub fn lacks(&self, tasks: &[usize]) -> bool {
         tasks.iter().any(|task| self.tasks.get(*task).is_some_and(|(_, statistics)| statistics.count() == 0.0))
     }
 
     /// Adds the observations of a batch.
     ///
-    /// Where there are several tasks, a row that begins an episode counts only if a step follows it: the others may be
-    /// padding.
+    /// If there are several tasks, a row that begins an episode counts only if a step follows it, because it may be padding.
     pub fn absorb(&mut self, batch: &Batch) {
         let tasks = batch.tasks();
         let length = batch.layout.shape().length;
@@ -67,13 +67,12 @@ impl ObservationStatistics {
         }
     }
 
-    /// As the normaliser takes them.
+    /// In the form that the normaliser takes.
     ///
     /// # Errors
     /// When libtorch refuses.
     pub fn to_normaliser(&self) -> Result<NormaliserStatistics> {
-        let floats =
-            |tensors: Vec<Tensor>| Vec::<f32>::try_from(Tensor::cat(&tensors, 0)).context("cannot read the statistics");
+        let floats = |tensors: Vec<Tensor>| Vec::<f32>::try_from(Tensor::cat(&tensors, 0));
         let (mean, std) = self.proprioception.mean_and_std();
         let (task_means, task_stds) = self.tasks.iter().map(|(_, statistics)| statistics.mean_and_std()).unzip();
         Ok(NormaliserStatistics {
@@ -97,11 +96,12 @@ impl ObservationStatistics {
     pub fn restore(&mut self, tensors: &mut Vec<(String, Tensor)>) -> Result<()> {
         let find = |wanted: &str| tensors.iter().find(|(name, _)| name == wanted).map(|(_, tensor)| tensor.copy());
         let rows = find(ROWS).and_then(|rows| f64::try_from(rows).ok());
-        self.rows = rows.with_context(|| format!("the checkpoint has no {ROWS}"))?;
+        self.rows = rows.ok_or_else(|| Error::Checkpoint(format!("the checkpoint has no {ROWS}")))?;
         let named = std::iter::once((PROPRIOCEPTION.to_string(), &mut self.proprioception))
             .chain(self.tasks.iter_mut().map(|(task, statistics)| (of_task(task), statistics)));
         for (name, statistics) in named {
-            statistics.restore(&name, find).with_context(|| format!("the checkpoint's {name} do not fit the task"))?;
+            let misfit = || Error::Checkpoint(format!("the checkpoint's {name} do not fit the task"));
+            statistics.restore(&name, find).ok_or_else(misfit)?;
         }
         tensors.retain(|(name, _)| !name.starts_with(PREFIX));
         Ok(())
@@ -113,7 +113,7 @@ impl ObservationStatistics {
     }
 }
 
-/// How the names of statistics begin in a checkpoint.
+/// The beginning of the statistics' names in a checkpoint.
 const PREFIX: &str = "statistics.";
 const ROWS: &str = "statistics.rows";
 const PROPRIOCEPTION: &str = "statistics.proprioception";
@@ -151,7 +151,8 @@ impl Statistics {
         self.count
     }
 
-    /// Mean and standard deviation `[width]`, float32. A component that never moves gets 1, so that it stays harmless.
+    /// Mean and standard deviation, `[width]` each, float32. A component that never changes gets deviation 1, so that it is
+    /// not divided by 0.
     pub fn mean_and_std(&self) -> (Tensor, Tensor) {
         let count = self.count.max(1.0);
         let mean = &self.sum / count;
@@ -214,7 +215,7 @@ mod tests {
         }
     }
 
-    /// Unrolls of three steps: tracking's observations are 1, 2, 3, 2; getting up's 10 and 30, and then padding.
+    /// Unrolls of three steps. Tracking's observations are 1, 2, 3, 2; those of getting up are 10, 30, and then padding.
     fn batch(spec: &TaskSpec) -> Batch {
         let mut experiment = resolve("tracking-mlp", &["unroll.length=3".into()]).unwrap();
         experiment.network.latent.size = 1;
@@ -238,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn every_task_has_its_own_mean_and_padding_counts_nowhere() {
+    fn every_task_has_its_own_mean_without_padding() {
         let spec = spec();
         let mut statistics = ObservationStatistics::new(&spec);
         assert!(statistics.lacks(&[1]));
@@ -246,12 +247,12 @@ mod tests {
         let normaliser = statistics.to_normaliser().unwrap();
         assert_eq!(normaliser.task_mean, [2.0, 20.0]);
         assert!((normaliser.proprioception_mean[0] - 8.0).abs() < 1e-5, "{normaliser:?}");
-        assert_eq!(statistics.rows(), 8.0, "rows are counted whatever stands in them");
+        assert_eq!(statistics.rows(), 8.0, "padding is counted as rows");
         assert!(!statistics.lacks(&[0, 1]));
     }
 
     #[test]
-    fn a_checkpoint_brings_them_back() {
+    fn a_checkpoint_restores_them() {
         let spec = spec();
         let mut statistics = ObservationStatistics::new(&spec);
         statistics.absorb(&batch(&spec));
@@ -260,7 +261,7 @@ mod tests {
         let mut restored = ObservationStatistics::new(&spec);
         restored.restore(&mut state).unwrap();
         assert_eq!(restored.to_normaliser().unwrap(), statistics.to_normaliser().unwrap());
-        assert_eq!((restored.rows(), state.len()), (8.0, 1), "what is somebody else's is left");
+        assert_eq!((restored.rows(), state.len()), (8.0, 1), "other tensors stay");
         let error = restored.restore(&mut Vec::new()).unwrap_err().to_string();
         assert!(error.contains("statistics.rows"), "{error}");
     }

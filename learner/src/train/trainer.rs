@@ -1,206 +1,116 @@
 //! The trainer: one OS thread that owns the device. Batches in, parameters out.
 
-use std::path::PathBuf;
-use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use anyhow::Result;
-use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec};
-use comic_networks::to_safetensors;
-use comic_proto::v1::{Behaviour, EpisodeEnd, UnrollHeader};
-use comic_replay::{Batch, Batcher, Next, Phase, Reason};
-use rand::SeedableRng as _;
-use rand_pcg::Pcg64;
-use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value};
+use comic_proto::v1::Behaviour;
+use comic_replay::{Batch, Batcher, Next, Reason};
 
-use crate::algorithm::Algorithm as _;
-use crate::algorithm::losses::Losses;
-use crate::checkpoint::{Name, Snapshot, Store, incompatible};
+use crate::algorithm::losses::{LossValues, Losses};
+use crate::algorithm::minibatch::MinibatchTensors;
+use crate::checkpoint::{Name, Snapshot, incompatible};
 use crate::device::Backend;
-use crate::observe::metrics::{Metrics, Position};
-use crate::publish::Publisher;
-use crate::service::Shared;
-use crate::train::skipped_steps::SkippedSteps;
-use crate::train::statistics::ObservationStatistics;
-use crate::train::writer::Writer;
-use crate::vmpo::VmpoLearner;
+use crate::error::{Error, Result};
+use crate::service::TrainerHandle;
+use crate::service::memory::{Bounds, Sizes};
+use crate::train::budget::BudgetClock;
+use crate::train::checkpoints::Checkpoints;
+use crate::train::minibatches::{draw, to_device};
+use crate::train::reports::Reports;
+use crate::train::setup::{Ending, Setup};
+use crate::train::skipped_steps::{REMEDIES, Recovery, SkippedSteps};
+use crate::train::state::State;
+use crate::train::versions::Versions;
+use crate::train::warm_start::WarmStart;
 
 /// How often a trainer without batches looks at the clock.
-const PATIENCE: std::time::Duration = std::time::Duration::from_millis(500);
+const PATIENCE: Duration = Duration::from_millis(500);
+/// Steps of the warm start between two reports.
+const REPORTED_STEPS: u64 = 50;
 
-/// What a trainer is made of.
-#[derive(Debug)]
-pub struct Setup {
-    /// The resolved experiment.
-    pub experiment: Experiment,
-    /// The task's sizes and names.
-    pub spec: TaskSpec,
-    /// Where the policy's mean starts, `[A]`.
-    pub pose: Vec<f32>,
-    /// Where it computes.
-    pub backend: Backend,
-    /// The run's directory.
-    pub run: PathBuf,
-    /// This life of the learner.
-    pub epoch: u64,
-    /// A checkpoint to go on from.
-    pub resume: Option<Snapshot>,
-    /// Where batches come from.
-    pub batcher: Batcher,
-    /// Where parameters go.
-    pub publisher: Publisher,
-    /// Where the newest metrics are shown.
-    pub shared: Arc<Shared>,
-}
-
-/// Why training ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Ending {
-    /// The experiment's budget is used up.
-    Budget,
-    /// The batcher was closed: somebody asked the learner to stop.
-    Stopped,
-}
-
-/// Everything that counts, in checkpoints as `progress.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct Progress {
-    /// The run's number; absent from checkpoints of learners that had none.
-    #[serde(default)]
-    pub(crate) run: Option<u64>,
-    /// The life of the learner that made it, without which the version means nothing.
-    pub(crate) epoch: u64,
-    pub(crate) updates: u64,
-    pub(crate) environment_steps: u64,
-    pub(crate) seconds: f64,
-    pub(crate) version: u64,
-    pub(crate) warm_started: bool,
-    /// Decides the minibatches.
-    pub(crate) random: Pcg64,
-}
-
-/// Learns from batches until the budget is used up or the batcher closed.
+/// Learns from batches until the budget is used up or the batcher is closed.
 #[derive(Debug)]
 pub struct Trainer {
-    pub(crate) experiment: Experiment,
-    pub(crate) spec: TaskSpec,
-    pub(crate) epoch: u64,
-    pub(crate) backend: Backend,
-    pub(crate) learner: VmpoLearner,
-    /// The last update's losses, where asking for them at once would mean to wait for the device.
-    late: Option<Losses>,
-    /// Of the observations, for the normaliser.
-    pub(crate) statistics: ObservationStatistics,
-    /// The parameters actors act with, as published.
-    pub(crate) target: Bytes,
-    pub(crate) progress: Progress,
-    /// Since when this life counts time, and what had been counted then.
-    clock: Option<(Instant, f64)>,
-    pub(crate) losses: Map<String, Value>,
-    pub(crate) batcher: Batcher,
-    publisher: Publisher,
-    pub(crate) shared: Arc<Shared>,
-    /// Unrolls of versions before this one are superseded.
-    pub(crate) oldest: u64,
-    pub(crate) metrics: Metrics,
-    pub(crate) writer: Writer,
-    pub(crate) checkpointed: Instant,
-    /// The newest checkpoint, in memory: where a learner turns back to that lost its way.
-    pub(crate) good: Arc<Snapshot>,
-    pub(crate) skipped_steps: SkippedSteps,
+    experiment: Experiment,
+    spec: TaskSpec,
+    backend: Backend,
+    batcher: Batcher,
+    state: State,
+    skipped_steps: SkippedSteps,
+    budget: BudgetClock,
+    versions: Versions,
+    reports: Reports,
+    checkpoints: Checkpoints,
 }
 
 impl Trainer {
-    /// A trainer at its beginning, or where its checkpoint left it. Fresh runs write their `initial` checkpoint.
+    /// A trainer at the beginning of its run, or at its checkpoint. A new run gets its `initial` checkpoint.
     ///
     /// # Errors
     /// A checkpoint that does not fit the experiment; a disk that refuses.
     pub fn new(setup: Setup) -> Result<Self> {
-        let Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, shared } = setup;
-        tch::manual_seed(experiment.seed as i64);
+        let Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, service } = setup;
         backend.train_here()?;
-        let learner = VmpoLearner::new(&spec, &experiment, &pose, backend.device())?;
-        let store = Store::open(&run, experiment.learner.checkpoints_kept)?;
+        let mut state = State::new(&experiment, &spec, &pose, backend.device(), service.id(), epoch)?;
+        if let Some(snapshot) = &resume {
+            state.restore(snapshot, service.id(), epoch).map_err(|error| incompatible(&run, error))?;
+        }
+        let mut reports = Reports::open(&run, &spec, &experiment.learner, service.clone())?;
+        reports.begin(&state.progress, batcher.accounting_by_task());
         let mut trainer = Self {
-            statistics: ObservationStatistics::new(&spec),
-            target: Bytes::from(to_safetensors(learner.policy_store())?),
-            progress: Progress {
-                run: Some(shared.id()),
-                epoch,
-                updates: 0,
-                environment_steps: 0,
-                seconds: 0.0,
-                version: 0,
-                warm_started: experiment.warm_start.steps == 0,
-                random: Pcg64::seed_from_u64(experiment.seed),
-            },
-            clock: None,
-            losses: Map::new(),
-            oldest: 0,
-            metrics: Metrics::open(&run, &spec)?,
-            writer: Writer::start(store, shared.telemetry.clone())?,
-            checkpointed: Instant::now(),
-            good: Arc::default(),
             skipped_steps: SkippedSteps::new(experiment.learner.restore_after),
+            budget: BudgetClock::new(experiment.budget.clone(), state.progress.seconds),
+            versions: Versions::new(batcher.clone(), publisher, experiment.unroll.lockstep),
+            checkpoints: Checkpoints::start(&run, &experiment.learner, service.telemetry.clone())?,
             experiment,
             spec,
-            epoch,
             backend,
-            learner,
-            late: None,
             batcher,
-            publisher,
-            shared,
+            state,
+            reports,
         };
         match resume {
-            Some(snapshot) => {
-                trainer.restore(&snapshot).map_err(|error| incompatible(&run, error))?;
-                trainer.good = Arc::new(snapshot);
-            }
-            None => trainer.keep(Name::Initial)?,
+            Some(snapshot) => trainer.checkpoints.set_good(snapshot),
+            None => trainer.write_checkpoint_if_sound(Name::Initial)?,
         }
-        let accounting = trainer.batcher.accounting_by_task();
-        trainer.metrics.begin(epoch, trainer.progress.environment_steps, accounting);
-        tracing::info!("buffers take {}", trainer.memory());
+        tracing::info!("buffers take {}", trainer.memory(&service));
         Ok(trainer)
     }
 
-    /// Demonstrations and regression if the experiment wants them, then V-MPO, then a last checkpoint.
+    /// Demonstrations and regression if the experiment wants them, then training, then a last checkpoint.
     ///
     /// # Errors
-    /// When gradient steps go on being skipped after a return to the last good state, or the disk refuses.
+    /// When gradient steps are still skipped after the last good state was restored, or when the disk refuses.
     pub fn run(mut self) -> Result<Ending> {
-        let ending = match self.train().and_then(|ending| self.report_late().map(|_| ending)) {
+        let ending = match self.train().and_then(|ending| self.report_deferred().map(|_| ending)) {
             Ok(ending) => ending,
             Err(error) => {
-                // What was handed to the writer is still good.
-                let _ = self.writer.finish();
+                // What the writer was given is still good.
+                let _ = self.checkpoints.finish();
                 return Err(error);
             }
         };
         self.take_evaluations()?;
-        self.write_metrics()?;
-        self.checkpoint(true)?;
-        self.writer.finish()?;
+        self.state.progress.seconds = self.budget.seconds();
+        self.reports.write(&self.state.progress, self.batcher.accounting_by_task());
+        self.write_last_checkpoint()?;
+        self.checkpoints.finish()?;
         Ok(ending)
     }
 
     fn train(&mut self) -> Result<Ending> {
-        if !self.progress.warm_started && self.warm_start()?.is_none() {
+        if !self.state.progress.warm_started && !self.warm_start()? {
             return Ok(Ending::Stopped);
         }
-        match self.progress.version {
+        match self.state.progress.version {
             0 => self.publish(Behaviour::Policy)?,
-            _ => self.announce(Behaviour::Policy),
+            _ => self.versions.announce(&self.state, Behaviour::Policy),
         }
-        while !self.budget_used_up() {
+        while self.budget.used(&self.state.progress) < 1.0 {
             match self.next_batch()? {
-                Wait::Batch(batch) => self.learn(batch)?,
-                Wait::Nothing => {}
-                Wait::Closed => return Ok(Ending::Stopped),
+                Next::Batch(batch) => self.learn(batch)?,
+                Next::Elapsed => {}
+                Next::Closed => return Ok(Ending::Stopped),
             }
         }
         Ok(Ending::Budget)
@@ -209,227 +119,284 @@ impl Trainer {
     /// One batch: gradient steps on it, its accounting, and new parameters when they are due.
     fn learn(&mut self, batch: Batch) -> Result<()> {
         let began = Instant::now();
-        let _update = tracing::debug_span!("update", update = self.progress.updates + 1).entered();
-        let tensors = tracing::debug_span!("to_device").in_scope(|| self.tensors(&batch))?;
-        let unseen = self.normalises() && self.statistics.lacks(&batch.tasks());
-        if unseen || self.normalises_still() {
-            self.absorb(&batch);
-            self.set_normaliser()?;
-            if unseen {
-                // Numbers of any size would teach the networks nothing: a task's first batch only sets the scale.
-                // What was made before acts on another scale.
-                self.oldest = self.progress.version + 1;
-                self.publish(Behaviour::Policy)?;
-                self.batcher.discard(batch, Reason::Superseded);
-                return self.after_update();
-            }
+        let _update = tracing::debug_span!("update", update = self.state.progress.updates + 1).entered();
+        let tensors = tracing::debug_span!("to_device")
+            .in_scope(|| to_device(&batch, self.spec.tasks.len(), self.backend.device()))?;
+        if self.normalise_by(&batch)? {
+            return self.skip_batch(batch);
         }
-        self.schedule_learning_rate();
+        let losses = self.take_gradient_steps(tensors)?;
+        let publishes = (self.state.progress.updates + 1).is_multiple_of(self.experiment.vmpo.target_period);
+        let restored = self.report_when_ready(losses, publishes || self.checkpoints.is_due())?;
+        let version = self.state.progress.version;
+        self.state.progress.updates += 1;
+        self.reports.count_update(&batch, version);
+        let ages = batch.headers().iter().map(|header| version.saturating_sub(header.version)).collect();
+        // Before the batch's memory is free: actors that wait for it then continue with these parameters.
+        if restored || publishes {
+            self.publish(Behaviour::Policy)?;
+        } else {
+            self.versions.repeat(&mut self.state, Behaviour::Policy);
+        }
+        self.account(batch);
+        self.reports.count_duration(began.elapsed(), ages);
+        self.after_update()
+    }
+
+    /// Adds a batch to the statistics of the normaliser while that still learns them. Says whether the batch is the first
+    /// one of a task.
+    fn normalise_by(&mut self, batch: &Batch) -> Result<bool> {
+        let (wanted, seen) = (self.experiment.network.normaliser_steps as f64, self.state.statistics.rows());
+        let first = wanted > 0.0 && self.state.statistics.lacks(&batch.tasks());
+        if first || seen < wanted {
+            self.state.statistics.absorb(batch);
+            self.state.set_normaliser()?;
+        }
+        Ok(first)
+    }
+
+    /// The first batch of a task only sets the scale of its observations, because without it the networks would learn
+    /// nothing. Unrolls so far were made with another scale.
+    fn skip_batch(&mut self, batch: Batch) -> Result<()> {
+        self.versions.supersede(&self.state);
+        self.publish(Behaviour::Policy)?;
+        self.batcher.discard(batch, Reason::Superseded);
+        self.after_update()
+    }
+
+    /// The gradient steps on a batch, and the mean of their losses.
+    fn take_gradient_steps(&mut self, tensors: MinibatchTensors) -> Result<Option<Losses>> {
+        let optimiser = &self.experiment.optimiser;
+        let used = self.budget.used(&self.state.progress).min(1.0);
+        let decay = 1.0 - (1.0 - optimiser.final_learning_rate_share) * used;
+        self.state.algorithm.set_learning_rate(optimiser.learning_rate * decay);
         let mut losses = Vec::new();
-        for minibatch in self.minibatches(&tensors) {
+        for unrolls in draw(&self.experiment, &mut self.state.progress.random) {
+            let minibatch = tensors.select(&unrolls);
             if !losses.is_empty() {
                 self.backend.end_step()?;
             }
-            losses.push(tracing::debug_span!("gradient_step").in_scope(|| self.learner.step(&minibatch))?);
+            let step = tracing::debug_span!("gradient_step").in_scope(|| self.state.algorithm.step(&minibatch));
+            losses.push(step?);
         }
         let losses = Losses::mean(&losses);
         drop(tensors);
         self.backend.end_step()?;
-        let publishes = (self.progress.updates + 1).is_multiple_of(self.experiment.vmpo.target_period);
-        let restored = self.report_when_there(losses, publishes || self.checkpoint_is_due())?;
-        self.progress.updates += 1;
-        self.metrics.count_update();
-        self.metrics.absorb(batch.headers(), self.progress.version);
-        let ages = batch.headers().iter().map(|header| self.progress.version.saturating_sub(header.version)).collect();
-        // Published before the batch goes back: whoever waits for its room goes on with these parameters.
-        if restored || publishes {
-            self.publish(Behaviour::Policy)?;
-        } else {
-            self.keep_step(Behaviour::Policy);
-        }
-        self.book(batch);
-        self.shared.telemetry.count_update(began.elapsed(), ages);
-        self.after_update()
+        Ok(losses)
     }
 
-    /// Reports the losses of an update; those of a device that works by itself when the next update is on its way, so that
-    /// it never waits for somebody to read, or `at_once` where it is waited for anyway. Says whether they led back to the last
-    /// good state.
-    fn report_when_there(&mut self, losses: Option<Losses>, at_once: bool) -> Result<bool> {
-        self.shared.telemetry.count_compilations(self.backend.compilations()?);
-        let restored = self.report_late()?;
+    /// Gathers demonstrations, regresses on them, and writes the checkpoint `warm-started`. Returns false if the learner was
+    /// asked to stop before that; the next start then begins again.
+    fn warm_start(&mut self) -> Result<bool> {
+        let mut warm_start = WarmStart::new(&self.experiment, &self.spec);
+        self.publish(Behaviour::Demonstration)?;
+        tracing::info!(steps = self.experiment.warm_start.demonstration_steps, "gathering demonstrations");
+        while !warm_start.is_complete() {
+            match self.next_batch()? {
+                Next::Batch(batch) => self.gather(&mut warm_start, batch)?,
+                Next::Elapsed => {}
+                Next::Closed => return Ok(false),
+            }
+        }
+        if self.experiment.network.normaliser_steps > 0 {
+            self.state.set_normaliser()?;
+        }
+        // The state before this one has no scale of the observations, so it is of no use as a good one.
+        let good = self.snapshot()?;
+        self.checkpoints.set_good(good);
+        self.regress(&mut warm_start)
+    }
+
+    fn gather(&mut self, warm_start: &mut WarmStart, batch: Batch) -> Result<()> {
+        warm_start.gather(&batch, self.backend.device())?;
+        self.state.statistics.absorb(&batch);
+        self.reports.count_episodes(&batch, 0);
+        if !warm_start.is_complete() {
+            self.versions.repeat(&mut self.state, Behaviour::Demonstration);
+        }
+        self.account(batch);
+        Ok(())
+    }
+
+    fn regress(&mut self, warm_start: &mut WarmStart) -> Result<bool> {
+        let steps = self.experiment.warm_start.steps;
+        tracing::info!(steps, "regressing on them");
+        let mut step = 0;
+        // If the last step was skipped, more steps follow: a state that is not sound would not be published.
+        while step < steps || !self.is_sound() {
+            let State { algorithm, progress, .. } = &mut self.state;
+            algorithm.set_learning_rate(self.experiment.warm_start.learning_rate);
+            warm_start.regress(algorithm.as_mut(), &mut progress.random)?;
+            self.backend.end_step()?;
+            let reported = step.is_multiple_of(REPORTED_STEPS) || step + 1 >= steps;
+            if let Some(losses) = reported.then(|| warm_start.take_losses()).flatten() {
+                let losses = losses.to_values();
+                let (regression, latent_kl) = (losses.get("regression_loss"), losses.get("latent_kl"));
+                tracing::info!(step, regression, latent_kl, "regressing");
+                if self.report(&losses)? {
+                    step = 0;
+                    continue;
+                }
+            }
+            step += 1;
+            self.write_metrics_when_due()?;
+            if self.batcher.is_closed() {
+                return Ok(false);
+            }
+        }
+        self.state.algorithm.reset_optimiser();
+        self.state.progress.warm_started = true;
+        self.publish(Behaviour::Policy)?;
+        self.write_checkpoint_if_sound(Name::WarmStarted)?;
+        Ok(true)
+    }
+
+    fn next_batch(&mut self) -> Result<Next> {
+        let next = self.batcher.next_batch_within(PATIENCE);
+        self.write_metrics_when_due()?;
+        if matches!(next, Next::Batch(_)) {
+            self.budget.start();
+        }
+        Ok(next)
+    }
+
+    /// Counts a batch as trained on, and frees its memory.
+    fn account(&mut self, batch: Batch) {
+        self.state.progress.environment_steps += self.reports.count_rows(&batch);
+        self.batcher.trained(batch);
+    }
+
+    /// Publishes the online policy as the next version, if it is sound: actors that cannot act would send nothing that
+    /// shows the failure.
+    fn publish(&mut self, behaviour: Behaviour) -> Result<()> {
+        if self.is_sound() {
+            return self.versions.publish(&mut self.state, behaviour);
+        }
+        let update = self.state.progress.updates;
+        tracing::warn!(update, "not published: the last gradient steps were not finite");
+        self.versions.repeat(&mut self.state, behaviour);
+        Ok(())
+    }
+
+    /// Whether the parameters can be published and restored: every one is a number, and the last gradient step was taken.
+    fn is_sound(&self) -> bool {
+        !self.skipped_steps.last_was_skipped() && self.state.algorithm.is_finite()
+    }
+
+    /// Reports the losses of an update. An asynchronous device is not waited for: its losses are reported when the next
+    /// update is on its way, or `at_once` where the device is waited for anyway. Returns whether the last good state was
+    /// restored.
+    fn report_when_ready(&mut self, losses: Option<Losses>, at_once: bool) -> Result<bool> {
+        self.reports.count_compilations(self.backend.compilations()?);
+        let restored = self.report_deferred()?;
         match losses {
-            // Of the state that was left.
-            Some(losses) if restored => self.count_skipped(losses.to_values().skipped),
+            // They belong to the state that was left.
+            Some(losses) if restored => self.reports.count_skipped(losses.to_values().skipped),
             Some(losses) if at_once || !self.backend.is_asynchronous() => return self.report(&losses.to_values()),
-            losses => self.late = losses,
+            losses => self.reports.defer(losses),
         }
         Ok(restored)
     }
 
-    fn report_late(&mut self) -> Result<bool> {
-        match self.late.take() {
+    fn report_deferred(&mut self) -> Result<bool> {
+        match self.reports.take_deferred() {
             Some(losses) => self.report(&losses.to_values()),
             None => Ok(false),
         }
     }
-}
 
-/// What waiting for a batch led to.
-pub(crate) enum Wait {
-    Batch(Batch),
-    Nothing,
-    Closed,
-}
-
-impl Trainer {
-    pub(crate) fn next_batch(&mut self) -> Result<Wait> {
-        let next = self.batcher.next_batch_within(PATIENCE);
-        self.write_metrics_when_due()?;
-        Ok(match next {
-            Next::Batch(batch) => {
-                let seconds = self.progress.seconds;
-                self.clock.get_or_insert_with(|| (Instant::now(), seconds));
-                Wait::Batch(batch)
-            }
-            Next::Elapsed => Wait::Nothing,
-            Next::Closed => Wait::Closed,
-        })
+    /// Reports losses, and recovers from steps that were skipped. Returns whether the last good state was restored, which
+    /// has to be published then.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] when it was restored before and that did not help.
+    fn report(&mut self, losses: &LossValues) -> Result<bool> {
+        let update = self.state.progress.updates;
+        self.reports.count_skipped(losses.skipped);
+        let recovery = self.skipped_steps.count(losses, update);
+        match recovery {
+            Recovery::Continue => {}
+            Recovery::Restore => self.restore_last_good()?,
+            Recovery::GiveUp => return Err(Error::Diverged(format!("update {update}: {REMEDIES}"))),
+        }
+        self.reports.keep_losses(losses);
+        Ok(recovery == Recovery::Restore)
     }
 
-    /// Counts a batch's steps and diverged episodes, and gives its memory back.
-    pub(crate) fn book(&mut self, batch: Batch) {
-        for (rows, task) in self.metrics.count_rows(&batch).into_iter().zip(&self.spec.tasks) {
-            self.progress.environment_steps += rows.environment_steps;
-            self.shared.telemetry.count_rows(&task.name, rows);
-        }
-        let episodes = batch.headers().iter().flat_map(|header| &header.episodes);
-        for UnrollHeader { actor, incarnation, sequence, .. } in batch.headers() {
-            tracing::trace!(actor, incarnation = format_args!("{incarnation:016x}"), sequence, "trained on");
-        }
-        let diverged = episodes.filter(|episode| episode.end() == EpisodeEnd::Diverged).count();
-        self.shared.telemetry.episodes_diverged.inc_by(diverged as u64);
-        self.batcher.trained(batch);
-    }
-
-    /// Publishes the online policy as the next version: from now on it is the target network, with which actors act.
-    /// One that is not sound stays here: from actors that cannot act nothing comes that would show it.
-    pub(crate) fn publish(&mut self, behaviour: Behaviour) -> Result<()> {
-        if !self.is_sound() {
-            tracing::warn!(update = self.progress.updates, "not published: the last gradient steps were not finite");
-            self.keep_step(behaviour);
-            return Ok(());
-        }
-        let _publish = tracing::debug_span!("publish", version = self.progress.version + 1).entered();
-        self.target = Bytes::from(to_safetensors(self.learner.policy_store())?);
-        self.progress.version += 1;
-        self.announce(behaviour);
+    /// Continues with the parameters, moments and statistics of the last good state; the progress stays. Unrolls of earlier
+    /// versions are superseded, because they were made with the parameters that failed.
+    fn restore_last_good(&mut self) -> Result<()> {
+        self.state.restore_learned(self.checkpoints.good())?;
+        self.reports.count_restore();
+        self.versions.supersede(&self.state);
+        let update = self.state.progress.updates;
+        tracing::warn!(update, "too many gradient steps in a row were skipped: the last good state is restored");
         Ok(())
     }
 
-    /// In lockstep actors make one unroll of each environment with each version, so a batch that changes no parameters
-    /// they act with is answered by the same ones as another version.
-    pub(crate) fn keep_step(&mut self, behaviour: Behaviour) {
-        if self.experiment.unroll.lockstep {
-            self.progress.version += 1;
-            self.announce(behaviour);
-        }
-    }
-
-    /// Tells actors and batcher of the newest version, for instance after a restart.
-    fn announce(&self, behaviour: Behaviour) {
-        let version = self.progress.version;
-        self.batcher.set_phase(Phase { epoch: self.epoch, version, oldest: self.oldest, behaviour });
-        self.publisher.publish(version, behaviour, &self.target);
-    }
-
-    fn normalises(&self) -> bool {
-        self.experiment.network.normaliser_steps > 0
-    }
-
-    fn normalises_still(&self) -> bool {
-        self.statistics.rows() < self.experiment.network.normaliser_steps as f64
-    }
-
-    pub(crate) fn absorb(&mut self, batch: &Batch) {
-        self.statistics.absorb(batch);
-    }
-
-    pub(crate) fn set_normaliser(&mut self) -> Result<()> {
-        Ok(self.learner.set_normaliser(&self.statistics.to_normaliser()?)?)
-    }
-
-    pub(crate) fn seconds(&self) -> f64 {
-        self.clock.map_or(self.progress.seconds, |(start, before)| before + start.elapsed().as_secs_f64())
-    }
-
-    /// Assignment of the budget that is used up, by whichever limit is nearest.
-    fn share_used(&self) -> f64 {
-        let budget = &self.experiment.budget;
-        [
-            (self.seconds() / 60.0, budget.minutes),
-            (self.progress.environment_steps as f64, budget.environment_steps as f64),
-            (self.progress.updates as f64, budget.updates as f64),
-        ]
-        .into_iter()
-        .filter(|(_, limit)| *limit > 0.0)
-        .map(|(used, limit)| used / limit)
-        .fold(0.0, f64::max)
-    }
-
-    fn budget_used_up(&self) -> bool {
-        self.share_used() >= 1.0
-    }
-
-    fn schedule_learning_rate(&mut self) {
-        let optimiser = &self.experiment.optimiser;
-        let share = 1.0 - (1.0 - optimiser.final_learning_rate_share) * self.share_used().min(1.0);
-        self.learner.set_learning_rates(optimiser.learning_rate * share, optimiser.multiplier_learning_rate);
-    }
-
-    pub(crate) fn after_update(&mut self) -> Result<()> {
+    fn after_update(&mut self) -> Result<()> {
         self.write_metrics_when_due()?;
-        if self.checkpoint_is_due() { self.checkpoint(false) } else { Ok(()) }
-    }
-
-    fn checkpoint_is_due(&self) -> bool {
-        self.checkpointed.elapsed().as_secs_f64() >= self.experiment.learner.checkpoint_seconds
-    }
-
-    pub(crate) fn write_metrics_when_due(&mut self) -> Result<()> {
-        if self.metrics.elapsed() < self.experiment.learner.metrics_seconds {
+        // While the last one is still being written, training does not wait.
+        if !self.checkpoints.is_due() || self.checkpoints.is_busy() {
             return Ok(());
         }
-        // Otherwise they wait where they are, and training goes on.
-        if !self.writer.is_busy() {
+        self.write_checkpoint_if_sound(Name::Updates(self.state.progress.updates))
+    }
+
+    fn write_metrics_when_due(&mut self) -> Result<()> {
+        if !self.reports.are_due() {
+            return Ok(());
+        }
+        // While a checkpoint is being written, evaluations wait, and training does not.
+        if !self.checkpoints.is_busy() {
             self.take_evaluations()?;
         }
-        if self.metrics.has_news(&self.batcher.accounting_by_task()) { self.write_metrics() } else { Ok(()) }
+        self.state.progress.seconds = self.budget.seconds();
+        self.reports.write_news(&self.state.progress, self.batcher.accounting_by_task());
+        Ok(())
     }
 
-    /// Keeps what actors found out about checkpoints.
     fn take_evaluations(&self) -> Result<()> {
-        for evaluation in self.shared.take_evaluations() {
-            self.metrics.keep_evaluation(&evaluation);
-            if let Some(evaluated) = evaluation.evaluated() {
-                self.writer.judge(evaluated)?;
-            }
+        self.reports.take_evaluations().into_iter().try_for_each(|evaluated| self.checkpoints.judge(evaluated))
+    }
+
+    fn write_checkpoint_if_sound(&mut self, name: Name) -> Result<()> {
+        if self.is_sound() {
+            return self.write_checkpoint(name);
         }
+        tracing::warn!(checkpoint = %name, "not written: the last gradient steps were not finite");
         Ok(())
     }
 
-    fn write_metrics(&mut self) -> Result<()> {
-        let position = Position {
-            seconds: self.seconds(),
-            environment_steps: self.progress.environment_steps,
-            updates: self.progress.updates,
-            version: self.progress.version,
-            epoch: self.epoch,
-        };
-        let accounting = self.batcher.accounting_by_task();
-        let line = self.metrics.write(position, accounting, self.losses.clone());
-        tracing::info!(target: "metrics", "{line}");
-        self.shared.set_metrics(line);
-        Ok(())
+    /// A step that was skipped at the very end changed nothing, so finite parameters are enough.
+    fn write_last_checkpoint(&mut self) -> Result<()> {
+        let name = Name::Updates(self.state.progress.updates);
+        if self.state.algorithm.is_finite() {
+            self.write_checkpoint(name)
+        } else {
+            self.write_checkpoint_if_sound(name)
+        }
+    }
+
+    fn write_checkpoint(&mut self, name: Name) -> Result<()> {
+        let snapshot = self.snapshot()?;
+        self.checkpoints.write(name, snapshot)
+    }
+
+    fn snapshot(&mut self) -> Result<Snapshot> {
+        self.state.progress.seconds = self.budget.seconds();
+        self.state.snapshot(&self.experiment, &self.spec, &self.batcher.snapshot())
+    }
+
+    /// How much memory the learner's buffers can take, now that every size is known.
+    fn memory(&self, service: &TrainerHandle) -> Bounds {
+        Bounds::new(&Sizes {
+            ahead: self.experiment.unroll.ahead,
+            batch: self.experiment.unroll.batch,
+            unroll: self.batcher.layout().size(),
+            ingest: service.ingest(),
+            parameters: self.state.target.len(),
+            snapshot: self.checkpoints.good().parts.values().map(Vec::len).sum(),
+        })
     }
 }

@@ -1,20 +1,19 @@
 //! The warm start: regression towards the servo action on demonstrations that actors make.
 
-use std::sync::Arc;
-
-use anyhow::Result;
+use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::Field;
-use comic_proto::v1::Behaviour;
+use comic_replay::Batch;
 use rand::Rng;
 use rand::seq::index::sample;
+use tch::Device;
 
-use crate::algorithm::Algorithm as _;
+use crate::algorithm::Algorithm;
 use crate::algorithm::losses::Losses;
 use crate::algorithm::minibatch::MinibatchTensors;
-use crate::checkpoint::Name;
-use crate::train::trainer::{Trainer, Wait};
+use crate::error::Result;
+use crate::train::minibatches::masked_to_device;
 
-/// Which unrolls of a batch demonstrate something; the others are masked.
+/// Which unrolls of a batch are demonstrations; the others are masked.
 #[derive(Debug)]
 struct Demonstrated {
     unrolls: Vec<usize>,
@@ -39,8 +38,8 @@ impl Demonstrated {
         valid
     }
 
-    /// `count` different unrolls, or all there are: demonstrated ones at random, and masked ones where these are too few,
-    /// since each size that the mix of tasks made would have to be compiled.
+    /// `count` different unrolls, or all of them if there are fewer: random demonstrations, then masked unrolls. The masked
+    /// ones keep the size of a minibatch constant, because XLA compiles a program for every size.
     fn choose(&self, count: usize, random: &mut impl Rng) -> Vec<usize> {
         let places = sample(random, self.unrolls.len(), self.unrolls.len().min(count));
         let demonstrated = places.into_iter().filter_map(|place| self.unrolls.get(place));
@@ -49,100 +48,77 @@ impl Demonstrated {
 }
 
 /// A batch of the servo's rollouts.
+#[derive(Debug)]
 struct Demonstrations {
     tensors: MinibatchTensors,
     demonstrated: Demonstrated,
 }
 
-impl Trainer {
-    /// Gathers demonstrations, regresses on them, and leaves the checkpoint `warm-started`. `None` when the learner was
-    /// asked to stop meanwhile; the warm start then begins anew next time.
-    pub(crate) fn warm_start(&mut self) -> Result<Option<()>> {
-        self.publish(Behaviour::Demonstration)?;
-        tracing::info!(steps = self.experiment.warm_start.demonstration_steps, "gathering demonstrations");
-        let Some(mut demonstrations) = self.gather()? else { return Ok(None) };
-        if self.experiment.network.normaliser_steps > 0 {
-            self.set_normaliser()?;
+/// The demonstrations gathered so far, and the regression on them.
+#[derive(Debug)]
+pub(super) struct WarmStart {
+    batches: Vec<Demonstrations>,
+    /// Batches to gather.
+    wanted: usize,
+    /// Whether each task can be demonstrated.
+    demonstrated: Vec<bool>,
+    /// Unrolls in a regression step.
+    unrolls: usize,
+    unreported: Vec<Losses>,
+}
+
+impl WarmStart {
+    /// Nothing gathered yet.
+    pub(super) fn new(experiment: &Experiment, spec: &TaskSpec) -> Self {
+        let rows = (experiment.unroll.batch * experiment.unroll.length) as u64;
+        let config = &experiment.warm_start;
+        Self {
+            batches: Vec::new(),
+            wanted: config.demonstration_steps.div_ceil(rows).max(1) as usize,
+            demonstrated: spec.tasks.iter().map(|task| task.demonstrated).collect(),
+            unrolls: config.minibatch_unrolls,
+            unreported: Vec::new(),
         }
-        // Without the scale of the observations there would be no way on from the state before.
-        self.good = Arc::new(self.snapshot()?);
-        let config = self.experiment.warm_start.clone();
-        tracing::info!(steps = config.steps, "regressing on them");
-        let (mut unreported, mut step) = (Vec::new(), 0);
-        // A last step that was skipped is made up for: what is not sound would not be published.
-        while step < config.steps || !self.is_sound() {
-            self.learner.set_learning_rates(config.learning_rate, self.experiment.optimiser.multiplier_learning_rate);
-            unreported.push(self.regress(&mut demonstrations, config.minibatch_unrolls)?);
-            self.backend.end_step()?;
-            if (step % 50 == 0 || step + 1 >= config.steps)
-                && let Some(losses) = Losses::mean(&std::mem::take(&mut unreported))
-            {
-                let losses = losses.to_values();
-                tracing::info!(
-                    step,
-                    regression = losses.get("regression_loss"),
-                    latent_kl = losses.get("latent_kl"),
-                    "regressing"
-                );
-                if self.report(&losses)? {
-                    step = 0;
-                    continue;
-                }
-            }
-            step += 1;
-            self.write_metrics_when_due()?;
-            if self.batcher.is_closed() {
-                return Ok(None);
-            }
-        }
-        self.learner.reset_optimiser();
-        self.progress.warm_started = true;
-        self.publish(Behaviour::Policy)?;
-        self.keep(Name::WarmStarted)?;
-        Ok(Some(()))
     }
 
-    /// Batches of the servo's rollouts, of at least `demonstration_steps` rows in all.
-    fn gather(&mut self) -> Result<Option<Vec<Demonstrations>>> {
-        let unroll = &self.experiment.unroll;
-        let rows = (unroll.batch * unroll.length) as u64;
-        let wanted = self.experiment.warm_start.demonstration_steps.div_ceil(rows).max(1);
-        let mut demonstrations = Vec::new();
-        while (demonstrations.len() as u64) < wanted {
-            match self.next_batch()? {
-                Wait::Batch(batch) => {
-                    // What has no reference has nothing to demonstrate: holding still is no example.
-                    let demonstrated = Demonstrated::among(&batch.tasks(), |task| {
-                        self.spec.tasks.get(task).is_some_and(|task| task.demonstrated)
-                    });
-                    if !demonstrated.unrolls.is_empty() {
-                        let valid = demonstrated.mask(batch.f32(Field::Valid));
-                        let tensors = self.masked_tensors(&batch, &valid)?;
-                        demonstrations.push(Demonstrations { tensors, demonstrated });
-                    }
-                    self.absorb(&batch);
-                    self.metrics.absorb(batch.headers(), 0);
-                    if (demonstrations.len() as u64) < wanted {
-                        self.keep_step(Behaviour::Demonstration);
-                    }
-                    self.book(batch);
-                }
-                Wait::Nothing => {}
-                Wait::Closed => return Ok(None),
-            }
-        }
-        Ok(Some(demonstrations))
+    /// Whether there are as many demonstrations as the experiment wants.
+    pub(super) fn is_complete(&self) -> bool {
+        self.batches.len() >= self.wanted
     }
 
-    /// One step on some unrolls of one batch. The demonstrator has no latent, so z_{t−1} is this encoder's own: what it
-    /// gave when it last saw these unrolls.
-    fn regress(&mut self, demonstrations: &mut [Demonstrations], unrolls: usize) -> Result<Losses> {
-        let random = &mut self.progress.random;
-        let batch = &mut demonstrations[random.random_range(0..demonstrations.len())];
-        let chosen = batch.demonstrated.choose(unrolls, random);
-        let (losses, latents) = self.learner.regress(&batch.tensors.select(&chosen))?;
-        batch.tensors.refresh_previous_latent(&chosen, &latents);
-        Ok(losses)
+    /// Adds the demonstrations of a batch. A task without a reference has none: holding still is no example.
+    ///
+    /// # Errors
+    /// When the device refuses the batch.
+    pub(super) fn gather(&mut self, batch: &Batch, device: Device) -> Result<()> {
+        let is_demonstrated = |task: usize| self.demonstrated.get(task).copied().unwrap_or_default();
+        let demonstrated = Demonstrated::among(&batch.tasks(), is_demonstrated);
+        if !demonstrated.unrolls.is_empty() {
+            let valid = demonstrated.mask(batch.f32(Field::Valid));
+            let tensors = masked_to_device(batch, &valid, self.demonstrated.len(), device)?;
+            self.batches.push(Demonstrations { tensors, demonstrated });
+        }
+        Ok(())
+    }
+
+    /// One gradient step on some unrolls of one batch. The demonstrator has no latent, so z_{t−1} is the encoder's own: the
+    /// one it gave when these unrolls were last chosen.
+    ///
+    /// # Errors
+    /// When the batch does not fit the algorithm.
+    pub(super) fn regress(&mut self, algorithm: &mut dyn Algorithm, random: &mut impl Rng) -> Result<()> {
+        let index = random.random_range(0..self.batches.len());
+        let Demonstrations { tensors, demonstrated } = &mut self.batches[index];
+        let chosen = demonstrated.choose(self.unrolls, random);
+        let (losses, latents) = algorithm.regress(&tensors.select(&chosen))?;
+        tensors.refresh_previous_latent(&chosen, &latents);
+        self.unreported.push(losses);
+        Ok(())
+    }
+
+    /// The mean losses of the steps since the last time; `None` if there was no step.
+    pub(super) fn take_losses(&mut self) -> Option<Losses> {
+        Losses::mean(&std::mem::take(&mut self.unreported))
     }
 }
 

@@ -1,28 +1,27 @@
-//! Checkpoints are written by a thread of their own, so that training goes on. It alone changes the checkpoint directory
-//! while the trainer lives.
+//! Checkpoints are written by a separate thread, so that training continues. Only this thread changes the checkpoint
+//! directory while the trainer exists.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
-use anyhow::{Context as _, Result, anyhow};
-
 use crate::checkpoint::{Evaluated, Judgement, Name, Snapshot, Store};
+use crate::error::{Error, Result};
 use crate::observe::telemetry::Telemetry;
 
-/// What the thread is asked to do.
+/// A request to the thread.
 #[derive(Debug)]
 enum WriteRequest {
     Write(Name, Arc<Snapshot>),
     Judge(Evaluated),
 }
 
-/// The writing thread. At most one order waits behind the one being carried out.
+/// The writing thread. At most one request waits behind the one being carried out.
 #[derive(Debug)]
 pub struct Writer {
     queue: SyncSender<WriteRequest>,
-    /// Orders given and not yet carried out.
+    /// Requests that are not yet carried out.
     pending: Arc<AtomicUsize>,
     thread: JoinHandle<Result<()>>,
 }
@@ -39,47 +38,48 @@ impl Writer {
         let thread = std::thread::Builder::new()
             .name("checkpoints".into())
             .spawn(move || run_writer(&store, &received, &shared, &telemetry))
-            .context("cannot start the checkpoint thread")?;
+            .map_err(Error::system("cannot start the checkpoint thread"))?;
         Ok(Self { queue, pending, thread })
     }
 
-    /// Whether an order is still being carried out: until then another one may have to wait.
+    /// Whether a request is still being carried out: until then another one may have to wait.
     pub fn is_busy(&self) -> bool {
         self.pending.load(Ordering::Acquire) > 0
     }
 
-    /// Has `snapshot` written; waits while another order waits.
+    /// Requests that `snapshot` is written; waits while another request waits.
     ///
     /// # Errors
-    /// When the thread is gone.
+    /// When the thread has ended.
     pub fn write(&self, name: Name, snapshot: Arc<Snapshot>) -> Result<()> {
-        self.order(WriteRequest::Write(name, snapshot))
+        self.request(WriteRequest::Write(name, snapshot))
     }
 
-    /// Has the checkpoint that was evaluated kept if it is the best; waits while another order waits.
+    /// Requests that the evaluated checkpoint is kept if it is the best; waits while another request waits.
     ///
     /// # Errors
-    /// When the thread is gone.
+    /// When the thread has ended.
     pub fn judge(&self, evaluated: Evaluated) -> Result<()> {
-        self.order(WriteRequest::Judge(evaluated))
+        self.request(WriteRequest::Judge(evaluated))
     }
 
-    fn order(&self, order: WriteRequest) -> Result<()> {
+    fn request(&self, request: WriteRequest) -> Result<()> {
         self.pending.fetch_add(1, Ordering::AcqRel);
-        self.queue.send(order).map_err(|_| anyhow!("the checkpoint thread is gone"))
+        self.queue.send(request).map_err(|_| Error::Panicked("the checkpoint thread"))
     }
 
     /// Waits until everything is on disk.
     ///
     /// # Errors
-    /// When the last snapshot is not.
+    /// When the last snapshot could not be written.
     pub fn finish(self) -> Result<()> {
         drop(self.queue);
-        self.thread.join().map_err(|_| anyhow!("the checkpoint thread failed"))?
+        self.thread.join().map_err(|_| Error::Panicked("the checkpoint thread"))?
     }
 }
 
-/// A disk that refuses once may take the next one: training goes on, and the log says so. The last one counts.
+/// Carries out requests until the queue is closed. A write that fails is logged, and training continues, because the next one
+/// may succeed. The result is that of the last write.
 fn run_writer(
     store: &Store,
     queue: &Receiver<WriteRequest>,
@@ -87,13 +87,14 @@ fn run_writer(
     telemetry: &Telemetry,
 ) -> Result<()> {
     let mut last = Ok(());
-    while let Ok(order) = queue.recv() {
-        match order {
+    while let Ok(request) = queue.recv() {
+        match request {
             WriteRequest::Write(name, snapshot) => {
                 last = store.write(name, &snapshot).map(|path| tracing::info!(checkpoint = %path.display(), "written"));
                 telemetry.checkpoints.of(if last.is_ok() { "written" } else { "failed" }).inc();
                 if let Err(error) = &last {
-                    tracing::error!(checkpoint = %name, "checkpoint not written: {error:#}");
+                    let error = comic_proto::chain(error);
+                    tracing::error!(checkpoint = %name, "checkpoint not written: {error}");
                 }
             }
             WriteRequest::Judge(evaluated) => judge(store, evaluated),
@@ -111,8 +112,11 @@ fn judge(store: &Store, evaluated: Evaluated) {
         }
         Ok(Judgement::NotBetter) => {}
         Ok(Judgement::Gone) => {
-            tracing::warn!(epoch, updates, normalised_reward, "the checkpoint that was evaluated is not kept any more");
+            tracing::warn!(epoch, updates, normalised_reward, "the evaluated checkpoint does not exist any more");
         }
-        Err(error) => tracing::error!(normalised_reward, "the best checkpoint is not noted: {error:#}"),
+        Err(error) => {
+            let error = comic_proto::chain(&error);
+            tracing::error!(normalised_reward, "the best checkpoint is not recorded: {error}");
+        }
     }
 }

@@ -1,4 +1,4 @@
-//! The learner can be asked how it is, and told how good it is.
+//! The status of the learner, and the evaluations that actors report.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -8,12 +8,12 @@ use comic_proto::v1::{EvaluationReport, StatusRequest};
 use tonic::Code;
 
 #[tokio::test]
-async fn the_newest_metrics_are_what_is_answered() {
+async fn the_status_holds_the_newest_metrics() {
     let world = World::start().await;
     let mut client = world.client().await;
     let status = client.get_status(StatusRequest {}).await.unwrap().into_inner();
     assert_eq!((status.learner_epoch, status.metrics_json.as_str()), (EPOCH, "{}"));
-    world.shared.set_metrics(r#"{"updates": 7}"#.into());
+    world.service.trainer().set_metrics(r#"{"updates": 7}"#.into());
     let status = client.get_status(StatusRequest {}).await.unwrap().into_inner();
     assert_eq!(status.metrics_json, r#"{"updates": 7}"#);
 }
@@ -31,7 +31,7 @@ async fn reported_evaluations_wait_for_the_trainer_in_order_and_in_limited_numbe
     let expected: Vec<_> = (0..16)
         .map(|version| Evaluation { run: Some(RUN), epoch: EPOCH, version, updates: 7, json: "{}".into() })
         .collect();
-    assert_eq!(world.shared.take_evaluations(), expected);
+    assert_eq!(world.service.trainer().take_evaluations(), expected);
     assert!(client.report_evaluation(report(17)).await.is_ok());
 }
 
@@ -42,5 +42,5 @@ async fn a_report_that_is_no_json_is_refused() {
     let report = EvaluationReport { run: None, learner_epoch: EPOCH, version: 1, updates: 1, json };
     let refused = world.client().await.report_evaluation(report).await.unwrap_err();
     assert_eq!(refused.code(), Code::InvalidArgument);
-    assert!(world.shared.take_evaluations().is_empty());
+    assert!(world.service.trainer().take_evaluations().is_empty());
 }

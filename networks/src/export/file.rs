@@ -1,4 +1,4 @@
-//! Files, written and read.
+//! Writes and reads exported files.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -17,36 +17,37 @@ use crate::error::Error;
 use crate::parameters;
 use crate::policy::Policy;
 
-/// Where in the metadata the [`Spec`] stands.
+/// The key of the [`Spec`] in the metadata.
 pub const KEY: &str = "comic";
-/// Bytes that a file may have at most.
+/// Greatest length of a file, bytes.
 pub const LONGEST: u64 = 1 << 30;
 
-/// A policy, or a part of one, that is whole: every tensor its [`Spec`] asks for is there, and fit to be used.
+/// A complete policy or part of a policy: every tensor that its [`Spec`] describes exists and is valid.
 #[derive(Clone, Debug)]
 pub struct Exported {
-    /// What it is.
+    /// The description.
     pub spec: Spec,
-    /// Its experiment.
+    /// The experiment of the description.
     pub experiment: Experiment,
-    /// The file: safetensors, with the specification in its metadata.
+    /// The content of the file: safetensors, with the description in the metadata.
     pub bytes: Vec<u8>,
 }
 
 impl Exported {
-    /// Takes a part out of a checkpoint: its experiment and the parameters of its policy (safetensors).
+    /// Extracts a part of a checkpoint, given the checkpoint's experiment and the parameters of its policy
+    /// (safetensors).
     ///
     /// # Errors
-    /// A task that the experiment does not have, or parameters that are not its own.
+    /// [`Error`], if the experiment does not have the task, or the parameters are not those of the experiment.
     pub fn new(part: Part, experiment: &Experiment, source: Source, policy: &[u8]) -> Result<Self, Error> {
         let own = part.of(experiment)?;
         let sizes = task_spec(&own)?;
-        let place = experiment.tasks().iter().position(|(task, _)| Some(*task) == part.task());
+        let index = experiment.tasks().iter().position(|(task, _)| Some(*task) == part.task());
         let document = SafeTensors::deserialize(policy)?;
         let mut views = Vec::new();
         for (name, view) in document.tensors().into_iter().filter(|(name, _)| part.holds(name)) {
-            let view = match place {
-                Some(place) if name.starts_with("normaliser.task_") => row(&view, place, sizes.task)?,
+            let view = match index {
+                Some(index) if name.starts_with("normaliser.task_") => row(&view, index, sizes.task)?,
                 _ => view,
             };
             views.push((name, view));
@@ -54,14 +55,14 @@ impl Exported {
         let spec = Spec::new(part, &own, source)?;
         let text = serde_json::to_string(&spec)
             .map_err(|error| Error::Metadata { field: KEY.into(), problem: format!("cannot be written: {error}") })?;
-        // Read as anybody will read it: what could not be used is not given out.
+        // Reading checks the result in the same way as for every reader.
         Self::read(safetensors::serialize(views, Some(HashMap::from([(KEY.to_string(), text)])))?)
     }
 
-    /// Reads a file, which may come from anywhere.
+    /// Reads a file. The file may come from anywhere.
     ///
     /// # Errors
-    /// What is wrong with it, and what helps.
+    /// [`Error`]: what is wrong with the file, and what to do.
     pub fn open(path: &Path) -> Result<Self, Error> {
         let mut bytes = Vec::new();
         File::open(path).and_then(|file| file.take(LONGEST + 1).read_to_end(&mut bytes)).map_err(Error::File)?;
@@ -71,7 +72,7 @@ impl Exported {
         Self::read(bytes)
     }
 
-    /// Reads a file that is in memory.
+    /// Reads a file from its bytes.
     ///
     /// # Errors
     /// As [`Exported::open`].
@@ -87,7 +88,7 @@ impl Exported {
         let found: u64 = counted.map(|(_, info)| info.shape.iter().map(|size| *size as u64).product::<u64>()).sum();
         if expected != found {
             let problem =
-                format!("describes networks of {expected} weights where the file holds {found}: export it anew");
+                format!("describes networks of {expected} weights, but the file has {found}: export the policy again");
             return Err(wrong("experiment", problem));
         }
         let exported = Self { spec, experiment, bytes };
@@ -95,17 +96,17 @@ impl Exported {
         Ok(exported)
     }
 
-    /// Sets the parameters in `store` that this part is about, by their names; all others stay as they are.
+    /// Sets the parameters of this part in `store` by their names. All other parameters stay unchanged.
     ///
     /// # Errors
-    /// Parameters of other names or shapes: `store` is untouched then.
+    /// [`Error`], if names or shapes differ; then `store` is unchanged.
     pub fn load(&self, store: &nn::VarStore) -> Result<(), Error> {
         let mut variables = store.variables();
         variables.retain(|name, _| self.spec.part.holds(name));
         parameters::set(&variables, &self.bytes)
     }
 
-    /// Freshly initialised networks of its experiment.
+    /// New networks of the experiment.
     pub(super) fn policy(&self, sizes: &TaskSpec) -> Result<(nn::VarStore, Policy), Error> {
         let store = nn::VarStore::new(Device::Cpu);
         let policy = Policy::new(&store.root(), sizes, &self.experiment.network, &vec![0.0; sizes.action])?;
@@ -113,29 +114,29 @@ impl Exported {
     }
 }
 
-/// The last `width` entries of one row of a matrix `[tasks, X]`, as a matrix of its own.
-fn row<'a>(view: &TensorView<'a>, place: usize, width: usize) -> Result<TensorView<'a>, Error> {
+/// The last `width` entries of row `index` of a matrix `[tasks, X]`, as a matrix `[1, width]`.
+fn row<'a>(view: &TensorView<'a>, index: usize, width: usize) -> Result<TensorView<'a>, Error> {
     let size = size_of::<f32>();
     let longest = view.shape().last().copied().unwrap_or(0);
-    let end = (place + 1) * longest * size;
+    let end = (index + 1) * longest * size;
     let data = view.data().get(end.saturating_sub(width * size)..end).filter(|_| width <= longest);
     let data = data.ok_or_else(|| wrong("normaliser.task_mean", "has no row of this task in the checkpoint"))?;
     Ok(TensorView::new(view.dtype(), vec![1, width], data)?)
 }
 
 fn parse(text: &str) -> Result<Spec, Error> {
-    let malformed = |error: serde_json::Error| wrong(KEY, format!("is not what it should be: {error}"));
+    let malformed = |error: serde_json::Error| wrong(KEY, format!("is not a valid description: {error}"));
     let value: serde_json::Value = serde_json::from_str(text).map_err(malformed)?;
-    // First of all, since another format has other fields.
+    // The format is checked first, because another format has other fields.
     if value["format"] != FORMAT {
-        let problem = format!("is {} where this program reads {FORMAT}: export it anew", value["format"]);
+        let problem = format!("is {}, but this program reads {FORMAT}: export the policy again", value["format"]);
         return Err(wrong("format", problem));
     }
     serde_json::from_value(value).map_err(malformed)
 }
 
-/// What the file says of itself is what this program makes of its experiment: one whose observations are in another
-/// order is refused, not misread.
+/// Checks that the description is the one that this program makes for the experiment. So a file whose observations are
+/// in another order is refused and not misread.
 fn agree(spec: &Spec, experiment: &Experiment) -> Result<(), Error> {
     let own = spec.part.of(experiment)?;
     let made = Spec::new(spec.part, &own, spec.source.clone())?;
@@ -146,7 +147,9 @@ fn agree(spec: &Spec, experiment: &Experiment) -> Result<(), Error> {
         ("normalisation", spec.normalisation == made.normalisation),
     ];
     match fields.into_iter().find(|(_, same)| !same) {
-        Some((field, _)) => Err(wrong(field, "is not what this release makes of it: export it anew with this release")),
+        Some((field, _)) => {
+            Err(wrong(field, "differs from what this release writes: export the policy again with this release"))
+        }
         None => Ok(()),
     }
 }

@@ -1,24 +1,25 @@
-//! What a file holds.
+//! The content of an exported file.
 
 use comic_experiment::{Experiment, TaskName};
 use serde::{Deserialize, Serialize};
 
 use crate::error::Error;
 
-/// What a file holds: as the command line and the file write it, `policy`, `policy:TASK`, `encoder:TASK` or `low-level`.
+/// The content of an exported file. Command line and file write it as `policy`, `policy:TASK`, `encoder:TASK` or
+/// `low-level`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Part {
-    /// Everything that acts, of all tasks or of one.
+    /// The whole policy, of all tasks or of one.
     Policy(Option<TaskName>),
-    /// One task's encoder, with the statistics that normalise its inputs.
+    /// The encoder of one task, the image encoder, and the statistics that normalise their inputs.
     Encoder(TaskName),
     /// The low level, with the statistics that normalise proprioception.
     LowLevel,
 }
 
 impl Part {
-    /// The task it is limited to.
+    /// The task of the part; `None` for a part of all tasks.
     pub fn task(self) -> Option<TaskName> {
         match self {
             Self::Policy(task) => task,
@@ -27,7 +28,7 @@ impl Part {
         }
     }
 
-    /// Whether a parameter of this name, as checkpoints have it, belongs to it.
+    /// Whether the parameter with this name in a checkpoint belongs to the part.
     pub(crate) fn holds(self, name: &str) -> bool {
         let of = |task: TaskName| name.strip_prefix("encoder.").and_then(|rest| rest.strip_prefix(task.name()));
         let encodes = |task| of(task).is_some_and(|rest| rest.starts_with('.'));
@@ -41,10 +42,10 @@ impl Part {
         }
     }
 
-    /// The experiment as far as this part goes: a part of one task knows of no other.
+    /// The experiment of this part. For a part of one task, it is the experiment with only that task.
     ///
     /// # Errors
-    /// [`Error::NoTask`] when the experiment has no such task.
+    /// [`Error::NoTask`] if the experiment has no such task.
     pub(crate) fn of(self, experiment: &Experiment) -> Result<Experiment, Error> {
         let Some(task) = self.task() else { return Ok(experiment.clone()) };
         let tasks: Vec<TaskName> = experiment.tasks().into_iter().map(|(task, _)| task).collect();
@@ -100,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn parts_are_read_as_they_are_written() {
+    fn a_part_is_read_in_the_form_that_is_written() {
         for text in ["policy", "policy:get-up", "encoder:tracking", "low-level"] {
             assert_eq!(text.parse::<Part>().unwrap().to_string(), text);
         }
@@ -110,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_holds_its_own_parameters_alone() {
+    fn a_part_holds_only_its_own_parameters() {
         let names = [
             "encoder.tracking.head.bias",
             "encoder.get-up.head.bias",

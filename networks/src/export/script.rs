@@ -1,4 +1,4 @@
-//! The same policy as TorchScript.
+//! Writes a policy as TorchScript.
 
 use std::fs::OpenOptions;
 use std::io::Write as _;
@@ -17,12 +17,13 @@ use crate::policy::Policy;
 use crate::routing::Routing;
 
 impl Exported {
-    /// Writes the policy of one task as TorchScript to `path`: a module whose `forward` takes the inputs of the
-    /// [`Spec`](super::spec::Spec), `[1, size]` each, an image last, and gives the outputs side by side, `[1, A + M]`. The
-    /// specification lies in it as the extra file `comic.json`.
+    /// Writes the policy of one task as TorchScript to `path`. The method `forward` of the module takes the inputs of
+    /// the [`Spec`](super::spec::Spec), `[1, size]` each, with an image last. It returns the outputs in one tensor `[1,
+    /// A + M]`, where M is the size of the recurrent state. The module has the description as the extra file
+    /// `comic.json`.
     ///
     /// # Errors
-    /// [`Error::Script`] for anything but a policy of one task; what libtorch or the disk refuses.
+    /// [`Error::Script`] if the part is not a policy of one task; [`Error::Torch`]; [`Error::File`].
     pub fn save_script(&self, path: &Path) -> Result<(), Error> {
         let sizes = task_spec(&self.experiment)?;
         if !matches!(self.spec.part, Part::Policy(_)) || sizes.tasks.len() != 1 {
@@ -31,7 +32,7 @@ impl Exported {
         }
         let (mut store, policy) = self.policy(&sizes)?;
         self.load(&store)?;
-        // What needs a gradient cannot be a constant of a trace.
+        // A tensor that requires a gradient cannot be a constant of a trace.
         store.freeze();
         let network = &self.experiment.network;
         let (latent, state) = (network.latent.size as i64, network.state_size() as i64);
@@ -47,7 +48,8 @@ impl Exported {
         self.enclose(path).map_err(Error::File)
     }
 
-    /// PyTorch looks for extra files in a directory `extra` of the archive; libtorch's own writer takes none from here.
+    /// Adds the description to the archive. PyTorch reads extra files from its directory `extra`; the function of tch
+    /// that saves a module cannot write extra files.
     fn enclose(&self, path: &Path) -> std::io::Result<()> {
         let mut file = OpenOptions::new().read(true).write(true).open(path)?;
         let first = ZipArchive::new(&mut file)?.by_index(0)?.name().to_string();
@@ -60,7 +62,7 @@ impl Exported {
     }
 }
 
-/// One step without noise: the action within its bounds, and what is remembered.
+/// One step without noise: the action within its bounds, the latent, and the state.
 fn step(policy: &Policy, inputs: &[Tensor], latent: i64, state: i64) -> Tensor {
     let observation = policy.normalise(&inputs[0], &inputs[1], inputs.get(3), &Routing::single());
     let previous = inputs[2].narrow(1, 0, latent);

@@ -1,4 +1,4 @@
-//! What a file says of itself.
+//! The description in an exported file.
 
 use comic_experiment::{Experiment, PROPRIOCEPTION, TaskSpec};
 use serde::{Deserialize, Serialize};
@@ -7,67 +7,68 @@ use super::part::Part;
 use crate::error::Error;
 use crate::normaliser::NORMALISED_LIMIT;
 
-/// The form of files that this program writes and reads: another one whenever the same tensors come to mean something
-/// else, as in an encoder that reads its inputs in another order.
+/// Version of the file format. It changes when the same tensors get another meaning, for example if an encoder reads
+/// its inputs in another order.
 pub const FORMAT: u32 = 1;
 
-/// What a file holds, takes and gives, and where it comes from.
+/// The content of a file, its inputs and outputs, and its source.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Spec {
-    /// [`FORMAT`].
+    /// Version of the format, [`FORMAT`].
     pub format: u32,
-    /// What the file holds.
+    /// The content of the file.
     pub part: Part,
-    /// What it takes, in order.
+    /// The inputs, in order.
     pub inputs: Vec<Vector>,
-    /// What it gives, in order.
+    /// The outputs, in order.
     pub outputs: Vec<Vector>,
-    /// What happens to observations first.
+    /// The normalisation of the observations.
     pub normalisation: Normalisation,
-    /// Where it comes from.
+    /// The run and the checkpoint.
     pub source: Source,
-    /// The resolved experiment (TOML); of a part of one task, as if there had been no other.
+    /// The resolved experiment (TOML). For a part of one task, it has only that task.
     pub experiment: String,
 }
 
-/// An input or output: a row of so many numbers.
+/// An input or output: a row of numbers.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Vector {
-    /// Its name; a task's observation is `observation:TASK`.
+    /// Its name. The name of a task observation is `observation:TASK`.
     pub name: String,
-    /// How many numbers it has.
+    /// Number of entries.
     pub size: usize,
-    /// What they are.
+    /// What the numbers are.
     pub meaning: String,
-    /// What it is made of, in order, where that has names.
+    /// Its named parts in order; empty if the parts have no names.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub entries: Vec<Entry>,
 }
 
-/// A named stretch of a vector; observations have dm_control's names without `walker/`.
+/// A named part of a vector. Parts of observations have dm_control's names without `walker/`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Entry {
     /// Its name.
     pub name: String,
-    /// How many numbers it has.
+    /// Number of entries.
     pub size: usize,
 }
 
-/// Proprioception and task observations o become (o − mean) / std within ±limit, with the tensors
-/// `normaliser.proprioception_mean`, `…_std` and, a row for each task, `normaliser.task_mean`, `…_std`.
+/// The normalisation of proprioception and task observations: o becomes (o − mean) / std, clamped to ±limit. The
+/// tensors are `normaliser.proprioception_mean` and `…_std`, and `normaliser.task_mean` and `…_std` with a row for each
+/// task.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Normalisation {
-    /// Off, observations are taken as they are.
+    /// False if observations are not normalised.
     pub active: bool,
-    /// Standard deviations beyond which nothing is told apart.
+    /// Limit of normalised observations, standard deviations.
     pub limit: f64,
 }
 
-/// Where a file comes from.
+/// The run and the checkpoint that a file comes from.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Source {
@@ -77,20 +78,20 @@ pub struct Source {
     pub run: String,
     /// The checkpoint's name.
     pub checkpoint: String,
-    /// Updates until then.
+    /// Updates up to the checkpoint.
     pub updates: u64,
-    /// Environment steps until then.
+    /// Environment steps up to the checkpoint.
     pub environment_steps: u64,
-    /// The life of the learner, without which the version means nothing.
+    /// The learner epoch; versions are numbered within one epoch.
     pub epoch: u64,
-    /// The newest parameters that were published.
+    /// The newest published version of the parameters.
     pub version: u64,
     /// The experiment's seed.
     pub seed: u64,
 }
 
 impl Spec {
-    /// Describes a part of an `experiment` that knows of no task beyond it.
+    /// The description of a part, for an `experiment` that has only the tasks of the part.
     ///
     /// # Errors
     /// [`Error::Experiment`].
@@ -114,13 +115,16 @@ impl Spec {
     }
 }
 
-/// Sizes of the experiment's tasks; which clips there are is no matter of a policy.
+/// The sizes of the experiment's tasks. A policy does not depend on the clips.
 pub(super) fn task_spec(experiment: &Experiment) -> Result<TaskSpec, Error> {
     TaskSpec::new(experiment, Vec::new()).map_err(no_observation)
 }
 
 fn no_observation(name: String) -> Error {
-    Error::Metadata { field: "experiment".into(), problem: format!("names no observation of tracking: `{name}`") }
+    Error::Metadata {
+        field: "experiment".into(),
+        problem: format!("names an observation that tracking does not have: `{name}`"),
+    }
 }
 
 impl Vector {
@@ -137,18 +141,18 @@ impl Vector {
 
 fn proprioception() -> Vector {
     let entries = PROPRIOCEPTION.map(|(name, size)| (name.to_string(), size));
-    Vector::of("proprioception", entries, "what the body feels: rad, m, s; joints in control order")
+    Vector::of("proprioception", entries, "state of the body: rad, m, s; joints in control order")
 }
 
-/// What the tasks show, and what is seen.
+/// The task observations, and the camera image.
 fn observations(experiment: &Experiment, sizes: &TaskSpec) -> Result<Vec<Vector>, Error> {
     let mut vectors = Vec::new();
     for (task, _) in experiment.tasks() {
         let entries = experiment.observations(task).map_err(no_observation)?;
-        vectors.push(Vector::of(format!("observation:{task}"), entries, "what the task shows"));
+        vectors.push(Vector::of(format!("observation:{task}"), entries, "task observation"));
     }
     if sizes.image > 0 {
-        let meaning = "uint8: 64 rows of 64 pixels of red, green and blue, as the egocentric camera sees";
+        let meaning = "uint8: 64 rows of 64 pixels of red, green and blue, from the egocentric camera";
         vectors.push(Vector::plain("image", sizes.image, meaning));
     }
     Ok(vectors)
@@ -159,26 +163,27 @@ fn policy(experiment: &Experiment, sizes: &TaskSpec) -> Result<(Vec<Vector>, Vec
     let recurrent = || {
         let entries = [("latent", network.latent.size), ("state", network.state_size())];
         let entries = entries.map(|(name, size)| (name.to_string(), size));
-        Vector::of("recurrent_state", entries, "what the step before gave; zeros at an episode's first step")
+        Vector::of("recurrent_state", entries, "output of the previous step; zeros at the first step of an episode")
     };
     let mut inputs = vec![proprioception()];
     inputs.extend(observations(experiment, sizes)?);
     inputs.push(recurrent());
-    let meaning = "without noise: the mean, of a mixture its likeliest component's; within [-1, 1], in control order";
+    let meaning =
+        "without noise: the mean, or the mean of a mixture's most likely component; within [-1, 1], in control order";
     Ok((inputs, vec![Vector::plain("action", sizes.action, meaning), recurrent()]))
 }
 
 fn encoder(experiment: &Experiment, sizes: &TaskSpec) -> Result<(Vec<Vector>, Vec<Vector>), Error> {
     let network = &experiment.network;
     let latent = network.latent.size;
-    let previous = Vector::plain("previous_latent", latent, "zeros at an episode's first step");
+    let previous = Vector::plain("previous_latent", latent, "zeros at the first step of an episode");
     let mut inputs = observations(experiment, sizes)?;
     inputs.extend([proprioception(), previous]);
     let outputs = match latent {
-        0 => vec![Vector::plain("weights", network.primitives.count, "the primitives' weights, before the gate")],
+        0 => vec![Vector::plain("weights", network.primitives.count, "weights of the primitives, before the gate")],
         latent => vec![
-            Vector::plain("latent_mean", latent, "the latent is a diagonal Gaussian's"),
-            Vector::plain("latent_std", latent, "softplus of what the last layer gives, and a floor"),
+            Vector::plain("latent_mean", latent, "mean of the diagonal Gaussian of the latent"),
+            Vector::plain("latent_std", latent, "standard deviation of the latent"),
         ],
     };
     Ok((inputs, outputs))
@@ -187,18 +192,19 @@ fn encoder(experiment: &Experiment, sizes: &TaskSpec) -> Result<(Vec<Vector>, Ve
 fn low_level(experiment: &Experiment, sizes: &TaskSpec) -> (Vec<Vector>, Vec<Vector>) {
     let network = &experiment.network;
     let intent = match network.latent.size {
-        0 => Vector::plain("weights", network.primitives.count, "the primitives' weights, before the gate"),
-        latent => Vector::plain("latent", latent, "what is to be done"),
+        0 => Vector::plain("weights", network.primitives.count, "weights of the primitives, before the gate"),
+        latent => Vector::plain("latent", latent, "output of the encoder"),
     };
-    let state = || Vector::plain("state", network.state_size(), "what is remembered; zeros at an episode's first step");
+    let state =
+        || Vector::plain("state", network.state_size(), "recurrent state; zeros at the first step of an episode");
     let components = network.components();
     let actions = components * sizes.action;
     let mut outputs = vec![
-        Vector::plain("mean", actions, "of each component; in control order"),
-        Vector::plain("std", actions, "of each component"),
+        Vector::plain("mean", actions, "mean of each component; in control order"),
+        Vector::plain("std", actions, "standard deviation of each component"),
     ];
     if components > 1 {
-        outputs.push(Vector::plain("log_weights", components, "logarithms of the components' weights"));
+        outputs.push(Vector::plain("log_weights", components, "logarithms of the weights of the components"));
     }
     outputs.push(state());
     (vec![intent, proprioception(), state()], outputs)

@@ -1,12 +1,12 @@
-//! How many weights an experiment's networks have, before they are built.
+//! The number of weights of an experiment's networks, without building them.
 
 use comic_experiment::{Network, TaskSpec};
 
 use super::part::Part;
 use crate::low_level::{Layer, Sizes, low_level_layers};
 
-/// Entries of the matrices of encoders and low level, as far as `part` goes. Whoever reads a file compares it with what
-/// the file holds: an experiment in a file of a thousand numbers must not make networks of a billion.
+/// Number of entries of the matrices of encoders and low level in `part`. A reader compares it with the content of a
+/// file, so that a small file cannot describe networks that need huge memory.
 pub(super) fn count(part: Part, spec: &TaskSpec, network: &Network) -> u64 {
     let encoders = || spec.tasks.iter().map(|task| encoder(spec, task.observation, network)).sum();
     match part {
@@ -22,7 +22,7 @@ pub(super) fn is_counted(name: &str, shape: &[usize]) -> bool {
     matrix && (name.starts_with("encoder.") || name.starts_with("low_level."))
 }
 
-/// Weights of hidden layers, and the width of the last one.
+/// The number of weights of hidden layers, and the width of the last layer.
 fn hidden(input: u64, sizes: &[usize]) -> (u64, u64) {
     sizes.iter().fold((0, input), |(weights, width), size| (weights + width * *size as u64, *size as u64))
 }

@@ -1,4 +1,4 @@
-//! What every low level takes and gives.
+//! The interface of all low levels.
 
 use std::fmt::Debug;
 
@@ -8,38 +8,38 @@ use tch::Tensor;
 use crate::action::ActionDistribution;
 use crate::lstm::RecurrentState;
 
-/// π(a_t | s_t, z_t, what was before).
+/// π(a_t | s_t, z_t, h_t), where h_t is the recurrent state, if any.
 pub(crate) trait LowLevel: Debug + Send {
-    /// Acts on B·T rows.
+    /// The distribution of actions for N = B·T rows.
     fn act(&self, input: &Input<'_>) -> Output;
 }
 
-/// What a low level sees; N = B·T rows, unroll by unroll.
+/// The input of a low level: N = B·T rows, unroll by unroll.
 pub(crate) struct Input<'a> {
-    /// z_t, `[N, Z]`; without a bottleneck what the encoder gives in its place, `[N, K]`.
+    /// z_t, `[N, Z]`; without a bottleneck the encoder's logits of the K weights, `[N, K]`.
     pub(crate) intent: &'a Tensor,
-    /// s_t, `[N, P]`.
+    /// s_t, `[N, P]`, normalised.
     pub(crate) proprioception: &'a Tensor,
-    /// What was before.
+    /// The recurrent state before the first row of each unroll.
     pub(crate) recurrent: RecurrentState<'a>,
 }
 
-/// What a low level does.
+/// The output of a low level.
 pub(crate) struct Output {
-    /// Over N rows.
+    /// π(a_t | …), over N rows.
     pub(crate) action: ActionDistribution,
-    /// What is remembered after each unroll's last row, `[B, S]`.
+    /// The recurrent state after the last row of each unroll, `[B, S]`.
     pub(crate) state: Tensor,
 }
 
-/// Sizes and starting points that every low level is made with.
+/// Sizes and initial values of a low level.
 pub(crate) struct Config<'a> {
-    /// Z.
+    /// Z, the size of the latent.
     pub(crate) latent: i64,
-    /// P.
+    /// P, the size of proprioception.
     pub(crate) proprioception: i64,
-    /// Where the action's mean starts, `[A]`.
+    /// Initial mean of the action, `[A]`.
     pub(crate) pose: &'a [f32],
-    /// The experiment's section.
+    /// The section `network` of the experiment.
     pub(crate) network: &'a Network,
 }

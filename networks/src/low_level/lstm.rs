@@ -24,7 +24,7 @@ impl LstmLowLevel {
     }
 }
 
-/// As they are made in [`LstmLowLevel::new`].
+/// The layers that [`LstmLowLevel::new`] makes.
 pub(super) fn layers(sizes: &Sizes<'_>) -> Vec<Layer> {
     let units = &sizes.network.lstm.units;
     let inputs = std::iter::once(sizes.joined()).chain(units.iter().copied());

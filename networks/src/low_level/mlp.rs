@@ -7,8 +7,8 @@ use super::size::{Layer, Sizes};
 use crate::action::ActionDistribution;
 use crate::layers::{GaussianHead, GaussianHeadConfig, Torso};
 
-/// `[z, s]` → torso → mean and σ (S: 2×1024). The mean's bias starts at the pose, σ at `initial_std`; the head's weights
-/// are scaled by `policy_head_scale`.
+/// `[z, s]` → torso (S: 2×1024) → mean and σ. The initial bias of the mean is the pose, the initial σ is `initial_std`,
+/// and the initial weights of the head are scaled by `policy_head_scale`.
 #[derive(Debug)]
 pub(crate) struct MlpLowLevel {
     torso: Torso,
@@ -24,7 +24,7 @@ impl MlpLowLevel {
     }
 }
 
-/// As they are made in [`MlpLowLevel::new`].
+/// The layers that [`MlpLowLevel::new`] makes.
 pub(super) fn layers(sizes: &Sizes<'_>) -> Vec<Layer> {
     Layer::stack(sizes.joined(), &[&sizes.network.mlp.hidden[..], &[sizes.head()]].concat())
 }

@@ -1,4 +1,4 @@
-//! What mixture and product are made of.
+//! The parts of mixture and product: primitives and gate.
 
 use tch::{Tensor, nn};
 
@@ -7,23 +7,23 @@ use super::size::{Layer, Sizes};
 use crate::gaussian::DiagonalGaussian;
 use crate::layers::{Torso, inverse_softplus, linear};
 
-/// The outermost fixed bias of a primitive's mean (S).
+/// Largest fixed bias of a primitive's mean (S).
 const LARGEST_BIAS: f64 = 0.66;
 
-/// K Gaussians over actions, made of proprioception alone: a shared torso (S: 2×512), then a hidden layer (S: 256) and
-/// a head for each.
+/// K Gaussians over actions that depend only on proprioception: a shared torso (S: 2×512), then a hidden layer (S: 256)
+/// and a head for each primitive.
 ///
-/// The heads start like [the MLP's](super::mlp), with σ at the `initial_std` given.
+/// The heads have the same initial values as the MLP's head, with the given `initial_std`.
 #[derive(Debug)]
 pub(crate) struct Primitives {
     torso: Torso,
-    /// Every primitive's hidden layer, side by side.
+    /// The hidden layers of all primitives as one layer, `[K·hidden]`.
     hidden: nn::Linear,
     /// `[K, hidden, 2·A]`.
     heads: Tensor,
     /// `[K, 1, 2·A]`.
     head_biases: Tensor,
-    /// What is added to every dimension of each primitive's mean, K numbers, and not trained.
+    /// K numbers that are not trained. Each is added to every dimension of one primitive's mean.
     fixed_biases: Option<Vec<f32>>,
     count: i64,
     min_std: f64,
@@ -48,10 +48,10 @@ impl Primitives {
         Self { torso, hidden, heads, head_biases, fixed_biases, count, min_std: network.min_std }
     }
 
-    /// `[N, P]` to Gaussians over `[N, K, A]`.
+    /// From `[N, P]` to Gaussians `[N, K, A]`.
     pub(crate) fn forward(&self, proprioception: &Tensor) -> DiagonalGaussian {
         let hidden = self.torso.forward(proprioception).apply(&self.hidden).elu_();
-        // [K, N, units], so that each primitive's head is one product.
+        // [K, N, units]: the heads are one batched product.
         let hidden = hidden.unflatten(-1, [self.count, -1]).transpose(0, 1);
         let output = self.head_biases.baddbmm(&hidden, &self.heads, 1.0, 1.0).transpose(0, 1);
         let actions = output.size()[2] / 2;
@@ -65,13 +65,13 @@ impl Primitives {
     }
 }
 
-/// As they are made in [`Primitives::new`] and [`Gate::new`].
+/// The layers that [`Primitives::new`] and [`Gate::new`] make.
 pub(super) fn layers(sizes: &Sizes<'_>) -> Vec<Layer> {
     let network = sizes.network;
     let primitives = &network.primitives;
     let side_by_side = primitives.count * primitives.hidden;
     let mut layers = Layer::stack(sizes.proprioception, &[&primitives.torso[..], &[side_by_side]].concat());
-    // Nothing below an observation is learnt.
+    // The input of the first layer is an observation, so no gradient flows to it.
     if let Some(Layer::Dense { flows_on, .. }) = layers.first_mut() {
         *flows_on = false;
     }
@@ -82,14 +82,15 @@ pub(super) fn layers(sizes: &Sizes<'_>) -> Vec<Layer> {
     layers
 }
 
+/// `count` numbers, evenly spaced from −[`LARGEST_BIAS`] to [`LARGEST_BIAS`].
 fn evenly(count: usize) -> Vec<f32> {
     let step = 2.0 * LARGEST_BIAS / (count.max(2) - 1) as f64;
     (0..count).map(|index| (index as f64 * step - LARGEST_BIAS) as f32).collect()
 }
 
-/// What weighs the primitives: K numbers a row, of any size.
+/// The gate: K unbounded numbers per row, which determine the weights of the primitives.
 ///
-/// With a bottleneck `[z, s]` → MLP (S: 2×400) → K; without one the encoder gives the K numbers itself.
+/// With a bottleneck: `[z, s]` → MLP (S: 2×400) → K. Without one, the encoder's output is these K numbers.
 #[derive(Debug)]
 pub(crate) struct Gate {
     bottleneck: Option<(Torso, nn::Linear)>,
@@ -107,7 +108,7 @@ impl Gate {
         Self { bottleneck }
     }
 
-    /// `[N, K]`.
+    /// K numbers per row, `[N, K]`.
     pub(crate) fn forward(&self, input: &Input<'_>) -> Tensor {
         match &self.bottleneck {
             Some((torso, head)) => {

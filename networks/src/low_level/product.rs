@@ -7,10 +7,13 @@ use super::primitives::{Gate, Primitives};
 use crate::action::ActionDistribution;
 use crate::gaussian::DiagonalGaussian;
 
-/// π(a|s, z) ∝ Π_k N_k(s)^{w_k(z, s)}, w_k in (0, 1) and not normalised (S; MCP, Peng et al., 2019): one Gaussian again.
+/// π(a|s, z) ∝ Π_k N_k(s)^{w_k(z, s)} with w_k in (0, 1), not normalised (S; MCP, Peng et al., 2019). The product is
+/// one Gaussian.
 ///
-/// An exponent is at least 1e-3, and the product's σ no less than `min_std`: a product of nothing would be infinitely wide,
-/// and one of many narrower than any of them (D). The exponents start near ½, so the primitives start √(K/2) wider than `initial_std`, and the product as wide (D).
+/// Each exponent is at least 1e-3, because the product would be infinitely wide if all were 0. The σ of the product is
+/// at least `min_std`, because a product of many primitives is narrower than each of them (D). The initial exponents
+/// are near ½; the initial σ of the primitives is √(K/2)·`initial_std`, so the initial σ of the product is
+/// `initial_std` (D).
 #[derive(Debug)]
 pub(crate) struct ProductLowLevel {
     primitives: Primitives,
@@ -18,7 +21,7 @@ pub(crate) struct ProductLowLevel {
     min_std: f64,
 }
 
-/// The least an exponent can be.
+/// The least exponent (D).
 const LEAST_EXPONENT: f64 = 1e-3;
 
 impl ProductLowLevel {

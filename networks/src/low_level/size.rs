@@ -2,63 +2,63 @@
 
 use comic_experiment::Network;
 
-/// Sizes that a low level's layers follow from.
+/// Sizes that determine the layers of a low level.
 #[derive(Clone, Copy, Debug)]
 pub struct Sizes<'a> {
-    /// P.
+    /// P, the size of proprioception.
     pub proprioception: usize,
-    /// A.
+    /// A, the size of an action.
     pub actions: usize,
-    /// The experiment's section.
+    /// The section `network` of the experiment.
     pub network: &'a Network,
 }
 
 impl Sizes<'_> {
-    /// Z + P.
+    /// Z + P, the width of latent and proprioception together.
     pub(super) fn joined(&self) -> usize {
         self.network.latent.size + self.proprioception
     }
 
-    /// A mean and a deviation for each action.
+    /// Width of a head: mean and standard deviation of each action.
     pub(super) fn head(&self) -> usize {
         2 * self.actions
     }
 }
 
-/// What a low level multiplies every row by.
+/// A layer of a low level.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Layer {
-    /// A matrix.
+    /// A dense layer.
     Dense {
-        /// Numbers in.
+        /// Width of the input.
         input: usize,
-        /// Numbers out.
+        /// Width of the output.
         output: usize,
-        /// Whether the gradient flows on to what came in.
+        /// Whether the gradient flows to the input.
         flows_on: bool,
     },
     /// An LSTM layer.
     Lstm {
-        /// Numbers in.
+        /// Width of the input.
         input: usize,
-        /// Numbers out, and in either state.
+        /// Width of the output, of the hidden state and of the cell state.
         units: usize,
     },
 }
 
 impl Layer {
-    /// One matrix.
+    /// A dense layer.
     pub(super) fn dense(input: usize, output: usize) -> Self {
         Self::Dense { input, output, flows_on: true }
     }
 
-    /// Matrices on top of one another.
+    /// Dense layers on top of one another.
     pub(super) fn stack(input: usize, outputs: &[usize]) -> Vec<Self> {
         let inputs = std::iter::once(&input).chain(outputs);
         inputs.zip(outputs).map(|(input, output)| Self::dense(*input, *output)).collect()
     }
 
-    /// Entries of its matrices.
+    /// Number of entries of its matrices.
     pub fn weights(self) -> u64 {
         match self {
             Self::Dense { input, output, .. } => input as u64 * output as u64,

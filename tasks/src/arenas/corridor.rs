@@ -1,31 +1,31 @@
-//! The corridors (`locomotion/arenas/corridors.py`): an empty one, with gaps in its floor, or with walls across it.
+//! The corridors (`locomotion/arenas/corridors.py`): with gaps in the floor, or with walls.
 
 use std::path::Path;
 
 use mujoco_rs::prelude::*;
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjsGeom, MjtBuiltin};
 
-use super::base;
-use crate::error::Error;
-use crate::humanoid::{missing, refused};
+use super::base::base;
+use crate::error::{Error, missing, refused};
 
-/// How far the corridor reaches beyond both its ends (m, `_CORRIDOR_X_PADDING`).
+/// Length of the corridor before its start and after its end (m, `_CORRIDOR_X_PADDING`).
 pub(crate) const X_PADDING: f64 = 2.0;
-/// Thickness of walls and half of the platforms' (m, `_WALL_THICKNESS`).
+/// Thickness of walls, and half the thickness of platforms (m, `_WALL_THICKNESS`).
 const THICKNESS: f64 = 0.16;
-/// Height of the planes at the sides (m, `_SIDE_WALL_HEIGHT`), and the group by which they are not drawn.
+/// Height of the planes at the sides (m, `_SIDE_WALL_HEIGHT`), and their group, which is not drawn.
 const SIDE_HEIGHT: f64 = 4.0;
 const SIDE_GROUP: i32 = 3;
-/// Depth at which the ground lies under the gaps (m).
+/// Depth of the ground under the gaps (m).
 const GAP_DEPTH: f64 = 10.0;
-/// Height above that ground at which spare boxes lie (m): within the model's extent, which decides what is drawn.
+/// Height of the spare boxes above that ground (m). They are inside the model's extent, because the extent decides what is
+/// drawn.
 const HIDDEN_DEPTH: f64 = 0.5;
 /// Clipping planes relative to the model's extent (`tasks/corridors.py`).
 const NEAR: f32 = 0.00025;
 const FAR: f32 = 4.0;
-/// Name of the body that walls belong to.
+/// Name of the walls' body.
 const WALLS: &str = "walls";
-/// Name of the body that platforms belong to.
+/// Name of the platforms' body.
 pub(crate) const GROUND: &str = "ground";
 
 /// Length and width of a corridor, m.
@@ -35,30 +35,30 @@ pub(crate) struct Extent {
     pub(crate) width: f64,
 }
 
-/// A box that stands in the corridor: a platform or a wall.
+/// A box in the corridor: a platform or a wall.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Block {
     /// The geom's name.
     pub name: String,
     /// Centre, m.
     pub position: [f64; 3],
-    /// Half of its extent in x, y and z, m.
+    /// Half its size in x, y and z, m.
     pub half_size: [f64; 3],
     /// Red, green, blue and opacity.
     pub colour: [f32; 4],
 }
 
-/// Length of the platform that the humanoid starts on, m.
+/// Length of the platform on which the humanoid starts, m.
 pub(crate) fn first_platform_length() -> f64 {
     3.0 * X_PADDING
 }
 
-/// The platform that the humanoid starts on.
+/// The platform on which the humanoid starts.
 pub(crate) fn first_platform(extent: Extent) -> Block {
     Block { name: "start_floor".into(), ..platform(0, 0.0, first_platform_length(), extent) }
 }
 
-/// A stretch of floor that begins at `start`, m.
+/// A platform from `start` to `start + length`, m.
 pub(crate) fn platform(index: usize, start: f64, length: f64, extent: Extent) -> Block {
     Block {
         name: format!("floor_{index}"),
@@ -68,7 +68,7 @@ pub(crate) fn platform(index: usize, start: f64, length: f64, extent: Extent) ->
     }
 }
 
-/// A wall at `x` that reaches `width` into the corridor from the left, the side of positive y, or from the right; m.
+/// A wall at `x` that reaches `width` into the corridor, m. Its side is the left (positive y) or the right.
 pub(crate) fn wall(index: usize, x: f64, [width, height]: [f64; 2], left: bool, extent: Extent) -> Block {
     let side = if left { 1.0 } else { -1.0 };
     Block {
@@ -81,8 +81,8 @@ pub(crate) fn wall(index: usize, x: f64, [width, height]: [f64; 2], left: bool, 
 
 /// The corridor with gaps between `platforms`.
 ///
-/// `spare` boxes more lie in the depth under the first platform, seen and reached by nobody: arenas with equally many
-/// boxes have equal memory layouts, so a simulation and a renderer can go from one to the next.
+/// `spare` more boxes are far below the first platform, where nothing touches or shows them. Arenas with the same number of
+/// boxes have the same memory layout, so a simulation and a renderer can change from one to the next.
 pub(crate) fn with_gaps(directory: &Path, extent: Extent, platforms: &[Block], spare: usize) -> Result<MjSpec, Error> {
     let mut spec = empty(directory, "gaps_corridor", extent, Some(GAP_DEPTH), 0)?;
     let ground = spec.world_body_mut().add_body();
@@ -91,7 +91,8 @@ pub(crate) fn with_gaps(directory: &Path, extent: Extent, platforms: &[Block], s
         add_block(ground, platform)?;
     }
     for index in platforms.len()..platforms.len() + spare {
-        // It collides like any other: what does not is left out of MuJoCo's bounding volumes, which are counted.
+        // A spare box collides, too: MuJoCo's bounding volumes leave out geoms without collisions, and their number is
+        // part of the memory layout.
         let hidden = Block {
             position: [first_platform_length() / 2.0, 0.0, HIDDEN_DEPTH - GAP_DEPTH],
             half_size: [THICKNESS / 2.0; 3],
@@ -122,8 +123,8 @@ fn add_block<'a>(body: &'a mut MjsBody, block: &Block) -> Result<&'a mut MjsGeom
     Ok(geom)
 }
 
-/// `EmptyCorridor`: the ground, invisible planes at the sides and ends, a sky. With `depth` the ground lies so far
-/// below and is not seen. dm_control numbers what has no name by its place among all geoms, `first` of them before.
+/// `EmptyCorridor`: the ground, invisible planes at the sides and ends, and a sky. With `depth` the ground is invisible and
+/// this far below (m). dm_control names unnamed geoms by their place among all geoms; `first` geoms come before these.
 fn empty(directory: &Path, name: &str, extent: Extent, depth: Option<f64>, first: usize) -> Result<MjSpec, Error> {
     let mut spec = base(directory, name)?;
     let map = &mut spec.visual_mut().map;

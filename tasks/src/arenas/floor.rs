@@ -1,19 +1,18 @@
-//! The floor (`locomotion/arenas/floors.py`), and what tasks put on it.
+//! The floor (`locomotion/arenas/floors.py`), with a target's mark or a ball.
 
 use std::path::Path;
 
 use mujoco_rs::prelude::*;
 use mujoco_rs::wrappers::mj_editing::{MjtBuiltin, MjtMark};
 
-use super::base;
-use crate::error::Error;
-use crate::humanoid::refused;
+use super::base::base;
+use crate::error::{Error, refused};
 
-/// Half the floor's extent in x and y (m); it is only drawn so far, MuJoCo's planes are infinite.
+/// Half the drawn size of the floor in x and y (m). MuJoCo's planes are infinite.
 const HALF_SIZE: f64 = 8.0;
-/// Spacing of the grid by which a plane is drawn (`_GROUNDPLANE_QUAD_SIZE`).
+/// Spacing of the grid with which a plane is drawn (`_GROUNDPLANE_QUAD_SIZE`).
 const QUAD_SIZE: f64 = 0.25;
-/// Height of the camera above the floor (m) and how much of it the floor fills.
+/// Height of the camera above the floor (m), and the size of its view relative to the floor.
 const TOP_CAMERA_DISTANCE: f64 = 100.0;
 const TOP_CAMERA_PADDING: f64 = 1.1;
 /// Radius (m) and colour of a target's mark (`tasks/go_to_target.py`).
@@ -23,7 +22,7 @@ const TARGET_COLOUR: [f32; 4] = [0.9, 0.6, 0.6, 1.0];
 pub(crate) const TARGET: &str = "target";
 /// The ball's colour.
 const BALL_COLOUR: [f32; 4] = [0.9, 0.5, 0.1, 1.0];
-/// Name of the ball: of its body, its joint and its geom.
+/// Name of the ball's body, joint and geom.
 pub(crate) const BALL: &str = "ball";
 
 /// The empty floor.
@@ -62,7 +61,7 @@ pub(crate) fn floor(directory: &Path) -> Result<MjSpec, Error> {
     Ok(spec)
 }
 
-/// The floor with a target's mark, which touches nothing.
+/// The floor with a target's mark, which has no contacts.
 pub(crate) fn with_target(directory: &Path) -> Result<MjSpec, Error> {
     let mut spec = floor(directory)?;
     let site = spec.world_body_mut().add_site();
@@ -73,10 +72,11 @@ pub(crate) fn with_target(directory: &Path) -> Result<MjSpec, Error> {
     Ok(spec)
 }
 
-/// Adds a ball of this radius (m) and mass (kg), free to move: after the humanoid, whose coordinates come first.
+/// Adds a ball with this radius (m), this mass (kg) and a free joint. It must be added after the humanoid, because the
+/// humanoid's coordinates come first.
 ///
-/// Contact parameters are those of dm_control's motion-capture props (`locomotion/mocap/props.py`): condim 6,
-/// priority 1, friction (0.7, r/4, r/2).
+/// It has the contact parameters of dm_control's motion-capture props (`locomotion/mocap/props.py`): condim 6, priority 1,
+/// friction (0.7, r/4, r/2).
 pub(crate) fn add_ball(arena: &mut MjSpec, radius: f64, mass: f64) -> Result<(), Error> {
     let body = arena.world_body_mut().add_body();
     body.set_name(BALL).map_err(refused("adding the ball"))?;

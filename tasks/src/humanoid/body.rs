@@ -1,4 +1,4 @@
-//! The humanoid itself: `CMUHumanoidPositionControlledV2020` and `CMUHumanoidPositionControlled`.
+//! The specification of the humanoid: `CMUHumanoidPositionControlledV2020` and `CMUHumanoidPositionControlled`.
 
 use std::path::Path;
 
@@ -6,15 +6,15 @@ use comic_clips::WalkerModel;
 use mujoco_rs::prelude::*;
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjtLimited};
 
+use super::names::END_EFFECTORS;
 use super::servos::{self, FILTER_TIME_CONSTANT, Servo};
-use super::{END_EFFECTORS, missing, refused};
 use crate::assets;
-use crate::error::Error;
+use crate::error::{Error, missing, refused};
 
 /// Lengths and sizes of the V2020 body relative to its XML, and its mass in kg (`rescale_humanoid(self, 1.2, 1.2, 70)`).
 const SCALE: f64 = 1.2;
 const MASS: f64 = 70.0;
-/// Density of a geom that gives none (kg/m³, MuJoCo's default).
+/// Density of a geom without a density of its own (kg/m³, MuJoCo's default).
 const DENSITY: f64 = 1000.0;
 
 /// The humanoid alone, without prefix and without floor.
@@ -36,7 +36,7 @@ pub(super) fn humanoid(directory: &Path, model: WalkerModel) -> Result<MjSpec, E
     Ok(spec)
 }
 
-/// The massless nose by which the direction of the head can be seen; its body counts as a tracked one.
+/// Adds the face and the nose, which show the direction of the head. They have no mass. Their body is a tracking body.
 fn add_face(spec: &mut MjSpec) -> Result<(), Error> {
     let radius = spec.geom("head").ok_or_else(|| missing("geom", "head"))?.size()[0];
     let head = spec.body_mut("head").ok_or_else(|| missing("body", "head"))?;
@@ -68,7 +68,7 @@ fn add_face(spec: &mut MjSpec) -> Result<(), Error> {
     Ok(())
 }
 
-/// `rescale_subtree`: every position and every size that an element gives itself; sizes from a class stay.
+/// `rescale_subtree`: scales every position, and every size that the element itself gives. Sizes from a class do not change.
 fn rescale(body: &mut MjsBody) {
     for joint in body.joint_iter_mut(false) {
         scale(joint.pos_mut());
@@ -103,8 +103,8 @@ fn scale(vector: &mut [f64; 3]) {
     }
 }
 
-/// Scales a size that the element gives itself, which is known by not being its class's: as many numbers as its type
-/// has. The rest of the vector is MuJoCo's filling, which dm_control does not see.
+/// Scales a size unless it is equal to the class's size. It scales as many numbers as the type has: MuJoCo fills the rest of
+/// the vector, and dm_control does not know the rest.
 fn scale_own(size: &mut [f64; 3], kind: MjtGeomBase, inherited: Option<[f64; 3]>) {
     if inherited == Some(*size) {
         return;
@@ -119,7 +119,7 @@ fn scale_own(size: &mut [f64; 3], kind: MjtGeomBase, inherited: Option<[f64; 3]>
     }
 }
 
-/// `rescale_humanoid`'s second half: densities such that the body, compiled alone, weighs [`MASS`].
+/// The second half of `rescale_humanoid`: sets the densities so that the body, compiled alone, has the mass [`MASS`].
 fn set_mass(spec: &mut MjSpec) -> Result<(), Error> {
     let alone = spec.compile().map_err(refused("weighing the humanoid"))?;
     let root = alone.name_to_id(MjtObjBase::mjOBJ_BODY, "root").ok_or_else(|| missing("body", "root"))?;
@@ -134,8 +134,8 @@ fn set_mass(spec: &mut MjSpec) -> Result<(), Error> {
     Ok(())
 }
 
-/// Position servos instead of the XML's motors (`scaled_actuators.add_position_actuator`): control −1 … 1 is the
-/// joint's range.
+/// Replaces the XML's motors by position servos (`scaled_actuators.add_position_actuator`). Control −1 … 1 is the joint's
+/// range.
 fn replace_motors(spec: &mut MjSpec, servos: &[Servo], filtered: bool) -> Result<(), Error> {
     delete_actuators(spec)?;
     let main = spec.default_mut("main").ok_or_else(|| missing("default class", "main"))?;
@@ -168,13 +168,13 @@ fn replace_motors(spec: &mut MjSpec, servos: &[Servo], filtered: bool) -> Result
 #[allow(unsafe_code)]
 fn delete_actuators(spec: &mut MjSpec) -> Result<(), Error> {
     while let Some(motor) = spec.actuator_iter_mut().next() {
-        // SAFETY: the first actuator left is alive, is deleted once, and its handle ends with this statement.
+        // SAFETY: this is the first actuator that still exists. It is deleted once, and its handle ends with this statement.
         unsafe { motor.delete() }.map_err(refused("removing the motors"))?;
     }
     Ok(())
 }
 
-/// The sensors that dm_control's `end_effectors_pos` observable creates, in the frame of the root.
+/// Adds the sensors of dm_control's observable `end_effectors_pos`, in the frame of the root.
 fn add_end_effector_sensors(spec: &mut MjSpec) -> Result<(), Error> {
     for body in END_EFFECTORS {
         let sensor = spec.add_sensor();
@@ -188,7 +188,7 @@ fn add_end_effector_sensors(spec: &mut MjSpec) -> Result<(), Error> {
     Ok(())
 }
 
-/// PyMJCF names what has no name; the names' addresses are arrays of the model too.
+/// Names the contact exclusions as PyMJCF does. The addresses of names are arrays of the model, too.
 fn name_excludes(spec: &mut MjSpec) -> Result<(), Error> {
     for (index, exclude) in spec.exclude_iter_mut().enumerate() {
         exclude.set_name(&format!("/unnamed_contact_{index}")).map_err(refused("naming an exclusion"))?;

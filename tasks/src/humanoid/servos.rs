@@ -7,23 +7,23 @@ pub(super) struct Servo {
     pub(super) joint: &'static str,
     /// Proportional gain (N·m/rad).
     pub(super) gain: f64,
-    /// Torque limit, both ways (N·m).
+    /// Torque limit in both directions (N·m).
     pub(super) limit: f64,
-    /// Damping written to the joint (N·m·s/rad); the joint's class decides when absent.
+    /// Damping of the joint (N·m·s/rad); the damping of the joint's class when absent.
     pub(super) damping: Option<f64>,
 }
 
-/// V2020: the torque limit is the gain, joints get dampings of their own.
+/// A servo of V2020.
 const fn servo(joint: &'static str, gain: f64, damping: f64) -> Servo {
     Servo { joint, gain, limit: gain, damping: Some(damping) }
 }
 
-/// V2019.
+/// A servo of V2019: the damping is that of the joint's class.
 const fn bare(joint: &'static str, gain: f64, limit: f64) -> Servo {
     Servo { joint, gain, limit, damping: None }
 }
 
-/// Seconds of the filter between control and V2020 servo (`dynprm`).
+/// Time constant of the filter between the control and a V2020 servo, s (`dynprm`).
 pub(super) const FILTER_TIME_CONSTANT: f64 = 0.03;
 
 /// The V2020 body's servos.

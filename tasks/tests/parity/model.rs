@@ -1,28 +1,20 @@
-//! The compiled model against dm_control's: every array, bit for bit.
+//! Compares every array of the compiled models with dm_control's, bit for bit.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use comic_clips::WalkerModel;
 use comic_tasks::{comparison, humanoid};
 use mujoco_rs::prelude::MjModel;
 
+use crate::recording::models;
 use crate::rules::RecordedArena;
 use crate::{model_arrays, npz};
 
-fn golden(name: &str) -> Option<PathBuf> {
-    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/golden").join(name);
-    if path.is_file() {
-        return Some(path);
-    }
-    eprintln!("skipped: {} is not there", path.display());
-    None
-}
-
 fn assert_every_array_equal(build: impl FnOnce(&Path) -> MjModel, file: &str) {
-    let Some(path) = golden(file) else { return };
+    let path = models().join(file);
     let ours = build(&path);
     let arrays = npz::read(&path).unwrap();
-    // Sizes first: they vouch for the lengths of the arrays.
+    // The sizes come first: the lengths of the arrays follow from them.
     let (sizes, rest): (Vec<_>, Vec<_>) = arrays.iter().partition(|(_, array)| array.shape.is_empty());
     let mut different = Vec::new();
     for group in [sizes, rest] {

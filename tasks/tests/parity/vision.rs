@@ -1,43 +1,24 @@
-//! What the humanoid sees, against dm_control's own pictures. Without OpenGL there is nothing to compare, and the tests
-//! say so.
+//! Compares the camera image with dm_control's. The tests need OpenGL: their names begin with `opengl_`, and
+//! `cargo xtask test` leaves them out where there is none.
 
-use std::path::{Path, PathBuf};
-
-use comic_tasks::Error;
 use comic_tasks::comparison::{Replay, replay_corridor};
 use comic_tasks::vision::IMAGE_BYTES;
 
 use crate::npz;
-use crate::recording::workspace;
+use crate::recording::models;
 use crate::rules::RecordedArena;
 
 /// The corridor that was recorded, in the pose in which dm_control took its picture.
-fn replay(folder: &Path, kind: &str) -> Replay {
+fn replay(kind: &str) -> Replay {
     let RecordedArena { length, width, platforms, walls } =
-        RecordedArena::read(&folder.join(format!("{kind}_arena.json"))).unwrap();
+        RecordedArena::read(&models().join(format!("{kind}_arena.json"))).unwrap();
     replay_corridor(length, width, &platforms, &walls).unwrap()
 }
 
-fn golden() -> Option<PathBuf> {
-    let folder = workspace().join("../shared/golden");
-    if folder.is_dir() {
-        return Some(folder);
-    }
-    eprintln!("skipped: {} is not there", folder.display());
-    None
-}
-
-/// The picture, or nothing where there is no OpenGL.
-fn drawn(replay: &mut Replay, full: bool) -> Option<Vec<u8>> {
+fn drawn(replay: &mut Replay, full: bool) -> Vec<u8> {
     let mut image = vec![0; IMAGE_BYTES];
-    match replay.draw(full, &mut image) {
-        Ok(()) => Some(image),
-        Err(error @ Error::Graphics { .. }) => {
-            eprintln!("skipped: {error}");
-            None
-        }
-        Err(error) => panic!("{error}"),
-    }
+    replay.draw(full, &mut image).unwrap_or_else(|error| panic!("{error}"));
+    image
 }
 
 /// Mean and largest difference in grey levels.
@@ -48,12 +29,10 @@ fn difference(one: &[u8], other: &[f64]) -> (f64, f64) {
 }
 
 #[test]
-fn parity_of_pictures_with_dm_controls_within_a_few_grey_levels() {
-    let Some(folder) = golden() else { return };
+fn opengl_parity_of_images_with_dm_control_within_a_few_grey_levels() {
     for kind in ["gaps", "walls"] {
-        let mut replay = replay(&folder, kind);
-        let recorded = npz::read(&folder.join(format!("{kind}_camera.npz"))).unwrap();
-        let Some(image) = drawn(&mut replay, true) else { return };
+        let recorded = npz::read(&models().join(format!("{kind}_camera.npz"))).unwrap();
+        let image = drawn(&mut replay(kind), true);
         let (mean, largest) = difference(&image, recorded["rgb"].numbers().unwrap());
         eprintln!("{kind}: {mean:.3} grey levels on average, {largest} at most");
         assert!(mean < 1.0 && largest <= 8.0, "{kind}: {mean:.3} on average, {largest} at most");
@@ -61,11 +40,10 @@ fn parity_of_pictures_with_dm_controls_within_a_few_grey_levels() {
 }
 
 #[test]
-fn the_fast_picture_shows_the_same_without_shadows() {
-    let folder = workspace().join("tests/fixtures/golden");
+fn opengl_the_fast_image_is_the_full_image_without_shadows() {
     for kind in ["gaps", "walls"] {
-        let mut replay = replay(&folder, kind);
-        let (Some(fast), Some(full)) = (drawn(&mut replay, false), drawn(&mut replay, true)) else { return };
+        let mut replay = replay(kind);
+        let (fast, full) = (drawn(&mut replay, false), drawn(&mut replay, true));
         let full: Vec<f64> = full.into_iter().map(f64::from).collect();
         let (mean, _) = difference(&fast, &full);
         assert!(mean < 25.0, "{kind}: {mean}");

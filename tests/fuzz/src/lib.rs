@@ -1,12 +1,12 @@
-//! What the targets share: an experiment of the smallest size, and how bytes become a few of their own.
+//! What the targets share: a very small experiment, and how seeds are written.
 //!
-//! Whatever the bytes, the outcome is a value or an error; a panic is a finding. What was found is a test beside the
-//! code that it was found in.
+//! Any bytes must give a value or an error; a panic is a finding. For each finding there is a test beside the code that was
+//! wrong.
 
 use comic_experiment::{Experiment, TaskSpec, resolve};
 use comic_proto::{UnrollLayout, UnrollShape};
 
-/// A tracking experiment whose every layer is narrow, so that a run takes little time and its seeds little room.
+/// A tracking experiment with narrow layers, so that runs are fast and seeds are small.
 pub fn experiment() -> Experiment {
     let overrides = [
         "network.encoder=[2]",
@@ -18,20 +18,20 @@ pub fn experiment() -> Experiment {
         "vmpo.minibatch_unrolls=2",
         "tracking.observations=[\"body_height\"]",
     ];
-    resolve("tracking-mlp", &overrides.map(String::from)).expect("the experiment is sound")
+    resolve("tracking-mlp", &overrides.map(String::from)).expect("a valid experiment")
 }
 
-/// What its task observes.
+/// The observations of its task.
 pub fn spec(experiment: &Experiment) -> TaskSpec {
-    TaskSpec::new(experiment, vec!["one".into(), "another".into()]).expect("the observations are known")
+    TaskSpec::new(experiment, vec!["one".into(), "another".into()]).expect("known observations")
 }
 
-/// How its unrolls lie in memory.
+/// The memory layout of its unrolls.
 pub fn layout(spec: &TaskSpec, experiment: &Experiment) -> UnrollLayout {
     UnrollLayout::new(UnrollShape::new(spec, experiment))
 }
 
-/// Where the target is to write what is sound, if that is all it is asked to do: `COMIC_FUZZ_SEEDS=DIR`.
+/// Writes valid bytes as a seed if `COMIC_FUZZ_SEEDS=DIR` is set.
 pub fn seed(name: &str, bytes: &[u8]) {
     if let Some(directory) = std::env::var_os("COMIC_FUZZ_SEEDS") {
         let path = std::path::Path::new(&directory).join(name);

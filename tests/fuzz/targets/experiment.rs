@@ -1,4 +1,4 @@
-//! An experiment as somebody writes it, and a value of it as somebody types it.
+//! The text of an experiment file, and the text of an override.
 
 #![no_main]
 
@@ -11,11 +11,11 @@ fuzz_target!(init: {
         seed(name, text.as_bytes());
     }
     seed("override", b"vmpo.epsilon_eta=0.2");
-    seed("whole", Experiment::default().to_toml().expect("an experiment is written").as_bytes());
+    seed("whole", Experiment::default().to_toml().expect("an experiment can be written").as_bytes());
 }, |text: &str| {
     if let Ok(experiment) = Experiment::from_toml("the experiment", text) {
-        let written = experiment.to_toml().expect("what was read can be written");
-        let again = Experiment::from_toml("the same", &written).expect("what was written can be read");
+        let written = experiment.to_toml().expect("an experiment that was read can be written");
+        let again = Experiment::from_toml("the same", &written).expect("an experiment that was written can be read");
         assert_eq!(again, experiment);
         let _ = TaskSpec::new(&experiment, vec!["a clip".into()]);
     }

@@ -1,4 +1,4 @@
-//! Parameters, as they come off the wire: pieces put together, and what they make read into a policy.
+//! Pieces of parameters, as they are received: they are assembled and loaded into a policy.
 
 #![no_main]
 
@@ -23,8 +23,8 @@ fn store() -> nn::VarStore {
     let experiment = experiment();
     let spec = spec(&experiment);
     let store = nn::VarStore::new(Device::Cpu);
-    Policy::new(&store.root(), &spec, &experiment.network, &vec![0.0; spec.action]).expect("the networks are sound");
-    let whole = Bytes::from(to_safetensors(&store).expect("parameters are written"));
+    Policy::new(&store.root(), &spec, &experiment.network, &vec![0.0; spec.action]).expect("valid networks");
+    let whole = Bytes::from(to_safetensors(&store).expect("parameters can be written"));
     let half = whole.len() / 2;
     let piece = |offset: usize, data: Bytes| ParametersChunk {
         learner_epoch: 1,
@@ -36,7 +36,7 @@ fn store() -> nn::VarStore {
         run_over: false,
     };
     let pieces = [piece(0, whole.slice(..half)), piece(half, whole.slice(half..))];
-    seed("sound", &pieces.iter().flat_map(Message::encode_length_delimited_to_vec).collect::<Vec<u8>>());
+    seed("valid", &pieces.iter().flat_map(Message::encode_length_delimited_to_vec).collect::<Vec<u8>>());
     store
 }
 

@@ -1,4 +1,4 @@
-//! A message of an unroll, as it comes off the wire: decoded, validated, and, where it is sound, laid into a batch.
+//! A message with an unroll, as it is received: it is decoded, validated, and copied into a batch if it is valid.
 
 #![no_main]
 
@@ -8,14 +8,14 @@ use bytes::Bytes;
 use comic_fuzz::{experiment, layout, seed, spec};
 use comic_proto::v1::{Behaviour, UnrollHeader, UnrollMessage};
 use comic_proto::{Expected, Field, Pieces, ReceivedUnroll, UnrollBuffer, UnrollLayout, validate};
-use comic_replay::{Batcher, Config, Ledger, BatchOrder, Phase, TaskAccounting};
+use comic_replay::{BatchOrder, Batcher, Config, Ledger, Phase, TaskAccounting};
 use futures::executor::block_on;
 use libfuzzer_sys::fuzz_target;
 use prost::Message as _;
 
 struct Service {
     layout: Arc<UnrollLayout>,
-    /// Of each task.
+    /// Number of clips of each task.
     clips: Vec<usize>,
 }
 
@@ -29,9 +29,13 @@ static SERVICE: LazyLock<Service> = LazyLock::new(|| {
             unroll.row_mut(field, t).fill(1.0);
         }
     }
-    let header = UnrollHeader { layout_hash: layout.hash().to_vec(), behaviour: Behaviour::Policy.into(), ..UnrollHeader::default() };
+    let header = UnrollHeader {
+        layout_hash: layout.hash().to_vec(),
+        behaviour: Behaviour::Policy.into(),
+        ..UnrollHeader::default()
+    };
     let message = UnrollMessage { header: Some(header), payload: unroll.into_bytes() }.encode_to_vec();
-    seed("sound", &[&[128], &message[..]].concat());
+    seed("valid", &[&[128], &message[..]].concat());
     Service { layout, clips: spec.tasks.iter().map(|task| task.clips).collect() }
 });
 
@@ -39,7 +43,7 @@ fuzz_target!(init: {
     LazyLock::force(&SERVICE);
 }, |bytes: &[u8]| {
     let Service { layout, clips } = &*SERVICE;
-    // Cut somewhere, which the first byte decides.
+    // The first byte decides where the message is cut in two.
     let Some((cut, bytes)) = bytes.split_first() else { return };
     let (front, back) = bytes.split_at(bytes.len() * usize::from(*cut) / 256);
     let message: Pieces = [front, back].into_iter().map(Bytes::copy_from_slice).collect();
@@ -55,7 +59,7 @@ fuzz_target!(init: {
         let mut ledger = Ledger::new().with_tasks((0..clips.len()).map(|task| task.to_string()));
         let _ = ledger.join(header.incarnation, None);
         let batcher = Batcher::new(layout.clone(), config, Phase::begin(0), ledger);
-        // The first of two: there is room.
+        // The batch has room for two unrolls.
         block_on(batcher.insert(&header, payload));
         let accounting = batcher.accounting_by_task();
         assert!(accounting.all.balance() && accounting.tasks.values().all(TaskAccounting::balance));

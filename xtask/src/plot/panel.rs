@@ -1,4 +1,4 @@
-//! One panel of a picture: axes, lines with their bands, names.
+//! One panel of a picture: axes, lines with their bands, labels.
 
 use std::ops::Range;
 
@@ -6,12 +6,12 @@ use anyhow::{Result, anyhow};
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
-/// A line with a name, and the band around it.
+/// A line with a label, and the band around it.
 pub(super) struct Series {
     pub(super) label: String,
     /// (x, y).
     pub(super) line: Vec<(f64, f64)>,
-    /// (x, lower edge, upper edge); none where the line stands alone.
+    /// (x, lower edge, upper edge); empty for a line without a band.
     pub(super) band: Vec<(f64, f64, f64)>,
 }
 
@@ -21,14 +21,14 @@ impl Series {
         Self { label, line, band: Vec::new() }
     }
 
-    /// The band's outline: along its upper edge and back along its lower one.
+    /// The band's outline: forward along its upper edge, back along its lower edge.
     fn outline(&self) -> Vec<(f64, f64)> {
         let upper = self.band.iter().map(|(x, _, high)| (*x, *high));
         upper.chain(self.band.iter().rev().map(|(x, low, _)| (*x, *low))).collect()
     }
 }
 
-/// Draws `series`, each in a colour of its own.
+/// Draws the series, each in its own colour.
 pub(super) fn panel<B: DrawingBackend>(
     area: &DrawingArea<B, Shift>,
     series: &[Series],
@@ -70,7 +70,7 @@ pub(super) fn panel<B: DrawingBackend>(
         .map_err(|error| failed(error.to_string()))
 }
 
-/// From 0, or below it, to a little above the largest value.
+/// From 0, or the smallest value if that is negative, to 5 % above the largest value.
 fn range_of(values: impl Iterator<Item = f64> + Clone) -> Range<f64> {
     let low = values.clone().fold(0.0, f64::min);
     let high = values.fold(low + 1e-6, f64::max);

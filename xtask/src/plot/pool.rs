@@ -1,12 +1,12 @@
-//! Several runs of the same experiment as one curve: their mean, and a band from the least to the most of them.
+//! Several runs of the same experiment as one curve: their mean, and a band from the minimum to the maximum.
 
 use super::Point;
 use super::panel::Series;
 
-/// Places at which runs are compared, whose own lines come at different steps.
+/// Numbers of steps at which the runs are compared. Each run's own lines have other numbers.
 const SAMPLES: usize = 200;
 
-/// Mean and range of `curves` over environment steps, wherever all of them are. Each is sorted by steps.
+/// Mean and range of `curves` over the environment steps that all of them have. Each curve is sorted by steps.
 pub(super) fn pool(label: String, curves: &[Vec<Point>]) -> Series {
     let from = curves.iter().filter_map(|curve| curve.first()).map(|point| point.steps).fold(0.0, f64::max);
     let to = curves.iter().filter_map(|curve| curve.last()).map(|point| point.steps).fold(f64::INFINITY, f64::min);
@@ -26,13 +26,13 @@ pub(super) fn pool(label: String, curves: &[Vec<Point>]) -> Series {
     series
 }
 
-/// The value between a curve's two points around `steps`; its first or last one beyond them.
+/// The interpolated value of a curve at `steps`; its first or last value outside its range.
 fn at(curve: &[Point], steps: f64) -> Option<f64> {
     let next = curve.partition_point(|point| point.steps < steps);
     match (next.checked_sub(1).and_then(|before| curve.get(before)), curve.get(next)) {
         (Some(before), Some(after)) => {
-            let share = (steps - before.steps) / (after.steps - before.steps);
-            Some(before.value + share * (after.value - before.value))
+            let fraction = (steps - before.steps) / (after.steps - before.steps);
+            Some(before.value + fraction * (after.value - before.value))
         }
         (before, after) => before.or(after).map(|point| point.value),
     }
@@ -47,7 +47,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_are_compared_where_all_of_them_are_and_between_their_points() {
+    fn runs_are_compared_over_the_steps_of_all_of_them_by_interpolation() {
         let series =
             pool("β".into(), &[curve(&[(0.0, 0.0), (4.0, 4.0)]), curve(&[(1.0, 3.0), (2.0, 4.0), (3.0, 5.0)])]);
         assert_eq!((series.line[0], series.band[0]), ((1.0, 2.0), (1.0, 1.0, 3.0)));
@@ -62,7 +62,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_that_never_were_at_the_same_step_make_no_line() {
+    fn runs_without_common_steps_make_no_line() {
         assert!(pool("β".into(), &[curve(&[(0.0, 1.0)]), curve(&[(1.0, 1.0)])]).line.is_empty());
         assert!(pool("β".into(), &[]).line.is_empty());
     }

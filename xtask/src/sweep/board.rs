@@ -1,5 +1,4 @@
-//! How far a sweep is: a bar, and a row for each run that goes on. Nothing where no terminal is: there each run says by
-//! itself what becomes of it.
+//! Progress of a sweep on a terminal: a bar, and a row for each run. Elsewhere each run prints its own lines.
 
 use std::time::Duration;
 
@@ -17,7 +16,7 @@ struct Bars {
 }
 
 impl Board {
-    /// For `total` runs, of which some are finished.
+    /// For `total` runs, of which `finished` are finished.
     pub(super) fn new(total: usize, finished: usize) -> Self {
         Self(on_terminal().then(|| {
             let rows = MultiProgress::new();
@@ -30,20 +29,20 @@ impl Board {
         }))
     }
 
-    /// Where a person sees `run`.
+    /// The display of `run`.
     pub(super) fn display(&self, run: &Run) -> Display {
         let row = self.0.as_ref().map(|bars| bars.rows.insert_before(&bars.runs, ProgressBar::new(0)));
         Display::beside_others(&run.name, &run.job.experiment().budget, row)
     }
 
-    /// One more run is finished.
+    /// Counts one more finished run.
     pub(super) fn count(&self) {
         if let Some(bars) = &self.0 {
             bars.runs.inc(1);
         }
     }
 
-    /// Leaves the bar standing as it is.
+    /// Leaves the bar as it is.
     pub(super) fn finish(&self) {
         if let Some(bars) = &self.0 {
             bars.runs.abandon();

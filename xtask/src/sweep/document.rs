@@ -1,4 +1,4 @@
-//! The file of a sweep.
+//! Reads the file of a sweep.
 
 use std::num::NonZeroUsize;
 use std::path::Path;
@@ -8,10 +8,10 @@ use comic_experiment::{find_field, nearest};
 use serde::Deserialize;
 use toml::{Table, Value};
 
-/// Every name a file may have at its top.
+/// Every name that a file may have at the top level.
 const NAMES: [&str; 7] = ["preset", "clips", "actors", "parallel", "seeds", "set", "grid"];
 
-/// A sweep, as its file says.
+/// A sweep as it is written in its file.
 #[derive(Debug, Deserialize)]
 struct Written {
     preset: String,
@@ -41,21 +41,21 @@ fn first_seed() -> Vec<u64> {
     vec![1]
 }
 
-/// A sweep: an experiment, what is changed in all of its runs, and what is varied between them.
+/// A sweep: an experiment, the fields that all runs change, and the fields that vary between runs.
 #[derive(Debug)]
 pub(super) struct Document {
-    /// A preset's name or a file.
+    /// A preset's name or the path of an experiment file.
     pub(super) preset: String,
-    /// Clips instead of the experiment's, in the command line's form.
+    /// Clips instead of the experiment's, as on the command line.
     pub(super) clips: Vec<String>,
     /// Actor processes of a run.
     pub(super) actors: u16,
-    /// Runs at once.
+    /// Runs at the same time.
     pub(super) parallel: NonZeroUsize,
     pub(super) seeds: Vec<u64>,
-    /// Fields by their whole names, and the value every run has.
+    /// Fields by their full names, and the value in every run.
     pub(super) set: Vec<(String, Value)>,
-    /// Fields by their whole names, and the values that are tried.
+    /// Fields by their full names, and the values that are tried.
     pub(super) grid: Vec<(String, Vec<Value>)>,
 }
 
@@ -104,7 +104,7 @@ impl Document {
         }
         let varied = || self.grid.iter().map(|(field, _)| field);
         if let Some((field, _)) = self.set.iter().find(|(field, _)| varied().any(|varied| varied == field)) {
-            bail!("`{field}` is in `set` and in `grid`: leave one of them out");
+            bail!("`{field}` is in `set` and in `grid`: remove one of them");
         }
         if self.set.iter().map(|(field, _)| field).chain(varied()).any(|field| field == "seed") {
             bail!("`seed` is not a field to set: write the seeds as `seeds = [1, 2, 3]`");
@@ -113,8 +113,8 @@ impl Document {
     }
 }
 
-/// The fields of a table, whether it writes them as `"latent.beta" = 0` or as sections, by their whole names and in the
-/// order of these, so that a run's directory does not depend on how they are written.
+/// The fields of a table, written as `"latent.beta" = 0` or as sections, sorted by their full names. So a run's directory
+/// does not depend on the way in which they are written.
 fn fields(origin: &str, table: &Table) -> Result<Vec<(String, Value)>> {
     let mut written = Vec::new();
     flatten("", table, &mut written);
@@ -122,7 +122,7 @@ fn fields(origin: &str, table: &Table) -> Result<Vec<(String, Value)>> {
     for (name, value) in written {
         let field = find_field(origin, &name)?;
         if fields.iter().any(|(known, _)| *known == field) {
-            bail!("{origin}: `{field}` is there twice: leave one of them out");
+            bail!("{origin}: `{field}` occurs twice: remove one of them");
         }
         fields.push((field, value));
     }
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn fields_may_be_written_by_their_ends_or_in_sections() {
+    fn fields_may_be_written_by_their_endings_or_in_sections() {
         let text = "preset = \"quickstart\"\n[set]\nbudget.minutes = 1\n[grid]\n\"latent.beta\" = [0, 1e-4]\n";
         let document = Document::parse("sweep.toml", text).unwrap();
         assert_eq!(document.set, [("budget.minutes".to_owned(), Value::Integer(1))]);
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_out_is_two_actors_one_run_at_once_and_the_first_seed() {
+    fn the_defaults_are_two_actors_one_run_at_a_time_and_the_first_seed() {
         let document = Document::parse("sweep.toml", "preset = \"quickstart\"").unwrap();
         assert_eq!((document.actors, document.parallel.get(), document.seeds), (2, 1, vec![1]));
     }
@@ -177,14 +177,14 @@ mod tests {
     }
 
     #[test]
-    fn values_that_make_no_sweep_are_refused_by_name() {
+    fn invalid_values_are_refused_by_name() {
         for (text, words) in [
             ("seeds = []", "seeds = []: name one or more"),
             ("actors = 0", "actors = 0: must be 1 to 1024"),
             ("parallel = 0", "parallel"),
             ("[grid]\n\"latent.beta\" = 0", "`network.latent.beta` must be a list of values"),
             ("[grid]\n\"latent.beta\" = []", "`network.latent.beta` must be a list of values"),
-            ("[grid]\nbeta = [0]\n\"latent.beta\" = [0]", "`network.latent.beta` is there twice"),
+            ("[grid]\nbeta = [0]\n\"latent.beta\" = [0]", "`network.latent.beta` occurs twice"),
             ("[set]\nbeta = 0\n[grid]\n\"latent.beta\" = [0]", "is in `set` and in `grid`"),
             ("[grid]\nseed = [1, 2]", "write the seeds as `seeds"),
         ] {

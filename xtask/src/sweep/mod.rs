@@ -1,7 +1,8 @@
-//! `cargo xtask sweep`: an experiment with some of its fields varied, run by run, and what each value was worth.
+//! `cargo xtask sweep`: trains an experiment with varied fields, and compares the results.
 
 mod board;
 mod document;
+mod outcome;
 mod plan;
 mod table;
 
@@ -18,12 +19,13 @@ use crate::train::display::Display;
 use crate::{plot, train, workspace};
 use board::Board;
 use document::Document;
+use outcome::Outcome;
 use plan::{Point, Run};
-use table::{Outcome, Row};
+use table::Row;
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
-    /// What is varied; docs/sweeps has examples
+    /// The file of the sweep; docs/sweeps has examples
     #[arg(value_name = "FILE")]
     file: PathBuf,
     /// Directory of the runs, tables and curves [default: runs/sweep-FILE]
@@ -31,7 +33,7 @@ pub(crate) struct Options {
     out: Option<PathBuf>,
 }
 
-/// Trains and evaluates what is not there yet, and prints the table.
+/// Trains and evaluates the runs that are not finished, and prints the table.
 pub(crate) fn run(options: Options) -> Result<()> {
     let name = options.file.file_stem().unwrap_or_default().to_string_lossy();
     let out = options.out.unwrap_or_else(|| workspace::root().join("runs").join(format!("sweep-{name}")));
@@ -45,21 +47,21 @@ pub(crate) fn run(options: Options) -> Result<()> {
         }
         run.job.evaluate(display, &interrupt).map(drop)
     });
-    println!("\n{}\nkept in {}", table::markdown(&sweep.rows()), sweep.directory.display());
+    println!("\n{}\nwritten to {}", table::markdown(&sweep.rows()), sweep.directory.display());
     ended
 }
 
-/// Every run there is to be, and where.
+/// All runs of a sweep.
 struct Sweep {
     directory: PathBuf,
-    /// Runs at once.
+    /// Runs at the same time.
     parallel: usize,
     points: Vec<Point>,
     runs: Vec<Run>,
 }
 
 impl Sweep {
-    /// Reads the file, and refuses whatever one of its runs would be refused for.
+    /// Reads the file. Refuses it if one of its runs would be refused.
     fn plan(file: &Path, out: &Path) -> Result<Self> {
         let document = Document::read(file)?;
         let directory = std::path::absolute(out).with_context(|| format!("no such path: {}", out.display()))?;
@@ -68,8 +70,8 @@ impl Sweep {
         Ok(Self { directory, parallel: document.parallel.get(), points, runs })
     }
 
-    /// Has `train` make every run that is not finished, some at once, and sums up after each of them. One that fails does
-    /// not stop the others; a request to stop does.
+    /// Calls `train` for every run that is not finished, for several at the same time, and writes the tables after each.
+    /// A run that fails does not stop the others; a request to stop does.
     fn run(&self, interrupt: &Interrupt, train: impl Fn(&Run, &mut Display) -> Result<()> + Sync) -> Result<()> {
         let left: Vec<&Run> = self.runs.iter().filter(|run| !run.finished()).collect();
         let board = Board::new(self.runs.len(), self.runs.len() - left.len());
@@ -87,7 +89,7 @@ impl Sweep {
                         let mut display = board.display(run);
                         let outcome = train(run, &mut display).and_then(|()| run.outcome());
                         show(display, &outcome, interrupt.requested());
-                        // Who receives it stays until every sender is gone.
+                        // The receiver exists as long as there is a sender.
                         let _ = report.send((run, outcome.is_ok()));
                     }
                 });
@@ -99,19 +101,22 @@ impl Sweep {
                 } else {
                     failed.push(run.name.as_str());
                 }
-                // Whatever keeps it from that will keep it at the end too, and is reported there.
-                let _ = self.sum_up();
+                // The tables are written again at the end, where an error is reported.
+                let _ = self.write_tables();
             }
         });
         board.finish();
-        self.sum_up()?;
+        self.write_tables()?;
         let finished = self.runs.iter().filter(|run| run.finished()).count();
         if interrupt.requested() {
-            bail!("interrupted; {finished} of {} runs are finished, the same command goes on", self.runs.len());
+            bail!(
+                "interrupted; {finished} of {} runs are finished, the same command resumes the sweep",
+                self.runs.len()
+            );
         }
         if !failed.is_empty() {
             bail!(
-                "{} of {} runs failed ({}); the same command tries them again, and their logs are in {}",
+                "{} of {} runs failed ({}); the same command tries them again; their logs are in {}",
                 failed.len(),
                 self.runs.len(),
                 failed.join("; "),
@@ -125,8 +130,8 @@ impl Sweep {
         Row::all(&self.points, &self.runs)
     }
 
-    /// Writes both tables and the picture of the runs that are finished.
-    fn sum_up(&self) -> Result<()> {
+    /// Writes both tables and the picture of the finished runs.
+    fn write_tables(&self) -> Result<()> {
         let rows = self.rows();
         let write = |name: &str, text: String| {
             let path = self.directory.join(name);
@@ -148,7 +153,7 @@ impl Sweep {
     }
 }
 
-/// How a run ended, where a person looks.
+/// Shows how a run ended.
 fn show(display: Display, outcome: &Result<Outcome>, interrupted: bool) {
     match outcome {
         Ok(outcome) => {
@@ -167,19 +172,19 @@ mod tests {
 
     use super::*;
 
-    /// A directory with a sweep over two values and two seeds, and who was trained in it.
-    struct Bench {
+    /// A directory with a sweep over two values and two seeds, and the runs that were trained in it.
+    struct Trial {
         directory: tempfile::TempDir,
         trained: Mutex<Vec<String>>,
     }
 
     const ALL: [&str; 4] = ["beta=0,seed=1", "beta=0,seed=2", "beta=1e-4,seed=1", "beta=1e-4,seed=2"];
 
-    impl Bench {
+    impl Trial {
         fn new() -> Self {
-            let bench = Self { directory: tempfile::tempdir().unwrap(), trained: Mutex::default() };
-            bench.write("preset = \"quickstart\"\nseeds = [1, 2]\n[grid]\n\"latent.beta\" = [0, 1e-4]\n");
-            bench
+            let trial = Self { directory: tempfile::tempdir().unwrap(), trained: Mutex::default() };
+            trial.write("preset = \"quickstart\"\nseeds = [1, 2]\n[grid]\n\"latent.beta\" = [0, 1e-4]\n");
+            trial
         }
 
         fn write(&self, text: &str) {
@@ -190,7 +195,7 @@ mod tests {
             Sweep::plan(&self.directory.path().join("sweep.toml"), &self.directory.path().join("out"))
         }
 
-        /// Leaves in the run's directory what training does.
+        /// Writes the files of a finished run.
         fn train(&self, run: &Run) -> Result<()> {
             self.begin(run);
             let overall = json!({
@@ -202,7 +207,7 @@ mod tests {
             Ok(())
         }
 
-        /// Leaves in the run's directory what training does until it is interrupted.
+        /// Writes the files of an interrupted run.
         fn begin(&self, run: &Run) {
             self.trained.lock().unwrap().push(run.name.clone());
             fs::create_dir_all(run.job.path().join("checkpoints")).unwrap();
@@ -212,7 +217,7 @@ mod tests {
             fs::write(run.job.path().join("metrics.jsonl"), line + "\n").unwrap();
         }
 
-        /// Who was trained since the last call.
+        /// The runs that were trained since the last call.
         fn trained(&self) -> Vec<String> {
             let mut names = std::mem::take(&mut *self.trained.lock().unwrap());
             names.sort();
@@ -225,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn the_sweeps_in_the_docs_are_sweeps() {
+    fn the_sweeps_in_the_docs_are_valid() {
         let files = fs::read_dir(workspace::root().join("docs/sweeps")).unwrap();
         for file in files.map(|file| file.unwrap().path()) {
             Sweep::plan(&file, tempfile::tempdir().unwrap().path()).unwrap();
@@ -233,71 +238,71 @@ mod tests {
     }
 
     #[test]
-    fn every_run_is_trained_once_and_summed_up() {
-        let bench = Bench::new();
-        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
-        assert_eq!(bench.trained(), ALL);
-        assert!(bench.out("table.md").contains("| 1e-4 | 1, 2 | 1.500 (1.000–2.000) | 0.500 |"));
-        let table: serde_json::Value = serde_json::from_str(&bench.out("table.json")).unwrap();
+    fn every_run_is_trained_once_and_is_in_the_tables() {
+        let trial = Trial::new();
+        trial.plan().unwrap().run(&Interrupt::default(), |run, _| trial.train(run)).unwrap();
+        assert_eq!(trial.trained(), ALL);
+        assert!(trial.out("table.md").contains("| 1e-4 | 1, 2 | 1.500 (1.000–2.000) | 0.500 |"));
+        let table: serde_json::Value = serde_json::from_str(&trial.out("table.json")).unwrap();
         assert_eq!(table[1]["normalised_reward"]["mean"], 1.5);
-        assert!(bench.out("curves.svg").contains("beta=1e-4"));
+        assert!(trial.out("curves.svg").contains("beta=1e-4"));
     }
 
     #[test]
-    fn what_is_finished_is_not_trained_again() {
-        let bench = Bench::new();
-        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
-        bench.trained();
-        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
-        assert!(bench.trained().is_empty());
+    fn finished_runs_are_not_trained_again() {
+        let trial = Trial::new();
+        trial.plan().unwrap().run(&Interrupt::default(), |run, _| trial.train(run)).unwrap();
+        trial.trained();
+        trial.plan().unwrap().run(&Interrupt::default(), |run, _| trial.train(run)).unwrap();
+        assert!(trial.trained().is_empty());
     }
 
     #[test]
     fn a_run_that_fails_does_not_stop_the_others_and_is_tried_again() {
-        let bench = Bench::new();
-        let train = |run: &Run, _: &mut Display| if run.name == ALL[1] { bail!("diverged") } else { bench.train(run) };
-        let error = bench.plan().unwrap().run(&Interrupt::default(), train).unwrap_err().to_string();
+        let trial = Trial::new();
+        let train = |run: &Run, _: &mut Display| if run.name == ALL[1] { bail!("diverged") } else { trial.train(run) };
+        let error = trial.plan().unwrap().run(&Interrupt::default(), train).unwrap_err().to_string();
         assert!(error.starts_with("1 of 4 runs failed (beta=0,seed=2)"), "{error}");
-        assert_eq!(bench.trained().len(), 3);
-        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
-        assert_eq!(bench.trained(), [ALL[1]]);
+        assert_eq!(trial.trained().len(), 3);
+        trial.plan().unwrap().run(&Interrupt::default(), |run, _| trial.train(run)).unwrap();
+        assert_eq!(trial.trained(), [ALL[1]]);
     }
 
     #[test]
-    fn an_interrupted_sweep_begins_no_other_run_and_goes_on_with_the_one_it_left() {
-        let bench = Bench::new();
+    fn an_interrupted_sweep_starts_no_other_run_and_is_resumed() {
+        let trial = Trial::new();
         let interrupt = Interrupt::default();
         let train = |run: &Run, _: &mut Display| {
-            bench.begin(run);
+            trial.begin(run);
             interrupt.request();
             bail!("interrupted")
         };
-        let error = bench.plan().unwrap().run(&interrupt, train).unwrap_err().to_string();
-        assert_eq!(error, "interrupted; 0 of 4 runs are finished, the same command goes on");
-        assert_eq!(bench.trained(), [ALL[0]]);
-        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
-        assert_eq!(bench.trained(), ALL);
+        let error = trial.plan().unwrap().run(&interrupt, train).unwrap_err().to_string();
+        assert_eq!(error, "interrupted; 0 of 4 runs are finished, the same command resumes the sweep");
+        assert_eq!(trial.trained(), [ALL[0]]);
+        trial.plan().unwrap().run(&Interrupt::default(), |run, _| trial.train(run)).unwrap();
+        assert_eq!(trial.trained(), ALL);
     }
 
     #[test]
-    fn as_many_runs_as_the_file_says_go_on_at_once() {
-        let bench = Bench::new();
-        bench.write("preset = \"quickstart\"\nparallel = 2\nseeds = [1, 2]");
+    fn as_many_runs_as_the_file_says_run_at_the_same_time() {
+        let trial = Trial::new();
+        trial.write("preset = \"quickstart\"\nparallel = 2\nseeds = [1, 2]");
         let both = Barrier::new(2);
         let train = |run: &Run, _: &mut Display| {
             both.wait();
-            bench.train(run)
+            trial.train(run)
         };
-        bench.plan().unwrap().run(&Interrupt::default(), train).unwrap();
-        assert_eq!(bench.trained(), ["seed=1", "seed=2"]);
+        trial.plan().unwrap().run(&Interrupt::default(), train).unwrap();
+        assert_eq!(trial.trained(), ["seed=1", "seed=2"]);
     }
 
     #[test]
-    fn a_file_that_was_changed_under_its_runs_is_refused() {
-        let bench = Bench::new();
-        bench.plan().unwrap().run(&Interrupt::default(), |run, _| bench.train(run)).unwrap();
-        bench.write("preset = \"quickstart\"\n[set]\nbudget.minutes = 1\n[grid]\n\"latent.beta\" = [0]\n");
-        let error = format!("{:#}", bench.plan().err().unwrap());
+    fn a_file_that_differs_from_its_runs_is_refused() {
+        let trial = Trial::new();
+        trial.plan().unwrap().run(&Interrupt::default(), |run, _| trial.train(run)).unwrap();
+        trial.write("preset = \"quickstart\"\n[set]\nbudget.minutes = 1\n[grid]\n\"latent.beta\" = [0]\n");
+        let error = format!("{:#}", trial.plan().err().unwrap());
         assert!(error.contains("sweep.toml: beta=0,seed=1: ") && error.contains("budget.minutes"), "{error}");
     }
 }

@@ -1,4 +1,4 @@
-//! What a sweep runs: every combination of its grid, with every seed, each in a directory named after it.
+//! The runs of a sweep: every combination of the grid's values with every seed, each in a directory with its name.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -8,18 +8,18 @@ use comic_experiment::Experiment;
 use toml::Value;
 
 use super::document::Document;
-use super::table::Outcome;
+use super::outcome::Outcome;
 use crate::train::{self, Job};
 
-/// Bytes a directory's name may have, on every file system there is.
+/// Bytes that the name of a directory may have on every common file system.
 const LONGEST_NAME: usize = 255;
 
 /// One of the grid's fields and one of its values.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Setting {
-    /// The field's whole name.
+    /// The field's full name.
     pub(super) field: String,
-    /// As short as it can be told from the grid's other fields.
+    /// The shortest name that differs from those of the grid's other fields.
     pub(super) short: String,
     pub(super) value: Value,
 }
@@ -29,7 +29,7 @@ pub(super) struct Setting {
 pub(super) struct Point(pub(super) Vec<Setting>);
 
 impl Point {
-    /// `beta=1e-4,size=20`; "all" where nothing is varied but the seed.
+    /// `beta=1e-4,size=20`, or "all" where only the seed varies.
     pub(super) fn name(&self) -> String {
         let settings: Vec<_> =
             self.0.iter().map(|setting| format!("{}={}", setting.short, text(&setting.value))).collect();
@@ -39,16 +39,16 @@ impl Point {
 
 /// One run: a grid point with a seed.
 pub(super) struct Run {
-    /// `beta=1e-4,seed=2`, its directory's name too.
+    /// `beta=1e-4,seed=2`, which is also the name of its directory.
     pub(super) name: String,
-    /// Which grid point.
+    /// The index of the grid point.
     pub(super) point: usize,
     pub(super) seed: u64,
     pub(super) job: Job,
 }
 
 impl Run {
-    /// What it came to; an error while it is not trained and evaluated to the end.
+    /// The result; an error while the run is not finished.
     pub(super) fn outcome(&self) -> Result<Outcome> {
         Outcome::read(self.job.path())
     }
@@ -58,7 +58,7 @@ impl Run {
     }
 }
 
-/// Every combination of the grid's values, the last field's changing fastest.
+/// Every combination of the grid's values. The values of the last field change fastest.
 pub(super) fn points(document: &Document) -> Vec<Point> {
     let short = |field: &str| {
         let end = |field: &str| field.rsplit('.').next().unwrap_or_default().to_owned();
@@ -74,8 +74,8 @@ pub(super) fn points(document: &Document) -> Vec<Point> {
     })
 }
 
-/// The runs of `points` with every seed, below `directory`. All of them are resolved here, and compared with what the
-/// directories hold already.
+/// The runs of `points` with every seed, below `directory`. Resolves all of them, and compares them with existing
+/// directories.
 pub(super) fn runs(document: &Document, points: &[Point], directory: &Path) -> Result<Vec<Run>> {
     let mut names = BTreeSet::new();
     let mut runs = Vec::new();
@@ -84,10 +84,12 @@ pub(super) fn runs(document: &Document, points: &[Point], directory: &Path) -> R
             let seed_name = format!("seed={seed}");
             let name = if point.0.is_empty() { seed_name } else { format!("{},{seed_name}", point.name()) };
             if name.len() > LONGEST_NAME {
-                bail!("{name}: a directory's name may have {LONGEST_NAME} bytes: put the values into files of presets");
+                bail!(
+                    "{name}: the name of a directory may have {LONGEST_NAME} bytes: put the values into preset files"
+                );
             }
             if !names.insert(name.clone()) {
-                bail!("{name}: two runs would have this name: leave out the value or seed that is there twice");
+                bail!("{name}: two runs would have this name: remove the value or seed that occurs twice");
             }
             let job = job(document, point, seed, &directory.join(&name)).with_context(|| name.clone())?;
             runs.push(Run { name, point: index, seed, job });
@@ -96,7 +98,7 @@ pub(super) fn runs(document: &Document, points: &[Point], directory: &Path) -> R
     Ok(runs)
 }
 
-/// The run as `cargo xtask train` would make it or go on with it.
+/// The run, as `cargo xtask train` would start or resume it.
 fn job(document: &Document, point: &Point, seed: u64, directory: &Path) -> Result<Job> {
     let varied = point.0.iter().map(|setting| (&setting.field, &setting.value));
     let set = document.set.iter().map(|(field, value)| (field, value));
@@ -119,15 +121,15 @@ fn job(document: &Document, point: &Point, seed: u64, directory: &Path) -> Resul
     Ok(job)
 }
 
-/// A run that is there was made by this sweep, or by another one of the same name.
+/// Refuses an existing run with another experiment, for instance of another sweep with the same name.
 fn refuse_another_experiment(wanted: &Experiment, directory: &Path) -> Result<()> {
     let path = directory.join("experiment.toml");
     let Ok(text) = std::fs::read_to_string(&path) else { return Ok(()) };
     let made = Experiment::from_toml(&path.display().to_string(), &text)?;
     if let Some(difference) = made.differences(wanted)?.into_iter().next() {
         bail!(
-            "{} was made with `{} = {}`, and the sweep now says `{}`: put the old value back, remove that directory, or \
-             name another place for the sweep by --out",
+            "{} has `{} = {}`, and the sweep has `{}`: restore the old value, remove that directory, or choose another \
+             directory for the sweep with --out",
             directory.display(),
             difference.field,
             difference.ours,
@@ -137,7 +139,7 @@ fn refuse_another_experiment(wanted: &Experiment, directory: &Path) -> Result<()
     Ok(())
 }
 
-/// A value as a part of a file's name: `1e-4`, `reference-mean`, `64-64`.
+/// A value as part of a file name: `1e-4`, `reference-mean`, `64-64`.
 pub(super) fn text(value: &Value) -> String {
     let text = match value {
         Value::Float(number) => {
@@ -168,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn every_combination_runs_with_every_seed() {
+    fn every_combination_has_a_run_with_every_seed() {
         let names = names("seeds = [1, 2]\n[grid]\n\"latent.beta\" = [0, 1e-4]\n\"latent.size\" = [20, 60]").unwrap();
         assert_eq!(
             names,
@@ -191,13 +193,13 @@ mod tests {
     }
 
     #[test]
-    fn fields_that_end_alike_are_named_in_full() {
+    fn fields_with_the_same_ending_have_full_names() {
         let names = names("[grid]\n\"network.initial_std\" = [0.1]\n\"latent.initial_std\" = [0.2]").unwrap();
         assert_eq!(names, ["network.initial_std=0.1,network.latent.initial_std=0.2,seed=1"]);
     }
 
     #[test]
-    fn values_are_short_and_fit_for_a_files_name() {
+    fn values_are_short_and_usable_in_file_names() {
         for (value, name) in [
             (Value::Float(1e-4), "1e-4"),
             (Value::Float(0.1), "0.1"),
@@ -213,20 +215,20 @@ mod tests {
     }
 
     #[test]
-    fn two_runs_of_one_name_are_refused() {
+    fn two_runs_with_the_same_name_are_refused() {
         for text in ["seeds = [1, 1]", "[grid]\n\"latent.beta\" = [1e-4, 0.0001]"] {
             assert!(names(text).unwrap_err().to_string().contains("two runs would have this name"));
         }
     }
 
     #[test]
-    fn a_value_that_makes_no_experiment_is_refused_with_its_run() {
+    fn an_invalid_value_is_refused_with_its_run() {
         let error = format!("{:#}", names("[grid]\n\"latent.beta\" = [0, -1]").unwrap_err());
         assert!(error.starts_with("beta=-1,seed=1: ") && error.contains("must be 0 or more"), "{error}");
     }
 
     #[test]
-    fn a_directory_of_the_same_experiment_is_taken_and_of_another_one_refused() {
+    fn a_directory_with_the_same_experiment_is_used_and_with_another_one_refused() {
         let document = document("[grid]\n\"latent.beta\" = [0.5]");
         let directory = tempfile::tempdir().unwrap();
         let made = |beta: &str| {
@@ -238,6 +240,6 @@ mod tests {
         };
         assert!(made("0.5").is_ok());
         let error = format!("{:#}", made("0.25").err().unwrap());
-        assert!(error.contains("was made with `network.latent.beta = 0.25`, and the sweep now says `0.5`"), "{error}");
+        assert!(error.contains("has `network.latent.beta = 0.25`, and the sweep has `0.5`"), "{error}");
     }
 }

@@ -1,63 +1,17 @@
-//! What the runs of a sweep came to: a row for each grid point, mean and range over its seeds.
+//! The results of a sweep: a row for each grid point, with mean and range over its seeds.
 
-use std::path::Path;
-
-use anyhow::{Context, Result};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
+use super::outcome::Outcome;
 use super::plan::{Point, Run, text};
-use crate::train::{evaluation, metrics};
 
-/// Lines at the end of a run's metrics whose mean the latent's KL is: each tells only of the newest update.
-const LAST_LINES: usize = 5;
-
-/// What one finished run came to.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Outcome {
-    /// Without noise, over all starts; so are the next two.
-    pub(super) normalised_reward: f64,
-    /// Per survived step / the most a step pays.
-    pub(super) reward_per_step: f64,
-    /// Steps.
-    pub(super) episode_length: f64,
-    /// Nats a step.
-    pub(super) latent_kl: Option<f64>,
-    pub(super) environment_steps: f64,
-    /// Wall clock since the first unroll.
-    pub(super) minutes: f64,
-}
-
-impl Outcome {
-    /// Of the finished run in `directory`. The evaluation is the last thing a run writes: without it, it is not finished.
-    pub(super) fn read(directory: &Path) -> Result<Self> {
-        let evaluations = evaluation::read(directory)?;
-        let trained = evaluations.get("trained").with_context(|| {
-            format!(
-                "{} has no evaluation of a trained policy: its budget ended before the first update",
-                directory.display()
-            )
-        })?;
-        let lines = metrics::read(&directory.join("metrics.jsonl"))?;
-        let last = lines.last().with_context(|| format!("{} holds no line of metrics", directory.display()))?;
-        let kls: Vec<f64> = lines.iter().rev().filter_map(metrics::Line::latent_kl).take(LAST_LINES).collect();
-        Ok(Self {
-            normalised_reward: trained.overall.normalised_reward,
-            reward_per_step: trained.overall.reward_per_step,
-            episode_length: trained.overall.length_mean,
-            latent_kl: Spread::of(&kls).map(|spread| spread.mean),
-            environment_steps: last.environment_steps as f64,
-            minutes: last.seconds / 60.0,
-        })
-    }
-}
-
-/// A column: its key in JSON, its head in Markdown, decimals, and what stands in it.
+/// A column: its key in JSON, its heading in Markdown, its decimals, and its value.
 type Column = (&'static str, &'static str, usize, fn(&Outcome) -> Option<f64>);
 
 const COLUMNS: [Column; 6] = [
     ("normalised_reward", "normalised reward", 3, |outcome| Some(outcome.normalised_reward)),
-    ("reward_per_step", "reward per step / most", 3, |outcome| Some(outcome.reward_per_step)),
+    ("reward_per_step", "reward per step / largest", 3, |outcome| Some(outcome.reward_per_step)),
     ("episode_length", "episode length", 1, |outcome| Some(outcome.episode_length)),
     ("latent_kl", "latent KL, nats per step", 2, |outcome| outcome.latent_kl),
     ("environment_steps", "environment steps", 0, |outcome| Some(outcome.environment_steps)),
@@ -73,7 +27,7 @@ struct Spread {
 }
 
 impl Spread {
-    /// `None` of nothing.
+    /// `None` of no values.
     fn of(values: &[f64]) -> Option<Self> {
         let mean = values.iter().sum::<f64>() / values.len() as f64;
         let min = values.iter().copied().reduce(f64::min)?;
@@ -81,7 +35,7 @@ impl Spread {
         Some(Self { mean, min, max })
     }
 
-    /// `0.402 (0.388–0.416)`, and only the mean where there is no range.
+    /// `0.402 (0.388–0.416)`, or only the mean where all values are equal.
     fn text(self, decimals: usize) -> String {
         let [mean, min, max] = [self.mean, self.min, self.max].map(|value| format!("{value:.decimals$}"));
         if min == max { mean } else { format!("{mean} ({min}–{max})") }
@@ -95,7 +49,7 @@ pub(super) struct Row<'a> {
 }
 
 impl<'a> Row<'a> {
-    /// One for each point, of whatever runs are finished.
+    /// A row for each point, from the runs that are finished.
     pub(super) fn all(points: &'a [Point], runs: &[Run]) -> Vec<Self> {
         let row = |(index, point)| {
             let runs = runs.iter().filter(|run| run.point == index);
@@ -109,13 +63,13 @@ impl<'a> Row<'a> {
     }
 }
 
-/// A row for each grid point, a column for each of its fields and for each figure.
+/// A row for each grid point, a column for each of its fields and for each result.
 pub(super) fn markdown(rows: &[Row]) -> String {
     let Some(first) = rows.first() else { return String::new() };
     let fields = first.point.0.iter().map(|setting| setting.short.as_str());
     let figures = COLUMNS.iter().map(|(_, head, ..)| *head);
     let head: Vec<&str> = fields.chain(["seeds"]).chain(figures).collect();
-    let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
+    let line = |values: &[String]| format!("| {} |\n", values.join(" | "));
     let mut table = line(&head.iter().map(ToString::to_string).collect::<Vec<_>>());
     table += &line(&vec!["---".to_owned(); head.len()]);
     for row in rows {
@@ -127,11 +81,11 @@ pub(super) fn markdown(rows: &[Row]) -> String {
         table += &line(&values.chain([seeds]).chain(figures).collect::<Vec<_>>());
     }
     table
-        + "\nMean over the seeds that are finished (least–most). Rewards and lengths are the trained policy's without \
-             noise, over every start; the KL is that of the last updates.\n"
+        + "\nMean over the finished seeds (minimum–maximum). Rewards and lengths are those of the trained policy without \
+             noise over every start; the KL is that of the last updates.\n"
 }
 
-/// The same as JSON, an object for each grid point.
+/// The same table in JSON, an object for each grid point.
 pub(super) fn json(rows: &[Row]) -> Value {
     let row = |row: &Row| {
         let point: Map<String, Value> =
@@ -174,49 +128,11 @@ mod tests {
     }
 
     #[test]
-    fn json_has_whole_names_and_numbers() {
+    fn json_has_full_names_and_numbers() {
         let rows = json(&row(&point(), &[0.25, 0.75]));
         assert_eq!(rows[0]["point"], json!({ "network.latent.beta": 1e-4 }));
         assert_eq!(rows[0]["seeds"], json!([1, 2]));
         assert_eq!(rows[0]["normalised_reward"], json!({ "mean": 0.5, "min": 0.25, "max": 0.75 }));
         assert_eq!(rows[0]["latent_kl"], Value::Null);
-    }
-
-    #[test]
-    fn a_runs_kl_is_that_of_its_last_lines_and_its_reward_the_trained_policys() {
-        let directory = tempfile::tempdir().unwrap();
-        let line = |number: u32| {
-            let kl = if number < 3 { 100.0 } else { 4.0 };
-            json!({ "seconds": 60 * number, "environment_steps": number, "losses": { "latent_kl": kl } }).to_string()
-        };
-        std::fs::write(directory.path().join("metrics.jsonl"), (1..8).map(|n| line(n) + "\n").collect::<String>())
-            .unwrap();
-        let overall = |reward: f64| {
-            json!({ "clips": [], "overall": {
-                "clip": "overall", "episodes": 1, "length_mean": 30.0, "return_mean": 1.0, "normalised_reward": reward,
-                "reward_per_step": 0.5, "fraction_survived": 1.0, "reward_terms": {},
-            } })
-        };
-        let evaluations = json!({ "untrained": overall(0.1), "trained": overall(0.4) });
-        std::fs::write(directory.path().join("evaluation.json"), evaluations.to_string()).unwrap();
-        assert_eq!(
-            Outcome::read(directory.path()).unwrap(),
-            Outcome {
-                normalised_reward: 0.4,
-                reward_per_step: 0.5,
-                episode_length: 30.0,
-                latent_kl: Some(4.0),
-                environment_steps: 7.0,
-                minutes: 7.0,
-            }
-        );
-    }
-
-    #[test]
-    fn a_run_whose_evaluation_was_cut_off_came_to_nothing_yet() {
-        let directory = tempfile::tempdir().unwrap();
-        std::fs::write(directory.path().join("metrics.jsonl"), "{}\n").unwrap();
-        std::fs::write(directory.path().join("evaluation.json"), "{\"trained\": {\"cli").unwrap();
-        assert!(Outcome::read(directory.path()).is_err());
     }
 }

@@ -1,5 +1,4 @@
-//! What a person sees while a run goes on: a panel on a terminal, a row of its own where several runs share one, JSON
-//! lines elsewhere.
+//! Shows a run's progress: a panel on a terminal, a row of the terminal that several runs share, JSON lines elsewhere.
 
 use std::path::PathBuf;
 use std::process::Stdio;
@@ -11,26 +10,26 @@ use comic_setup::on_terminal;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Map, Value};
 
-use super::metrics::Line;
 use super::process::append;
+use crate::metrics::Line;
 
-/// One run as a person sees it.
+/// The display of one run.
 pub(crate) struct Display {
-    sight: Sight,
-    /// What the run is called beside others.
+    output: Output,
+    /// The run's name, if several runs share the terminal.
     name: Option<String>,
     budget: Budget,
     started: Instant,
 }
 
-enum Sight {
-    /// Several lines that stay, on a terminal of the run's own.
+enum Output {
+    /// Several lines that are updated, on a terminal of the run's own.
     Panel(ProgressBar),
-    /// Plain lines under a panel that is finished.
+    /// Plain lines below a finished panel.
     Text,
-    /// One line that shows the newest, on a terminal that runs share.
+    /// One line that is updated, on a terminal that several runs share.
     Row(ProgressBar),
-    /// JSON lines, where no terminal is.
+    /// JSON lines, where there is no terminal.
     Lines,
 }
 
@@ -38,7 +37,7 @@ enum Sight {
 const TICKS: f64 = 1000.0;
 
 impl Display {
-    /// Of a run that has the terminal for itself.
+    /// For a run that has the terminal for itself.
     pub(super) fn new(budget: &Budget) -> Self {
         let panel = || {
             let panel = ProgressBar::with_draw_target(Some(TICKS as u64), ProgressDrawTarget::stderr());
@@ -49,69 +48,69 @@ impl Display {
             panel.enable_steady_tick(Duration::from_millis(500));
             panel
         };
-        let sight = if on_terminal() { Sight::Panel(panel()) } else { Sight::Lines };
-        Self { sight, name: None, budget: budget.clone(), started: Instant::now() }
+        let output = if on_terminal() { Output::Panel(panel()) } else { Output::Lines };
+        Self { output, name: None, budget: budget.clone(), started: Instant::now() }
     }
 
-    /// Of the run `name` beside others: in a row of their terminal, which this styles, if they have one.
+    /// For the run `name` among several: in `row` of their terminal, if there is one.
     pub(crate) fn beside_others(name: &str, budget: &Budget, row: Option<ProgressBar>) -> Self {
-        let sight = row.map_or(Sight::Lines, |row| {
+        let output = row.map_or(Output::Lines, |row| {
             row.set_length(TICKS as u64);
             if let Ok(style) = ProgressStyle::with_template("  {prefix} {bar:16} {percent:>3} %  {wide_msg}") {
                 row.set_style(style);
             }
             row.set_prefix(name.to_owned());
-            Sight::Row(row)
+            Output::Row(row)
         });
-        Self { sight, name: Some(name.to_owned()), budget: budget.clone(), started: Instant::now() }
+        Self { output, name: Some(name.to_owned()), budget: budget.clone(), started: Instant::now() }
     }
 
-    /// Something happened that is worth a line.
+    /// Shows an event with its facts.
     pub(super) fn event(&mut self, event: &str, facts: &[(&str, String)]) {
-        match &self.sight {
-            Sight::Panel(panel) => panel.println(event_text(event, facts)),
-            Sight::Text => eprintln!("{}", event_text(event, facts)),
-            Sight::Row(row) => row.set_message(event_text(event, facts).replace('\n', " ")),
-            Sight::Lines => {
+        match &self.output {
+            Output::Panel(panel) => panel.println(event_text(event, facts)),
+            Output::Text => eprintln!("{}", event_text(event, facts)),
+            Output::Row(row) => row.set_message(event_text(event, facts).replace('\n', " ")),
+            Output::Lines => {
                 let facts = facts.iter().map(|(name, value)| ((*name).to_owned(), Value::from(value.as_str())));
                 self.line(event, facts.collect());
             }
         }
     }
 
-    /// The learner wrote a line into its log.
+    /// Shows a line of the learner's log.
     pub(super) fn learner(&mut self, line: &str) {
-        // Its own date and level say nothing that a panel does not.
-        let said = line.split_once(" INFO ").map_or(line, |(_, said)| said);
-        self.event("learner", &[("says", said.trim().to_owned())]);
+        // The date and the level are left out.
+        let message = line.split_once(" INFO ").map_or(line, |(_, message)| message);
+        self.event("learner", &[("message", message.trim().to_owned())]);
     }
 
-    /// A line of metrics came.
+    /// Shows a line of metrics.
     pub(super) fn metrics(&mut self, text: &str) {
         let Ok(line) = serde_json::from_str::<Line>(text) else {
             self.event("unreadable metrics", &[("line", text.to_owned())]);
             return;
         };
-        let ticks = (self.share(&line) * TICKS) as u64;
-        match &self.sight {
-            Sight::Panel(panel) => {
+        let ticks = (self.used_budget(&line) * TICKS) as u64;
+        match &self.output {
+            Output::Panel(panel) => {
                 panel.set_message(panel_text(&line));
                 panel.set_position(ticks);
             }
-            Sight::Row(row) => {
+            Output::Row(row) => {
                 row.set_message(row_text(&line));
                 row.set_position(ticks);
             }
-            Sight::Text | Sight::Lines => {
+            Output::Text | Output::Lines => {
                 let facts = serde_json::from_str::<Map<String, Value>>(text).unwrap_or_default();
                 self.line("progress", facts);
             }
         }
     }
 
-    /// How much of the budget is spent, 0 to 1; whatever limit comes first.
-    fn share(&self, line: &Line) -> f64 {
-        let of = |spent: f64, limit: f64| if limit > 0.0 { spent / limit } else { 0.0 };
+    /// The used fraction of the budget, 0 to 1, by the limit that is nearest.
+    fn used_budget(&self, line: &Line) -> f64 {
+        let of = |used: f64, limit: f64| if limit > 0.0 { used / limit } else { 0.0 };
         of(line.seconds, self.budget.minutes * 60.0)
             .max(of(line.environment_steps as f64, self.budget.environment_steps as f64))
             .max(of(line.updates as f64, self.budget.updates as f64))
@@ -127,23 +126,23 @@ impl Display {
         eprintln!("{}", Value::Object(facts));
     }
 
-    /// Where a child says how far it is: here, or in `log` where runs are beside each other.
+    /// Where a child writes its progress: to this terminal, or to `log` if several runs share it.
     pub(super) fn stderr(&self, log: PathBuf) -> Result<Stdio> {
         Ok(if self.name.is_some() { append(&log)?.into() } else { Stdio::inherit() })
     }
 
-    /// Leaves the panel standing as it is; what comes after it are lines below.
+    /// Leaves the panel as it is; later events are lines below it.
     pub(super) fn finish(&mut self) {
-        if let Sight::Panel(panel) = &self.sight {
+        if let Output::Panel(panel) = &self.output {
             panel.abandon();
-            self.sight = Sight::Text;
+            self.output = Output::Text;
         }
     }
 
-    /// The run beside others is over: its last event takes the place of its row.
+    /// Replaces the run's row by its last event.
     pub(crate) fn conclude(mut self, event: &str, facts: &[(&str, String)]) {
-        match (&self.sight, &self.name) {
-            (Sight::Row(row), Some(name)) => {
+        match (&self.output, &self.name) {
+            (Output::Row(row), Some(name)) => {
                 row.println(format!("{name}  {}", event_text(event, facts)));
                 row.finish_and_clear();
             }
@@ -169,10 +168,10 @@ fn panel_text(line: &Line) -> String {
             accounting.produced, accounting.trained, accounting.in_flight
         )
     });
-    // In joint training a line for each task: their rewards have nothing to do with one another.
+    // In joint training one line for each task: rewards of different tasks cannot be compared.
     let tasks = line.tasks.iter().map(|(task, own)| {
         format!(
-            "\n{task:<12}      {:>6}   survived {:>5}   head {:>5} m   environment steps lately {}",
+            "\n{task:<12}      {:>6}   survived {:>5}   head {:>5} m   new environment steps {}",
             number(own.normalised_reward, 3),
             number(own.fraction_survived, 2),
             number(own.head_height, 2),
@@ -211,7 +210,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_panel_shows_every_tasks_own_reward() {
+    fn the_panel_shows_the_reward_of_every_task() {
         let line: Line = serde_json::from_str(
             r#"{"normalised_reward":0.25,"tasks":{"tracking":{"normalised_reward":0.125},
                 "get-up":{"normalised_reward":0.5,"head_height":1.25,"environment_steps":77}}}"#,
@@ -224,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn panel_and_row_show_the_latents_kl_beside_the_reward() {
+    fn panel_and_row_show_the_latents_kl_and_the_reward() {
         let line: Line = serde_json::from_str(r#"{"normalised_reward":0.25,"losses":{"latent_kl":12.345}}"#).unwrap();
         for text in [panel_text(&line), row_text(&line)] {
             assert!(text.contains("latent KL") && text.contains("12.3") && text.contains("0.250"), "{text}");

@@ -1,4 +1,4 @@
-//! What was learnt: the untrained policy and the trained one side by side.
+//! The result of training: the untrained and the trained policy in one table.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -13,17 +13,17 @@ use super::Job;
 use super::display::Display;
 use crate::workspace;
 
-/// What `comic-actor evaluate --json` prints, as far as the table shows it.
+/// The members of the output of `comic-actor evaluate --json` that the table shows.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 pub(crate) struct Evaluation {
     clips: Vec<ClipEvaluation>,
-    /// In joint training, each over all its clips.
+    /// In joint training the tasks, each over all its clips.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     tasks: Vec<ClipEvaluation>,
     pub(crate) overall: ClipEvaluation,
 }
 
-/// Means over the episodes of one clip, or of all.
+/// Means over the episodes of one clip, of one task, or of all.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 pub(crate) struct ClipEvaluation {
     clip: String,
@@ -31,22 +31,22 @@ pub(crate) struct ClipEvaluation {
     /// Steps.
     pub(crate) length_mean: f64,
     return_mean: f64,
-    /// Return / (the most a step pays × the steps that were left at the episode's start).
+    /// Return / (the largest reward of a step × the steps that were left at the episode's start).
     pub(crate) normalised_reward: f64,
-    /// Reward per survived step / the most a step pays.
+    /// Reward per survived step / the largest reward of a step.
     pub(crate) reward_per_step: f64,
     fraction_survived: f64,
-    /// m; unknown to evaluations of earlier releases.
+    /// m; absent in evaluations of earlier releases.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     head_height: Option<f64>,
     /// Per survived step.
     reward_terms: BTreeMap<String, f64>,
 }
 
-/// The file in a run's directory that holds what its policies were worth.
+/// The file with the evaluations in a run's directory.
 const FILE: &str = "evaluation.json";
 
-/// Evaluates the run's policies without noise and keeps them in `evaluation.json`, each with its name.
+/// Evaluates the run's policies without noise and writes the evaluations with the policies' names to `evaluation.json`.
 pub(super) fn compare(job: &Job, display: &mut Display, interrupt: &Interrupt) -> Result<Vec<(String, Evaluation)>> {
     let directory = job.path();
     let policies = job.directory.policies();
@@ -59,7 +59,7 @@ pub(super) fn compare(job: &Job, display: &mut Display, interrupt: &Interrupt) -
         display.event("evaluating", &[("policy", name.into()), ("checkpoint", checkpoint.display().to_string())]);
         let evaluation = evaluate(&checkpoint, job.episodes, display.stderr(job.directory.log("evaluation"))?);
         if interrupt.count() > asked_before {
-            bail!("interrupted during the evaluation; the run is kept in {}", directory.display());
+            bail!("interrupted during the evaluation; the run is in {}", directory.display());
         }
         evaluations.push((name.to_owned(), evaluation?));
     }
@@ -70,11 +70,11 @@ pub(super) fn compare(job: &Job, display: &mut Display, interrupt: &Interrupt) -
     Ok(evaluations)
 }
 
-/// What [`compare`] kept of a run, by the policies' names.
+/// The evaluations that [`compare`] wrote for a run, by the policies' names.
 pub(crate) fn read(directory: &Path) -> Result<BTreeMap<String, Evaluation>> {
     let path = directory.join(FILE);
     let text = fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
-    serde_json::from_slice(&text).with_context(|| format!("{} is no evaluation", path.display()))
+    serde_json::from_slice(&text).with_context(|| format!("{} is not an evaluation", path.display()))
 }
 
 fn evaluate(checkpoint: &Path, episodes: Option<u32>, stderr: Stdio) -> Result<Evaluation> {
@@ -89,23 +89,23 @@ fn evaluate(checkpoint: &Path, episodes: Option<u32>, stderr: Stdio) -> Result<E
         bail!("{} ended with {}", workspace::describe(&command), output.status);
     }
     serde_json::from_slice(&output.stdout)
-        .with_context(|| format!("unreadable answer of {}", workspace::describe(&command)))
+        .with_context(|| format!("unreadable output of {}", workspace::describe(&command)))
 }
 
 impl Evaluation {
-    /// The block of this name.
+    /// The means with this name.
     fn of(&self, clip: &str) -> Option<&ClipEvaluation> {
         self.clips.iter().chain(&self.tasks).chain([&self.overall]).find(|evaluation| evaluation.clip == clip)
     }
 }
 
-/// One block of rows per clip, one column per policy.
+/// A block of rows for each clip, a column for each policy.
 pub(super) fn table(columns: &[(String, Evaluation)]) -> String {
-    let mut text = String::from("\nWhat was learnt (policies without noise)\n");
+    let mut text = String::from("\nEvaluation (policies without noise)\n");
     let Some((_, first)) = columns.first() else { return text };
-    // One clip is all clips.
+    // For one clip the overall block would be the same.
     let overall = (first.clips.len() > 1).then_some(&first.overall);
-    // A task of one clip has its block already.
+    // For one clip the task's block would be the same.
     let tasks = first.tasks.iter().filter(|_| first.clips.len() > first.tasks.len());
     for clip in first.clips.iter().chain(tasks).chain(overall) {
         let of_clip: Vec<_> = columns.iter().map(|(_, evaluation)| evaluation.of(&clip.clip)).collect();
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_has_a_block_per_clip_and_a_column_per_policy() {
+    fn the_table_has_a_block_for_each_clip_and_a_column_for_each_policy() {
         let columns = [("untrained", 0.03), ("trained", 0.41)];
         let table = table(&columns.map(|(name, reward)| (name.to_owned(), evaluation(&["CMU_007_01"], reward))));
         assert!(table.contains("CMU_007_01                       untrained       trained\n"), "{table}");
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn several_clips_are_summed_up() {
+    fn several_clips_have_an_overall_block() {
         let table = table(&[("trained".to_owned(), evaluation(&["walk", "run"], 0.5))]);
         for block in ["\nwalk ", "\nrun ", "\noverall "] {
             assert!(table.contains(block), "{table}");

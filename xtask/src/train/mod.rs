@@ -1,8 +1,7 @@
-//! `cargo xtask train`: one learner and its actors on this machine, watched to the end, and what was learnt.
+//! `cargo xtask train`: one learner and its actors on this machine, from the start to the evaluation.
 
 pub(crate) mod display;
 pub(crate) mod evaluation;
-pub(crate) mod metrics;
 mod process;
 mod run_directory;
 mod supervisor;
@@ -32,7 +31,7 @@ pub(crate) struct Options {
     /// Override any field of the experiment, for instance --set vmpo.epsilon_eta=0.2
     #[arg(long = "set", value_name = "FIELD=VALUE")]
     pub(crate) overrides: Vec<String>,
-    /// Actor processes
+    /// Number of actor processes
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub(crate) actors: u16,
     /// Directory of the run [default: runs/PRESET-1, -2, …]
@@ -47,15 +46,15 @@ pub(crate) struct Options {
     /// Episodes of each clip in the evaluations at the end [default: every start frame once]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) episodes: Option<u32>,
-    /// Go on with a run: the one named by --run, or else the preset's newest
+    /// Resume the run that --run names, or the preset's newest run
     #[arg(long)]
     pub(crate) resume: bool,
 }
 
-/// One run: what its learner is started with, and where it keeps what it makes.
+/// One run: the learner's arguments and the directory.
 pub(crate) struct Job {
     experiment: Experiment,
-    /// `--preset`, `--clips` and `--set` as the learner takes them.
+    /// `--preset`, `--clips` and `--set`, as the learner reads them.
     document: Vec<String>,
     actors: u16,
     episodes: Option<u32>,
@@ -63,7 +62,7 @@ pub(crate) struct Job {
     directory: RunDirectory,
 }
 
-/// Trains, and prints what was learnt.
+/// Trains, and prints the evaluation.
 pub(crate) fn run(options: Options) -> Result<()> {
     let job = Job::new(options)?;
     prepare()?;
@@ -84,7 +83,7 @@ pub(crate) fn prepare() -> Result<()> {
 }
 
 impl Job {
-    /// Resolves the experiment, so that a wrong field is refused before anything is fetched or built.
+    /// Resolves the experiment. A wrong field is refused before anything is fetched or built.
     pub(crate) fn new(options: Options) -> Result<Self> {
         let mut overrides = options.overrides;
         if let Some(minutes) = options.minutes {
@@ -110,7 +109,7 @@ impl Job {
         })
     }
 
-    /// What is learnt.
+    /// The experiment.
     pub(crate) fn experiment(&self) -> &Experiment {
         &self.experiment
     }
@@ -120,15 +119,15 @@ impl Job {
         self.directory.path()
     }
 
-    /// The run's metrics, once there are any.
+    /// The run's file of metrics, which may not exist yet.
     pub(crate) fn metrics(&self) -> PathBuf {
         self.directory.metrics()
     }
 
-    /// Trains until the budget is spent or somebody asks to stop, and draws the curve.
+    /// Trains until the budget is used up or a stop is requested, and draws the curve.
     pub(crate) fn train(&self, display: &mut Display, interrupt: &Interrupt) -> Result<()> {
         self.directory.make()?;
-        // Chosen only now: the build takes minutes, and a port that was free before it may be taken.
+        // The port is chosen after the build, which takes minutes: another program may take a port in that time.
         let port = self.port.map_or_else(free_port, Ok)?;
         display.event("starting", &[("directory", self.path().display().to_string()), ("port", port.to_string())]);
         let outcome = Supervisor::start(self, port, display, interrupt).and_then(|mut supervisor| {
@@ -147,7 +146,7 @@ impl Job {
         outcome
     }
 
-    /// Evaluates the run's policies without noise and keeps what was found in `evaluation.json`.
+    /// Evaluates the run's policies without noise and writes `evaluation.json`.
     pub(crate) fn evaluate(&self, display: &mut Display, interrupt: &Interrupt) -> Result<Vec<(String, Evaluation)>> {
         evaluation::compare(self, display, interrupt)
     }
@@ -161,8 +160,8 @@ fn absolute_if_file(preset: &str) -> Result<String> {
     Ok(path.display().to_string())
 }
 
-/// The first free port from 7070 on that this program has not taken yet: runs side by side choose before their learners
-/// listen. All are below 32768: a listening port inside the ephemeral range can meet a TCP self-connect.
+/// The first free port from 7070 on that this program has not chosen before: runs at the same time choose before their
+/// learners listen. All ports are below 32768, since in the ephemeral range a connection could connect to itself.
 fn free_port() -> Result<u16> {
     static TAKEN: AtomicU16 = AtomicU16::new(0);
     for _ in 0..PORTS {
@@ -174,7 +173,7 @@ fn free_port() -> Result<u16> {
     bail!("no port from 7070 to {} is free; name one by --port", 7070 + PORTS - 1)
 }
 
-/// Ports that are tried.
+/// Number of ports that are tried.
 const PORTS: u16 = 100;
 
 #[cfg(test)]
@@ -182,7 +181,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn runs_side_by_side_get_ports_of_their_own() {
+    fn runs_at_the_same_time_get_different_ports() {
         let ports: std::collections::BTreeSet<u16> = (0..5).map(|_| free_port().unwrap()).collect();
         assert_eq!(ports.len(), 5);
     }

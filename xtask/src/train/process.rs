@@ -10,19 +10,19 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result};
 use rustix::process::{Pid, Signal, kill_process};
 
-/// A running learner or actor. A terminal's Ctrl-C does not reach it: this program passes on every request to stop, and a
-/// learner that is asked twice leaves without its last checkpoint.
+/// A running learner or actor. A terminal's Ctrl-C does not reach it: this program sends it one request to stop. A learner
+/// that receives two requests exits without its last checkpoint.
 pub(super) struct Process {
     pub(super) name: String,
     log: PathBuf,
-    /// Where in the log this process began.
+    /// The size of the log when this process started.
     log_start: u64,
     child: Child,
     started: Instant,
 }
 
 impl Process {
-    /// Starts `command`; both its outputs are appended to `log`.
+    /// Starts `command`. Its standard output and standard error are appended to `log`.
     pub(super) fn start(name: impl Into<String>, command: &mut Command, log: PathBuf) -> Result<Self> {
         let name = name.into();
         let output = append(&log)?;
@@ -37,17 +37,17 @@ impl Process {
         Ok(Self { name, log, log_start, child, started: Instant::now() })
     }
 
-    /// How it ended, if it has.
+    /// How the process ended, if it has ended.
     pub(super) fn ended(&mut self) -> Result<Option<ExitStatus>> {
         self.child.try_wait().with_context(|| format!("cannot wait for {}", self.name))
     }
 
-    /// How long it has been there.
+    /// The time since the start of the process.
     pub(super) fn age(&self) -> Duration {
         self.started.elapsed()
     }
 
-    /// What this process has written.
+    /// The output of this process.
     pub(super) fn output(&self) -> String {
         let mut text = Vec::new();
         if let Ok(mut file) = File::open(&self.log) {
@@ -56,23 +56,23 @@ impl Process {
         String::from_utf8_lossy(&text).into_owned()
     }
 
-    /// The last lines it wrote and where the rest is.
-    pub(super) fn last_words(&self) -> String {
+    /// The last lines of the output, and the path of the log.
+    pub(super) fn last_lines(&self) -> String {
         let output = self.output();
         let lines: Vec<&str> = output.lines().collect();
         let last = lines[lines.len().saturating_sub(12)..].join("\n  ");
         format!("the end of {}:\n  {last}", self.log.display())
     }
 
-    /// Asks it to leave.
+    /// Requests the process to end (SIGTERM).
     pub(super) fn terminate(&self) {
         if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {
-            // It may be gone already, which is what is wanted.
+            // An error means that it has ended already.
             let _ = kill_process(pid, Signal::TERM);
         }
     }
 
-    /// Waits until it has left, and ends it by force after `limit`; whether it left by itself.
+    /// Waits until the process has ended, and kills it after `limit`. Returns whether it ended by itself.
     pub(super) fn wait(&mut self, limit: Duration) -> bool {
         let deadline = Instant::now() + limit;
         while Instant::now() < deadline {
@@ -88,7 +88,7 @@ impl Process {
 }
 
 impl Drop for Process {
-    /// Leaves no process behind, whatever way this program ends on an error.
+    /// Ends the process if this program ends with an error.
     fn drop(&mut self) {
         if matches!(self.child.try_wait(), Ok(None)) {
             self.terminate();
@@ -97,7 +97,7 @@ impl Drop for Process {
     }
 }
 
-/// A log to write to, after whatever it holds.
+/// Opens a log for appending.
 pub(super) fn append(log: &Path) -> Result<File> {
     let file = OpenOptions::new().create(true).append(true).open(log);
     file.with_context(|| format!("cannot write {}", log.display()))
@@ -116,7 +116,7 @@ impl Tail {
         Self { path, position }
     }
 
-    /// The whole lines that came since the last call.
+    /// The complete lines since the last call.
     pub(super) fn lines(&mut self) -> Vec<String> {
         let Ok(mut file) = File::open(&self.path) else { return Vec::new() };
         let mut text = String::new();
@@ -136,7 +136,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_tail_gives_whole_lines_once_and_nothing_that_was_there_before() {
+    fn a_tail_gives_complete_new_lines_once() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("metrics.jsonl");
         fs::write(&path, "old\n").unwrap();
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn a_process_that_is_asked_to_leave_leaves_and_its_words_are_kept() {
+    fn a_terminated_process_ends_by_itself_and_its_output_is_kept() {
         let directory = tempfile::tempdir().unwrap();
         let log = directory.path().join("child.log");
         let mut command = Command::new("sh");
@@ -162,6 +162,6 @@ mod tests {
         }
         process.terminate();
         assert!(process.wait(Duration::from_secs(20)));
-        assert!(process.last_words().ends_with("hello\n  bye"), "{}", process.last_words());
+        assert!(process.last_lines().ends_with("hello\n  bye"), "{}", process.last_lines());
     }
 }

@@ -1,4 +1,4 @@
-//! Where a run keeps what it makes.
+//! The directory of a run.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use crate::workspace;
 pub(super) struct RunDirectory(PathBuf);
 
 impl RunDirectory {
-    /// The directory asked for, or the preset's next one (its newest one to resume).
+    /// The directory `asked`, or the preset's next one, or for `resume` its newest one.
     pub(super) fn choose(asked: Option<PathBuf>, preset: &str, resume: bool) -> Result<Self> {
         Self::choose_below(&workspace::root().join("runs"), asked, preset, resume)
     }
@@ -21,17 +21,16 @@ impl RunDirectory {
         let next = (1..).find(|number| !numbered(*number).exists()).unwrap_or(1);
         let directory = match asked {
             Some(path) => std::path::absolute(&path).with_context(|| format!("no such path: {}", path.display()))?,
-            None if resume && next == 1 => bail!("there is no run of {preset} to resume in {}", runs.display()),
+            None if resume && next == 1 => bail!("{} has no run of {preset} to resume", runs.display()),
             None if resume => numbered(next - 1),
             None => numbered(next),
         };
         let has_run = directory.join("checkpoints").is_dir();
         match (resume, has_run) {
-            (true, false) => bail!("there is no run to resume in {}: it holds no checkpoints", directory.display()),
-            (false, true) => bail!(
-                "{} holds a run already: --resume goes on with it, another --run begins a new one",
-                directory.display()
-            ),
+            (true, false) => bail!("{} has no checkpoints, so there is no run to resume", directory.display()),
+            (false, true) => {
+                bail!("{} has a run already: --resume resumes it, another --run starts a new one", directory.display())
+            }
             _ => Ok(Self(directory)),
         }
     }
@@ -52,7 +51,7 @@ impl RunDirectory {
         self.0.join(format!("{name}.log"))
     }
 
-    /// The policies there are to compare, each with what it is called.
+    /// The policies that exist, each with its name.
     pub(super) fn policies(&self) -> Vec<(&'static str, PathBuf)> {
         let checkpoints = self.0.join("checkpoints");
         let mut policies =
@@ -72,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_gets_the_next_free_number_and_resuming_takes_the_newest() {
+    fn a_new_run_gets_the_next_free_number_and_resuming_takes_the_newest() {
         let runs = tempfile::tempdir().unwrap();
         for number in [1, 2] {
             fs::create_dir_all(runs.path().join(format!("quickstart-{number}/checkpoints"))).unwrap();
@@ -84,7 +83,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_is_neither_overwritten_nor_resumed_from_nothing() {
+    fn a_run_is_not_overwritten_and_only_an_existing_run_is_resumed() {
         let runs = tempfile::tempdir().unwrap();
         let used = runs.path().join("used");
         fs::create_dir_all(used.join("checkpoints")).unwrap();

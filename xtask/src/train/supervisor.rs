@@ -1,4 +1,4 @@
-//! The processes of a run: started, watched, restarted, stopped.
+//! Starts, watches, restarts and stops the processes of a run.
 
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -12,16 +12,16 @@ use super::display::Display;
 use super::process::{Process, Tail};
 use crate::workspace;
 
-/// How long the learner may take to serve: it opens the clips and builds networks first.
+/// The time in which the learner must begin to serve. It opens the clips and builds the networks first.
 const START_LIMIT: Duration = Duration::from_secs(120);
-/// How long the learner may take to write its last checkpoint and leave.
-const LEARNER_LEAVES: Duration = Duration::from_secs(60);
-/// How long actors may take to flush and leave.
-const ACTOR_LEAVES: Duration = Duration::from_secs(10);
-/// An actor that lived so long was sound: its next death counts as the first.
-const SOUND: Duration = Duration::from_secs(30);
-/// Deaths in a row after which an actor is not started again.
-const DEATHS: u32 = 5;
+/// The time in which the learner must write its last checkpoint and end.
+const LEARNER_END_LIMIT: Duration = Duration::from_secs(60);
+/// The time in which an actor must send its last unrolls and end.
+const ACTOR_END_LIMIT: Duration = Duration::from_secs(10);
+/// After this running time an actor's failure counts as the first.
+const STABLE: Duration = Duration::from_secs(30);
+/// Failures in a row after which an actor is not started again.
+const MAX_FAILURES: u32 = 5;
 
 /// One learner and its actors.
 pub(super) struct Supervisor<'a> {
@@ -33,13 +33,13 @@ pub(super) struct Supervisor<'a> {
     log: Tail,
 }
 
-/// One actor's place; the process in it may change.
+/// One actor. Its process may be started several times.
 struct Actor {
     number: usize,
     process: Option<Process>,
-    deaths: u32,
-    /// When to start the next process, after a death.
-    again: Option<Instant>,
+    failures: u32,
+    /// When to start the next process, after a failure.
+    restart_at: Option<Instant>,
 }
 
 impl<'a> Supervisor<'a> {
@@ -56,7 +56,7 @@ impl<'a> Supervisor<'a> {
         let mut supervisor = Self { job, port, learner, actors: Vec::new(), metrics, log };
         for number in 0..usize::from(job.actors) {
             let process = Some(supervisor.start_actor(number)?);
-            supervisor.actors.push(Actor { number, process, deaths: 0, again: None });
+            supervisor.actors.push(Actor { number, process, failures: 0, restart_at: None });
         }
         display.event("actors started", &[("count", job.actors.to_string())]);
         Ok(supervisor)
@@ -67,7 +67,7 @@ impl<'a> Supervisor<'a> {
         command.args(["--learner", &format!("http://127.0.0.1:{}", self.port)]);
         let Experiment { unroll, actor, .. } = &self.job.experiment;
         if unroll.lockstep {
-            // A batch waits for every environment, so the actors have all of them between them.
+            // A batch waits for every environment, so the actors together must have all of them.
             let environments = unroll.batch.div_ceil(usize::from(self.job.actors) * actor.threads);
             command.args(["--environments", &environments.to_string()]);
         }
@@ -76,81 +76,81 @@ impl<'a> Supervisor<'a> {
         Process::start(name, &mut command, log)
     }
 
-    /// Shows the run until the learner has finished or a stop is asked for.
+    /// Shows the run until the learner has ended or a stop is requested.
     pub(super) fn watch(&mut self, display: &mut Display, interrupt: &Interrupt) -> Result<()> {
         loop {
             self.show(display);
             if interrupt.requested() {
-                display.event("stopping", &[("reason", "asked to".into())]);
+                display.event("stopping", &[("reason", "requested".into())]);
                 return Ok(());
             }
             if let Some(status) = self.learner.ended()? {
                 if status.success() {
-                    display.event("budget spent", &[]);
+                    display.event("budget used up", &[]);
                     return Ok(());
                 }
-                bail!("comic-learner ended with {status}; {}", self.learner.last_words());
+                bail!("comic-learner ended with {status}; {}", self.learner.last_lines());
             }
-            self.tend_actors(display)?;
+            self.restart_failed_actors(display)?;
             std::thread::sleep(Duration::from_millis(200));
         }
     }
 
-    fn tend_actors(&mut self, display: &mut Display) -> Result<()> {
+    fn restart_failed_actors(&mut self, display: &mut Display) -> Result<()> {
         for index in 0..self.actors.len() {
             let actor = &mut self.actors[index];
             if let Some(process) = &mut actor.process
                 && let Some(status) = process.ended()?
             {
-                let (name, words, age) = (process.name.clone(), process.last_words(), process.age());
+                let (name, output, age) = (process.name.clone(), process.last_lines(), process.age());
                 actor.process = None;
                 if status.success() {
-                    display.event("actor left", &[("name", name)]);
+                    display.event("actor ended", &[("name", name)]);
                     continue;
                 }
-                actor.deaths = if age > SOUND { 1 } else { actor.deaths + 1 };
-                if actor.deaths >= DEATHS {
-                    bail!("{name} died {DEATHS} times in a row, last with {status}; {words}");
+                actor.failures = if age > STABLE { 1 } else { actor.failures + 1 };
+                if actor.failures >= MAX_FAILURES {
+                    bail!("{name} failed {MAX_FAILURES} times in a row, the last time with {status}; {output}");
                 }
-                display.event("actor died", &[("name", name), ("status", status.to_string()), ("log", words)]);
-                actor.again = Some(Instant::now() + Duration::from_secs(1 << (actor.deaths - 1)));
+                display.event("actor failed", &[("name", name), ("status", status.to_string()), ("log", output)]);
+                actor.restart_at = Some(Instant::now() + Duration::from_secs(1 << (actor.failures - 1)));
             }
-            if actor.again.is_some_and(|again| Instant::now() >= again) {
+            if actor.restart_at.is_some_and(|moment| Instant::now() >= moment) {
                 let number = actor.number;
                 let process = self.start_actor(number)?;
                 display.event("actor restarted", &[("name", process.name.clone())]);
                 self.actors[index].process = Some(process);
-                self.actors[index].again = None;
+                self.actors[index].restart_at = None;
             }
         }
         Ok(())
     }
 
-    /// Ends what still runs: the learner writes its checkpoint, actors flush what they have.
+    /// Ends the processes that still run. The learner writes its checkpoint, the actors send their last unrolls.
     pub(super) fn stop(&mut self, display: &mut Display) {
         if matches!(self.learner.ended(), Ok(None)) {
             self.learner.terminate();
-            if !self.learner.wait(LEARNER_LEAVES) {
-                display.event("learner killed", &[("reason", "it did not leave in time".into())]);
+            if !self.learner.wait(LEARNER_END_LIMIT) {
+                display.event("learner killed", &[("reason", "it did not end in time".into())]);
             }
         }
-        // The learner has told its actors that the run is over; those that do not know it are asked.
+        // The learner has told its actors that the run is over. The signal is for actors that were not connected.
         let actors: Vec<_> = self.actors.iter_mut().filter_map(|actor| actor.process.as_mut()).collect();
         for process in &actors {
             process.terminate();
         }
         for process in actors {
-            if !process.wait(ACTOR_LEAVES) {
+            if !process.wait(ACTOR_END_LIMIT) {
                 display.event("actor killed", &[("name", process.name.clone())]);
             }
         }
         self.show(display);
     }
 
-    /// New metrics, and what the learner says beside them: the phases before the first update take a while.
+    /// Shows new metrics and new lines of the learner's log, which report the phases before the first update.
     fn show(&mut self, display: &mut Display) {
         for line in self.log.lines() {
-            if !line.contains(" metrics: ") && !says_it_serves(&line) {
+            if !line.contains(" metrics: ") && !is_listening_line(&line) {
                 display.learner(&line);
             }
         }
@@ -160,23 +160,23 @@ impl<'a> Supervisor<'a> {
     }
 }
 
-/// Waits for the line `{"listening": …}` by which the learner says that it serves.
+/// Waits for the line `{"listening": …}`, which the learner prints when it serves.
 fn await_serving(learner: &mut Process, interrupt: &Interrupt) -> Result<()> {
     while learner.age() < START_LIMIT {
-        if learner.output().lines().any(says_it_serves) {
+        if learner.output().lines().any(is_listening_line) {
             return Ok(());
         }
         if let Some(status) = learner.ended()? {
-            bail!("comic-learner ended with {status} before it served; {}", learner.last_words());
+            bail!("comic-learner ended with {status} before it served; {}", learner.last_lines());
         }
         if interrupt.requested() {
             bail!("interrupted before the learner served");
         }
         std::thread::sleep(Duration::from_millis(50));
     }
-    bail!("comic-learner does not serve after {} s; {}", START_LIMIT.as_secs(), learner.last_words())
+    bail!("comic-learner did not serve within {} s; {}", START_LIMIT.as_secs(), learner.last_lines())
 }
 
-fn says_it_serves(line: &str) -> bool {
-    serde_json::from_str::<serde_json::Value>(line).is_ok_and(|said| said.get("listening").is_some())
+fn is_listening_line(line: &str) -> bool {
+    serde_json::from_str::<serde_json::Value>(line).is_ok_and(|line| line.get("listening").is_some())
 }

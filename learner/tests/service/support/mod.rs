@@ -10,10 +10,11 @@ use anyhow::Result;
 use bytes::Bytes;
 use comic_clips::Asset;
 use comic_experiment::{Experiment, TaskPart, TaskSpec, Unroll};
+use comic_learner::observe::probes::Probed as _;
 use comic_learner::publish::Publisher;
 use comic_learner::security::{ConnectionLimits, Security};
-use comic_learner::service::quarantine::QuarantineOptions;
-use comic_learner::service::{Setup, Shared, serve};
+use comic_learner::service::quarantine::QuarantineArguments;
+use comic_learner::service::{Service, Setup, serve};
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{
     Behaviour, JoinReply, JoinRequest, ParametersChunk, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict,
@@ -34,18 +35,18 @@ use tonic::{Status, Streaming};
 use tower::Service as _;
 
 pub(crate) const EPOCH: u64 = 3;
-/// Which run it is.
+/// The run's number.
 pub(crate) const RUN: u64 = 0x5eed;
-/// Unrolls a batch.
+/// Unrolls of a batch.
 pub(crate) const BATCH: usize = 2;
 
-/// A learner that serves, without a trainer.
+/// A learner that serves and has no trainer.
 pub(crate) struct World {
     pub(crate) experiment: Experiment,
     pub(crate) spec: TaskSpec,
     pub(crate) batcher: Batcher,
     pub(crate) publisher: Publisher,
-    pub(crate) shared: Arc<Shared>,
+    pub(crate) service: Service,
     pub(crate) address: String,
     shutdown: Option<oneshot::Sender<()>>,
     server: JoinHandle<comic_learner::error::Result<()>>,
@@ -56,37 +57,37 @@ impl World {
         Self::start_with(8, Vec::new()).await
     }
 
-    /// With so many numbers of proprioception, and these assets.
+    /// With this size of proprioception, and these assets.
     pub(crate) async fn start_with(proprioception: usize, assets: Vec<Asset>) -> Self {
         Self::guarded(proprioception, assets, Security::default(), ConnectionLimits::default()).await
     }
 
-    /// Behind these limits.
+    /// With these limits.
     pub(crate) async fn limited(limits: ConnectionLimits) -> Self {
         Self::guarded(8, Vec::new(), Security::default(), limits).await
     }
 
-    /// Behind certificates and tokens.
+    /// With certificates and tokens.
     pub(crate) async fn secured(security: Security) -> Self {
         Self::guarded(8, Vec::new(), security, ConnectionLimits::default()).await
     }
 
     /// With a quarantine.
-    pub(crate) async fn quarantining(quarantine: QuarantineOptions) -> Self {
+    pub(crate) async fn quarantining(quarantine: QuarantineArguments) -> Self {
         Self::of(experiment(), 8, Vec::new(), Security::default(), ConnectionLimits::default(), quarantine).await
     }
 
-    /// In lockstep, over so many environments.
+    /// In lockstep, with so many environments.
     pub(crate) async fn in_lockstep(environments: usize) -> Self {
         let mut experiment = experiment();
         experiment.unroll = Unroll { lockstep: true, ahead: 0, batch: environments, ..experiment.unroll };
         let (security, limits, quarantine) =
-            (Security::default(), ConnectionLimits::default(), QuarantineOptions::default());
+            (Security::default(), ConnectionLimits::default(), QuarantineArguments::default());
         Self::of(experiment, 8, Vec::new(), security, limits, quarantine).await
     }
 
     async fn guarded(proprioception: usize, assets: Vec<Asset>, security: Security, limits: ConnectionLimits) -> Self {
-        Self::of(experiment(), proprioception, assets, security, limits, QuarantineOptions::default()).await
+        Self::of(experiment(), proprioception, assets, security, limits, QuarantineArguments::default()).await
     }
 
     async fn of(
@@ -95,7 +96,7 @@ impl World {
         assets: Vec<Asset>,
         security: Security,
         limits: ConnectionLimits,
-        quarantine: QuarantineOptions,
+        quarantine: QuarantineArguments,
     ) -> Self {
         let spec = TaskSpec {
             proprioception,
@@ -129,22 +130,22 @@ impl World {
             publisher: publisher.clone(),
             quarantine,
         };
-        let shared = Shared::new(setup).unwrap();
+        let service = Service::new(setup).unwrap();
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = format!("http://{}", listener.local_addr().unwrap());
         let (shutdown, signal) = oneshot::channel::<()>();
-        let server = tokio::spawn(serve(listener, shared.clone(), async move {
+        let server = tokio::spawn(serve(listener, service.clone(), async move {
             let _ = signal.await;
         }));
-        Self { experiment, spec, batcher, publisher, shared, address, shutdown: Some(shutdown), server }
+        Self { experiment, spec, batcher, publisher, service, address, shutdown: Some(shutdown), server }
     }
 
-    /// A connection, for clients of other services than the learner's own.
+    /// A connection, for clients of other services.
     pub(crate) async fn channel(&self) -> Channel {
         Channel::from_shared(self.address.clone()).unwrap().connect().await.unwrap()
     }
 
-    /// The answer to a stream of unrolls of these frames, whatever they hold.
+    /// Sends these frames as a stream of unrolls, and returns the answer.
     pub(crate) async fn send_frames(&self, frames: impl Stream<Item = Bytes> + Send + 'static) -> Response<Body> {
         let body = StreamBody::new(frames.map(|data| Ok::<_, Infallible>(Frame::data(data))));
         let request = Request::post(format!("{}/comic.v1.Learner/SendUnrolls", self.address))
@@ -162,7 +163,7 @@ impl World {
         LearnerClient::connect(self.address.clone()).await.unwrap()
     }
 
-    /// A client that shows what `access` holds, or why there is none.
+    /// A client with this access, or the error that prevents it.
     pub(crate) async fn client_with(&self, access: &Access) -> Result<Client> {
         let scheme = if access.ca.is_some() { "https://localhost" } else { "http://127.0.0.1" };
         let port = self.address.rsplit(':').next().unwrap();
@@ -183,7 +184,12 @@ impl World {
         Actor { client, reply, incarnation, layout: self.batcher.layout().clone() }
     }
 
-    /// Gives the signal to end.
+    /// The metrics, as Prometheus reads them.
+    pub(crate) fn metrics_page(&self) -> String {
+        self.service.probed().metrics_page()
+    }
+
+    /// Gives the shutdown signal.
     pub(crate) fn begin_shutdown(&mut self) {
         let _ = self.shutdown.take().unwrap().send(());
     }
@@ -203,7 +209,7 @@ fn experiment() -> Experiment {
     experiment
 }
 
-/// What a new process asks for.
+/// The request of a new process.
 pub(crate) fn joining(incarnation: u64) -> JoinRequest {
     JoinRequest { incarnation, protocol: PROTOCOL_VERSION, ..JoinRequest::default() }
 }
@@ -216,7 +222,7 @@ pub(crate) struct Actor {
 }
 
 impl Actor {
-    /// An unroll that is as it should be.
+    /// A valid unroll.
     pub(crate) fn unroll(&self, sequence: u64) -> UnrollMessage {
         let header = UnrollHeader {
             actor: self.reply.actor,
@@ -239,7 +245,7 @@ impl Actor {
         UnrollMessage { header: Some(header), payload: unroll.into_bytes() }
     }
 
-    /// An unroll spoilt in one place of its header.
+    /// An unroll with a changed header.
     pub(crate) fn unroll_with(&self, sequence: u64, change: impl FnOnce(&mut UnrollHeader)) -> UnrollMessage {
         let mut unroll = self.unroll(sequence);
         change(unroll.header.as_mut().unwrap());
@@ -273,7 +279,7 @@ pub(crate) struct Unrolls {
 impl Unrolls {
     /// Sends an unroll and waits for its answer.
     pub(crate) async fn send(&mut self, unroll: UnrollMessage) -> Result<UnrollAck, Status> {
-        // The stream may have ended already: then the answer says why.
+        // The stream may have ended already; the answer then says why.
         let _ = self.sender.send(unroll).await;
         let answer = within(Duration::from_secs(10), self.acks.message()).await?;
         Ok(answer.expect("an acknowledgement"))
@@ -285,12 +291,12 @@ impl Unrolls {
     }
 }
 
-/// Fails the test, instead of hanging, when something takes so long.
+/// Fails the test when something takes longer than the limit.
 pub(crate) async fn within<T>(limit: Duration, future: impl Future<Output = T>) -> T {
     tokio::time::timeout(limit, future).await.expect("in time")
 }
 
-/// A payload that tells its version.
+/// A payload that depends on its version.
 pub(crate) fn parameters(version: u64, size: usize) -> Bytes {
     Bytes::from(vec![version as u8; size])
 }

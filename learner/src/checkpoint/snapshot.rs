@@ -1,0 +1,95 @@
+//! A checkpoint in memory, and how one is read.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use sha2::{Digest as _, Sha256};
+
+use crate::checkpoint::name::numbered;
+use crate::error::{Error, Result};
+
+/// The file of a checkpoint that holds the SHA-256 of each part.
+pub(super) const MANIFEST: &str = "MANIFEST.json";
+
+/// Everything that changes the future, on the host: file names and their bytes.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Snapshot {
+    /// Parts by file name.
+    pub parts: BTreeMap<String, Vec<u8>>,
+}
+
+impl Snapshot {
+    /// One part.
+    ///
+    /// # Errors
+    /// When the snapshot has no part of this name.
+    pub fn part(&self, name: &str) -> Result<&[u8]> {
+        let part = self.parts.get(name).map(Vec::as_slice);
+        part.ok_or_else(|| Error::Checkpoint(format!("the checkpoint has no part `{name}`")))
+    }
+
+    /// One part that is text.
+    ///
+    /// # Errors
+    /// When it is absent or not UTF-8.
+    pub fn text(&self, name: &str) -> Result<&str> {
+        std::str::from_utf8(self.part(name)?)
+            .map_err(|_| Error::Checkpoint(format!("checkpoint part `{name}` is not UTF-8")))
+    }
+}
+
+/// What the manifest says of a part.
+pub(super) fn checksum(bytes: &[u8]) -> String {
+    hex::encode(Sha256::digest(bytes))
+}
+
+/// The newest whole checkpoint that `path` names, and its directory. `path` is a run's directory, its `checkpoints`, or one
+/// checkpoint, for instance `checkpoints/best`. If it names several, a damaged one is skipped with a warning. Nothing is
+/// changed.
+///
+/// # Errors
+/// When there is none, or the one that was named is damaged.
+pub fn find(path: &Path) -> Result<(PathBuf, Snapshot)> {
+    if path.join(MANIFEST).is_file() {
+        return Ok((path.to_path_buf(), read(path)?));
+    }
+    let below = path.join("checkpoints");
+    let directory = if below.is_dir() { below } else { path.to_path_buf() };
+    for (_, path) in numbered(&directory)?.into_iter().rev() {
+        match read(&path) {
+            Ok(snapshot) => return Ok((path, snapshot)),
+            Err(error) => {
+                let error = comic_proto::chain(&error);
+                tracing::warn!(checkpoint = %path.display(), "skipped a damaged checkpoint: {error}");
+            }
+        }
+    }
+    let remedy = "name a run's directory, its `checkpoints`, or one of them";
+    Err(Error::Checkpoint(format!("no complete checkpoint in {}: {remedy}", path.display())))
+}
+
+/// Reads one checkpoint directory, verifying every part.
+///
+/// # Errors
+/// A part that is missing, or is not what the manifest says.
+pub fn read(path: &Path) -> Result<Snapshot> {
+    let file = path.join(MANIFEST);
+    let text = fs::read(&file).map_err(Error::file("read", &file))?;
+    let manifest: BTreeMap<String, String> =
+        serde_json::from_slice(&text).map_err(Error::json(file.display().to_string()))?;
+    let mut snapshot = Snapshot::default();
+    for (part, expected) in manifest {
+        if part.contains(['/', '\\']) || part.starts_with('.') {
+            return Err(Error::Checkpoint(format!("{}: `{part}` is not the name of a part", file.display())));
+        }
+        let file = path.join(&part);
+        let bytes = fs::read(&file).map_err(Error::file("read", &file))?;
+        if checksum(&bytes) != expected {
+            let said = format!("{} is not what the manifest says: its SHA-256 differs", file.display());
+            return Err(Error::Checkpoint(said));
+        }
+        snapshot.parts.insert(part, bytes);
+    }
+    Ok(snapshot)
+}

@@ -1,0 +1,158 @@
+//! What a learner epoch begins with: the experiment, the checkpoint to resume from, and the parts made of them.
+
+use std::sync::Arc;
+
+use comic_clips::Catalogue;
+use comic_experiment::{Difference, Experiment, InitialPose, TaskSpec, Unroll};
+use comic_proto::{UnrollLayout, UnrollShape};
+use comic_replay::{BatchOrder, Batcher, Config, Ledger, Phase};
+
+use crate::checkpoint::{Snapshot, Store, incompatible};
+use crate::device::Backend;
+use crate::error::{Error, Result};
+use crate::options::Options;
+use crate::publish::Publisher;
+use crate::security::Security;
+use crate::service::{self, Service};
+use crate::train::setup::Setup;
+
+/// The trainer's setup and the service. Begins the learner epoch.
+pub(super) fn prepare(
+    options: &Options,
+    experiment: Experiment,
+    backend: Backend,
+    security: Security,
+) -> Result<(Setup, Service)> {
+    let catalogue = Catalogue::open(&experiment.clips)?;
+    let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
+    let spec = TaskSpec::new(&experiment, names).map_err(|name| {
+        Error::configuration(format!("tracking.observations: the tracking task has no observation `{name}`"))
+    })?;
+    let pose = match experiment.network.initial_pose {
+        InitialPose::MidRange => vec![0.0; spec.action],
+        InitialPose::ReferenceMean => catalogue.mean_action()?.iter().map(|action| *action as f32).collect(),
+    };
+    let store = Store::open(&options.run, experiment.learner.checkpoints_kept)?;
+    let resume = checkpoint(&store, options, &experiment, &spec)?;
+    let epoch = store.begin_epoch()?;
+    let document = options.run.join("experiment.toml");
+    std::fs::write(&document, experiment.to_toml()?).map_err(Error::file("write", document))?;
+    let ledger = match &resume {
+        Some(snapshot) => accounting(snapshot).map_err(|error| incompatible(&options.run, error))?,
+        None => Ledger::new(),
+    };
+    let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| task.name.clone()));
+    let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
+    let config = batches(&experiment.unroll);
+    let batcher = Batcher::new(layout, config, Phase::begin(epoch), ledger);
+    let publisher = Publisher::new(epoch);
+    let service = Service::new(service::Setup {
+        run: options.run.clone(),
+        id: store.run()?,
+        security,
+        limits: options.limits.clone(),
+        experiment: experiment.clone(),
+        spec: spec.clone(),
+        assets: catalogue.assets()?,
+        batcher: batcher.clone(),
+        publisher: publisher.clone(),
+        quarantine: options.quarantine.clone(),
+    })?;
+    let run = options.run.clone();
+    let handle = service.trainer();
+    let setup = Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, service: handle };
+    Ok((setup, service))
+}
+
+/// The checkpoint to resume from; `None` if the run begins.
+fn checkpoint(store: &Store, options: &Options, experiment: &Experiment, spec: &TaskSpec) -> Result<Option<Snapshot>> {
+    let Some((path, snapshot)) = store.newest()? else { return Ok(None) };
+    check_same_experiment(experiment, spec, &snapshot, options.allow_changed)
+        .map_err(|error| incompatible(&options.run, error))?;
+    tracing::info!(checkpoint = %path.display(), "resuming");
+    Ok(Some(snapshot))
+}
+
+/// The accounting of all unrolls up to the checkpoint.
+fn accounting(snapshot: &Snapshot) -> Result<Ledger> {
+    let accounting = serde_json::from_slice(snapshot.part("accounting.json")?);
+    let accounting = accounting.map_err(Error::json("accounting.json of the checkpoint"))?;
+    Ledger::restore(&accounting).map_err(Error::within("accounting.json of the checkpoint cannot be used"))
+}
+
+/// How the batcher makes batches.
+fn batches(unroll: &Unroll) -> Config {
+    let Unroll { batch, max_staleness, ahead, lockstep, .. } = *unroll;
+    let (order, max_staleness) =
+        if lockstep { (BatchOrder::Environment, 0) } else { (BatchOrder::Arrival, max_staleness) };
+    Config { unrolls: batch, max_staleness, ahead, order }
+}
+
+/// Checks that a run is resumed with the experiment that it had, unless it is `allowed` to change. The budget, the intervals
+/// and the numbers of threads may always change.
+fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot, allowed: bool) -> Result<()> {
+    let then = Experiment::from_toml("experiment.toml of the checkpoint", snapshot.text("experiment.toml")?)?;
+    let mut now = now.clone();
+    now.budget = then.budget.clone();
+    now.learner = then.learner.clone();
+    now.actor = then.actor.clone();
+    let changed = |Difference { field, ours, theirs }| format!("{field} was {ours} and is {theirs}");
+    let mut changes: Vec<String> = then.differences(&now)?.into_iter().map(changed).collect();
+    let task = serde_json::from_slice::<TaskSpec>(snapshot.part("task.json")?);
+    let task = task.map_err(Error::json("task.json of the checkpoint"))?;
+    if changes.is_empty() && task != *spec {
+        changes.push("the clips, the observations or the rewards are different".into());
+    }
+    if changes.is_empty() {
+        return Ok(());
+    }
+    let changes = changes.join("; ");
+    if allowed {
+        tracing::warn!("the run continues with another experiment: {changes}");
+        return Ok(());
+    }
+    Err(Error::configuration(format!(
+        "it was made by another experiment ({changes}): give another --run, the old values, or --allow-changed"
+    )))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn resumed(change: impl FnOnce(&mut Experiment), allowed: bool) -> Result<()> {
+        let then = Experiment::default();
+        let spec = TaskSpec::new(&then, vec!["walk".into()]).unwrap();
+        let mut snapshot = Snapshot::default();
+        snapshot.parts.insert("experiment.toml".into(), then.to_toml()?.into_bytes());
+        snapshot.parts.insert("task.json".into(), serde_json::to_vec(&spec).unwrap());
+        let mut now = then;
+        change(&mut now);
+        check_same_experiment(&now, &spec, &snapshot, allowed)
+    }
+
+    #[test]
+    fn a_changed_experiment_is_refused_with_every_changed_field() {
+        let change = |experiment: &mut Experiment| {
+            experiment.vmpo.lambda = 0.5;
+            experiment.network.latent.beta = 0.25;
+        };
+        let refused = resumed(change, false).unwrap_err();
+        assert_eq!(refused.exit_code(), 2);
+        let message = refused.to_string();
+        for part in ["vmpo.lambda was", "is 0.5", "network.latent.beta was", "is 0.25", "--allow-changed"] {
+            assert!(message.contains(part), "no `{part}` in {message}");
+        }
+        assert!(resumed(change, true).is_ok());
+    }
+
+    #[test]
+    fn budget_intervals_and_threads_may_always_change() {
+        let change = |experiment: &mut Experiment| {
+            experiment.budget.minutes = 7.0;
+            experiment.learner.checkpoint_seconds = 8.0;
+            experiment.actor.threads = 9;
+        };
+        assert!(resumed(change, false).is_ok());
+    }
+}

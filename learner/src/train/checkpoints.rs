@@ -1,0 +1,80 @@
+//! When checkpoints are written, and the newest one in memory.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Instant;
+
+use comic_experiment::Learner;
+
+use crate::checkpoint::{Evaluated, Name, Snapshot, Store};
+use crate::error::Result;
+use crate::observe::telemetry::Telemetry;
+use crate::train::writer::Writer;
+
+/// The checkpoints of a run that trains.
+#[derive(Debug)]
+pub(super) struct Checkpoints {
+    writer: Writer,
+    /// Seconds between two of them.
+    interval: f64,
+    written: Instant,
+    /// The last good state: the one to restore when gradient steps are skipped again and again.
+    good: Arc<Snapshot>,
+}
+
+impl Checkpoints {
+    /// Opens the checkpoint directory of `run`, and starts the thread that writes.
+    ///
+    /// # Errors
+    /// When the directory cannot be made, or the system gives no thread.
+    pub(super) fn start(run: &Path, learner: &Learner, telemetry: Arc<Telemetry>) -> Result<Self> {
+        let writer = Writer::start(Store::open(run, learner.checkpoints_kept)?, telemetry)?;
+        Ok(Self { writer, interval: learner.checkpoint_seconds, written: Instant::now(), good: Arc::default() })
+    }
+
+    /// Whether the newest checkpoint is old enough for another one.
+    pub(super) fn is_due(&self) -> bool {
+        self.written.elapsed().as_secs_f64() >= self.interval
+    }
+
+    /// Whether the thread still writes: until it has finished, another request may have to wait.
+    pub(super) fn is_busy(&self) -> bool {
+        self.writer.is_busy()
+    }
+
+    /// Keeps a state in memory as the last good one.
+    pub(super) fn set_good(&mut self, snapshot: Snapshot) {
+        self.good = Arc::new(snapshot);
+    }
+
+    /// The last good state.
+    pub(super) fn good(&self) -> &Snapshot {
+        &self.good
+    }
+
+    /// Keeps a state in memory as the last good one, and has it written.
+    ///
+    /// # Errors
+    /// When the writing thread has ended.
+    pub(super) fn write(&mut self, name: Name, snapshot: Snapshot) -> Result<()> {
+        self.set_good(snapshot);
+        self.written = Instant::now();
+        self.writer.write(name, Arc::clone(&self.good))
+    }
+
+    /// Keeps the checkpoint that was evaluated if it is the best.
+    ///
+    /// # Errors
+    /// When the writing thread has ended.
+    pub(super) fn judge(&self, evaluated: Evaluated) -> Result<()> {
+        self.writer.judge(evaluated)
+    }
+
+    /// Waits until everything is on disk.
+    ///
+    /// # Errors
+    /// When the last snapshot could not be written.
+    pub(super) fn finish(self) -> Result<()> {
+        self.writer.finish()
+    }
+}

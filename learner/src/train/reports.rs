@@ -1,0 +1,161 @@
+//! What training tells people, Prometheus and the service.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use comic_experiment::{Learner, TaskSpec};
+use comic_proto::v1::{EpisodeEnd, UnrollHeader};
+use comic_replay::{AccountingByTask, Batch};
+use serde_json::{Map, Value, json};
+
+use crate::algorithm::losses::{LossValues, Losses};
+use crate::checkpoint::Evaluated;
+use crate::checkpoint::progress::Progress;
+use crate::error::Result;
+use crate::observe::metrics::{Metrics, Position};
+use crate::observe::telemetry::Telemetry;
+use crate::service::TrainerHandle;
+
+/// Counters, metric lines, and evaluations that came in.
+#[derive(Debug)]
+pub(super) struct Reports {
+    metrics: Metrics,
+    /// Shows the newest metrics, and collects the evaluations that actors report.
+    service: TrainerHandle,
+    telemetry: Arc<Telemetry>,
+    /// Seconds between two lines.
+    interval: f64,
+    tasks: Vec<String>,
+    /// The newest finite losses, as a line shows them.
+    losses: Map<String, Value>,
+    /// The last update's losses, if reading them at once would mean to wait for the device.
+    deferred: Option<Losses>,
+}
+
+impl Reports {
+    /// Opens the metrics of `run`.
+    ///
+    /// # Errors
+    /// When their file cannot be opened.
+    pub(super) fn open(run: &Path, spec: &TaskSpec, learner: &Learner, service: TrainerHandle) -> Result<Self> {
+        Ok(Self {
+            metrics: Metrics::open(run, spec)?,
+            telemetry: service.telemetry.clone(),
+            service,
+            interval: learner.metrics_seconds,
+            tasks: spec.tasks.iter().map(|task| task.name.clone()).collect(),
+            losses: Map::new(),
+            deferred: None,
+        })
+    }
+
+    /// Begins a learner epoch at this progress.
+    pub(super) fn begin(&mut self, progress: &Progress, accounting: AccountingByTask) {
+        self.metrics.begin(progress.epoch, progress.environment_steps, accounting);
+    }
+
+    /// Counts the rows and episodes of a batch that was used, and returns its environment steps.
+    pub(super) fn count_rows(&mut self, batch: &Batch) -> u64 {
+        let mut environment_steps = 0;
+        for (rows, task) in self.metrics.count_rows(batch).into_iter().zip(&self.tasks) {
+            environment_steps += rows.environment_steps;
+            self.telemetry.count_rows(task, rows);
+        }
+        for UnrollHeader { actor, incarnation, sequence, .. } in batch.headers() {
+            tracing::trace!(actor, incarnation = format_args!("{incarnation:016x}"), sequence, "trained on");
+        }
+        let episodes = batch.headers().iter().flat_map(|header| &header.episodes);
+        let diverged = episodes.filter(|episode| episode.end() == EpisodeEnd::Diverged).count();
+        self.telemetry.episodes_diverged.inc_by(diverged as u64);
+        environment_steps
+    }
+
+    /// Counts the episodes of a batch, and the ages of its unrolls where `version` is the newest.
+    pub(super) fn count_episodes(&mut self, batch: &Batch, version: u64) {
+        self.metrics.count_episodes(batch.headers(), version);
+    }
+
+    /// Counts an update on a batch whose parameters were `version`; the duration is counted by
+    /// [`count_duration`](Self::count_duration).
+    pub(super) fn count_update(&mut self, batch: &Batch, version: u64) {
+        self.metrics.count_update();
+        self.count_episodes(batch, version);
+    }
+
+    /// Counts the duration of an update on unrolls of these ages, in versions.
+    pub(super) fn count_duration(&self, duration: Duration, ages: Vec<u64>) {
+        self.telemetry.count_update(duration, ages);
+    }
+
+    /// Counts the programs that the device has compiled so far.
+    pub(super) fn count_compilations(&self, compilations: u64) {
+        self.telemetry.count_compilations(compilations);
+    }
+
+    /// Counts gradient steps that were skipped.
+    pub(super) fn count_skipped(&mut self, skipped: u64) {
+        self.metrics.count_skipped(skipped);
+        self.telemetry.updates_skipped.inc_by(skipped);
+    }
+
+    /// Counts a return to the last good state.
+    pub(super) fn count_restore(&self) {
+        self.telemetry.restores.inc();
+    }
+
+    /// Keeps losses to be read later.
+    pub(super) fn defer(&mut self, losses: Option<Losses>) {
+        self.deferred = losses;
+    }
+
+    /// The losses to be read later.
+    pub(super) fn take_deferred(&mut self) -> Option<Losses> {
+        self.deferred.take()
+    }
+
+    /// Keeps the newest losses for the metrics, if they are finite.
+    pub(super) fn keep_losses(&mut self, losses: &LossValues) {
+        if !losses.is_finite() {
+            return;
+        }
+        self.losses = losses.entries().iter().map(|(name, value)| ((*name).to_string(), json!(value))).collect();
+        if self.tasks.len() > 1 && losses.temperatures.len() == self.tasks.len() {
+            let named = self.tasks.iter().cloned().zip(losses.temperatures.iter().map(|eta| json!(eta)));
+            self.losses.insert("temperatures".to_string(), Value::Object(named.collect()));
+        }
+    }
+
+    /// Whether the last line is old enough for another one.
+    pub(super) fn are_due(&self) -> bool {
+        self.metrics.elapsed() >= self.interval
+    }
+
+    /// Writes the evaluations that actors reported since the last time, and returns what they say of checkpoints.
+    pub(super) fn take_evaluations(&self) -> Vec<Evaluated> {
+        let evaluations = self.service.take_evaluations();
+        evaluations.iter().for_each(|evaluation| self.metrics.keep_evaluation(evaluation));
+        evaluations.iter().filter_map(|evaluation| evaluation.evaluated()).collect()
+    }
+
+    /// Writes a line of metrics if it says anything new.
+    pub(super) fn write_news(&mut self, progress: &Progress, accounting: AccountingByTask) {
+        if self.metrics.has_news(&accounting) {
+            self.write(progress, accounting);
+        }
+    }
+
+    /// Writes a line of metrics, and shows it as the run's status.
+    pub(super) fn write(&mut self, progress: &Progress, accounting: AccountingByTask) {
+        let position = Position {
+            seconds: progress.seconds,
+            environment_steps: progress.environment_steps,
+            updates: progress.updates,
+            version: progress.version,
+            epoch: progress.epoch,
+        };
+        let line = self.metrics.write(position, accounting, self.losses.clone());
+        tracing::info!(target: "metrics", "{line}");
+        self.service.set_metrics(line);
+    }
+}

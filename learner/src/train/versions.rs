@@ -1,0 +1,58 @@
+//! Publishing versions of the parameters.
+
+use bytes::Bytes;
+use comic_proto::v1::Behaviour;
+use comic_replay::{Batcher, Phase};
+
+use crate::error::Result;
+use crate::publish::Publisher;
+use crate::train::state::State;
+
+/// Where actors and batcher learn which version is the newest.
+#[derive(Debug)]
+pub(super) struct Versions {
+    batcher: Batcher,
+    publisher: Publisher,
+    lockstep: bool,
+    /// Unrolls of versions before this one are superseded.
+    oldest: u64,
+}
+
+impl Versions {
+    pub(super) fn new(batcher: Batcher, publisher: Publisher, lockstep: bool) -> Self {
+        Self { batcher, publisher, lockstep, oldest: 0 }
+    }
+
+    /// Publishes the online policy as the next version. From now on it is the target network, with which actors act.
+    ///
+    /// # Errors
+    /// When the parameters cannot be read from the device.
+    pub(super) fn publish(&self, state: &mut State, behaviour: Behaviour) -> Result<()> {
+        let _publish = tracing::debug_span!("publish", version = state.progress.version + 1).entered();
+        state.target = Bytes::from(state.algorithm.policy_parameters()?);
+        state.progress.version += 1;
+        self.announce(state, behaviour);
+        Ok(())
+    }
+
+    /// In lockstep, publishes the same parameters as the next version. There, actors make one unroll of each environment
+    /// with each version, so they need a version after every batch.
+    pub(super) fn repeat(&self, state: &mut State, behaviour: Behaviour) {
+        if self.lockstep {
+            state.progress.version += 1;
+            self.announce(state, behaviour);
+        }
+    }
+
+    /// Tells actors and batcher of the newest version, for instance after a restart.
+    pub(super) fn announce(&self, state: &State, behaviour: Behaviour) {
+        let (epoch, version, oldest) = (state.progress.epoch, state.progress.version, self.oldest);
+        self.batcher.set_phase(Phase { epoch, version, oldest, behaviour });
+        self.publisher.publish(version, behaviour, &state.target);
+    }
+
+    /// With the next version, unrolls of all versions so far are superseded.
+    pub(super) fn supersede(&mut self, state: &State) {
+        self.oldest = state.progress.version + 1;
+    }
+}

@@ -1,0 +1,203 @@
+//! The environment that plays the rules of any task without a reference.
+
+use std::sync::Arc;
+
+use comic_experiment::TaskSpec;
+use mujoco_rs::prelude::MjModel;
+use rand::SeedableRng as _;
+use rand_pcg::Pcg64;
+
+use super::interface::{Rules, Verdict};
+use super::poses::Pose;
+use super::stage::{CONTROL_TIMESTEP, Stage};
+use crate::environment::{ClipStarts, Environment, Episode, Outcome, Scenery, Simulated, Step, Task, control};
+use crate::error::Error;
+use crate::physics::{Simulation, is_healthy};
+use crate::rendering::vision;
+
+/// Number of starts for an evaluation. Start k is the episode that seed k draws.
+const EVALUATION_STARTS: usize = 64;
+
+/// A task with [`Rules`].
+#[derive(Debug)]
+pub(crate) struct RuledTask<R> {
+    rules: R,
+    spec: TaskSpec,
+    starts: [ClipStarts; 1],
+}
+
+impl<R: Rules> RuledTask<R> {
+    pub(crate) fn new(rules: R, spec: TaskSpec) -> Self {
+        let starts = [ClipStarts { clip: 0, frames: 0..EVALUATION_STARTS, probability: 1.0 }];
+        Self { rules, spec, starts }
+    }
+}
+
+impl<R: Rules> Task for RuledTask<R> {
+    fn spec(&self) -> &TaskSpec {
+        &self.spec
+    }
+
+    fn starts(&self) -> &[ClipStarts] {
+        &self.starts
+    }
+
+    fn control_timestep(&self) -> f64 {
+        CONTROL_TIMESTEP
+    }
+
+    fn environment(self: Arc<Self>, seed: u64) -> Result<Box<dyn Simulated>, Error> {
+        Ok(Box::new(RuledEnvironment::new(self, seed)?))
+    }
+}
+
+/// One simulation of a task.
+#[derive(Debug)]
+pub(crate) struct RuledEnvironment<R: Rules> {
+    task: Arc<RuledTask<R>>,
+    stage: Stage,
+    state: R::State,
+    random: Pcg64,
+    start: usize,
+    /// Control steps since the last reset.
+    steps: usize,
+    diverged: bool,
+}
+
+impl<R: Rules> RuledEnvironment<R> {
+    fn new(task: Arc<RuledTask<R>>, seed: u64) -> Result<Self, Error> {
+        let mut random = Pcg64::seed_from_u64(seed);
+        let stage = task.rules.stage(&mut random)?;
+        let mut environment =
+            Self { task, stage, state: R::State::default(), random, start: 0, steps: 0, diverged: false };
+        environment.reset();
+        Ok(environment)
+    }
+
+    /// An environment in which an episode begins in this pose.
+    pub(crate) fn at(rules: R, pose: &Pose, state: R::State) -> Result<Self, Error> {
+        let mut random = Pcg64::seed_from_u64(0);
+        let mut stage = rules.stage(&mut random)?;
+        stage.place(&pose.qpos, &pose.qvel);
+        let task = Arc::new(RuledTask::new(rules, TaskSpec::default()));
+        Ok(Self { task, stage, state, random, start: 0, steps: 0, diverged: false })
+    }
+
+    pub(crate) fn stage(&self) -> &Stage {
+        &self.stage
+    }
+
+    pub(crate) fn state(&self) -> &R::State {
+        &self.state
+    }
+
+    pub(crate) fn rules(&self) -> &R {
+        &self.task.rules
+    }
+
+    /// The number of control steps until the time limit.
+    fn max_steps(&self) -> usize {
+        let steps = self.task.rules.time_limit() / CONTROL_TIMESTEP;
+        // The division is not exact. 45 s must give 1500 steps.
+        (steps - 1e-9).ceil().max(1.0) as usize
+    }
+
+    fn diverge(&mut self) -> Step {
+        self.diverged = true;
+        Step::DIVERGED
+    }
+}
+
+impl<R: Rules> Environment for RuledEnvironment<R> {
+    fn reset(&mut self) {
+        (self.steps, self.diverged) = (0, false);
+        self.task.rules.begin(&mut self.stage, &mut self.state, &mut self.random);
+    }
+
+    fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error> {
+        let frames = self.task.starts[0].frames.clone();
+        if clip != 0 || !frames.contains(&start) {
+            return Err(Error::Start { clip, start, first: frames.start, frames: frames.len() });
+        }
+        self.random = Pcg64::seed_from_u64(start as u64);
+        // The last episode must not change this one.
+        self.state = R::State::default();
+        self.start = start;
+        self.reset();
+        Ok(())
+    }
+
+    fn step(&mut self, action: &[f32]) -> Step {
+        self.step_control(&control(action))
+    }
+
+    fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
+        if self.diverged {
+            proprioception.fill(0.0);
+            task.fill(0.0);
+            return;
+        }
+        self.stage.body().write_proprioception(proprioception);
+        self.task.rules.observe(&self.stage, &self.state, task);
+    }
+
+    fn draw(&mut self, image: &mut [u8]) -> Result<(), Error> {
+        if self.diverged {
+            image.fill(0);
+            return Ok(());
+        }
+        vision::draw(self.task.rules.vision(), &mut self.stage.data, image)
+    }
+
+    fn episode(&self) -> Episode {
+        Episode { clip: 0, start: self.start, steps_left: self.max_steps(), task: 0 }
+    }
+
+    fn servo_action(&self, action: &mut [f32]) {
+        // The servos hold the joints in their current positions.
+        let joints: [f64; 56] = std::array::from_fn(|joint| self.stage.data.qpos()[7 + joint]);
+        for (place, value) in action.iter_mut().zip(comic_clips::pose_to_action(&joints)) {
+            *place = value as f32;
+        }
+    }
+}
+
+impl<R: Rules> Simulated for RuledEnvironment<R> {
+    fn step_control(&mut self, control: &[f64; 56]) -> Step {
+        if self.diverged || !control.iter().all(|value| value.is_finite()) {
+            return self.diverge();
+        }
+        self.stage.step(control);
+        self.steps += 1;
+        if !is_healthy(&self.stage.data) {
+            return self.diverge();
+        }
+        let Verdict { reward_terms, failed } =
+            self.task.rules.judge(&mut self.stage, &mut self.state, &mut self.random);
+        let outcome = if failed {
+            Outcome::Terminated
+        } else if self.steps >= self.max_steps() {
+            Outcome::Truncated
+        } else {
+            Outcome::Running
+        };
+        let discount = if failed { 0.0 } else { 1.0 };
+        Step { reward_terms, discount, outcome, head_height: self.stage.head_height() }
+    }
+
+    fn model(&self) -> Arc<MjModel> {
+        self.stage.arena.models.shared()
+    }
+
+    fn simulation(&self) -> &Simulation {
+        &self.stage.data
+    }
+
+    fn simulation_mut(&mut self) -> &mut Simulation {
+        &mut self.stage.data
+    }
+
+    fn scenery(&self) -> Scenery {
+        Scenery { reference: None, target: self.task.rules.target(&self.state) }
+    }
+}

@@ -1,0 +1,263 @@
+//! Get up and stand (CoMic supplement 1.3): an episode begins with a lying humanoid, or with one that falls.
+//!
+//! | constant | value | source |
+//! | --- | --- | --- |
+//! | share of lying starts | 0.05 | supplement, "about 5%" |
+//! | reward | exp(−(h − h_target)²), h the head's height in m | supplement |
+//! | length | 8 s, 267 steps, no early end | supplement ("a maximum reward of about 267") |
+//! | target height | 1.808 m | the upright pose's, ours; the reward is 1 there |
+//! | lying pose | any orientation, joints N(0, 0.3 rad), simulated for 3 s without control | ours |
+//! | standing pose | 2 to 15 cm up, tilt N(0, 0.15 rad), joints N(0, 0.1 rad), velocities N(0, 0.3 m/s), N(0, 0.5 rad/s) | ours |
+//! | task observation | the root's height, m | ours |
+//!
+//! All of them are fields of [`GetUp`].
+
+use std::f64::consts::PI;
+use std::sync::Arc;
+
+use comic_clips::spatial::normalize;
+use comic_clips::{Catalogue, JOINT_RANGES};
+use comic_experiment::{GetUp, LyingPose};
+use rand::Rng as _;
+use rand_distr::{Distribution as _, StandardNormal};
+use rand_pcg::Pcg64;
+
+use super::environment::RuledTask;
+use super::interface::{Rules, Verdict};
+use super::poses::{Pose, Poses, UP};
+use super::stage::{Arena, CONTROL_TIMESTEP, Part, Stage};
+use crate::arenas::floor;
+use crate::environment::Task;
+use crate::error::Error;
+use crate::humanoid;
+use crate::humanoid::observation::{Number, fill};
+use crate::physics::is_healthy;
+use crate::registry::{BuildTask, Context};
+
+/// Standard deviation of the joints of a pose that is dropped, rad.
+const DROPPED_JOINTS: f64 = 0.3;
+/// Control steps in which a dropped body falls and comes to rest: three seconds.
+const SETTLING_STEPS: usize = (3.0 / CONTROL_TIMESTEP) as usize;
+/// Poses are dropped from the smallest multiple of this height at which nothing touches the ground, m.
+const DROP_STEP: f64 = 0.1;
+
+/// The rules of get-up-and-stand.
+#[derive(Debug)]
+pub(crate) struct GetUpRules {
+    config: GetUp,
+    standing: Poses,
+    /// `None` when lying poses are simulated.
+    lying: Option<Poses>,
+    arena: Arc<Arena>,
+}
+
+/// Get-up keeps nothing from step to step.
+#[derive(Debug, Default)]
+pub(crate) struct State;
+
+impl BuildTask for GetUp {
+    fn build(&self, context: &Context<'_>) -> Result<Arc<dyn Task>, Error> {
+        Ok(Arc::new(RuledTask::new(GetUpRules::new(self, context.catalogue)?, context.spec()?)))
+    }
+}
+
+impl GetUpRules {
+    pub(crate) fn new(config: &GetUp, catalogue: &Catalogue) -> Result<Self, Error> {
+        let lying = match config.lying_pose {
+            LyingPose::Simulated => None,
+            LyingPose::Clips => Some(Poses::of_clips(catalogue, 1)?),
+        };
+        let arena = Arc::new(Arena::new(humanoid::build_in(floor::floor)?)?);
+        Ok(Self { config: config.clone(), standing: Poses::new(config.start_pose, catalogue)?, lying, arena })
+    }
+
+    /// A standing pose a little above the ground, which will fall.
+    fn standing(&self, random: &mut Pcg64) -> Pose {
+        let GetUp { drop_height: [low, high], tilt, joint_noise, velocity_noise, angular_velocity_noise, .. } =
+            self.config;
+        let mut pose = self.standing.draw(random);
+        pose.position_mut()[2] += random.random_range(low..=high);
+        let about: f64 = random.random_range(-PI..PI);
+        let pose = pose.turned(UP, random.random_range(-PI..PI));
+        let mut pose = pose.turned([about.cos(), about.sin(), 0.0], tilt * normal(random));
+        disturb_joints(&mut pose, joint_noise, random);
+        pose.qvel[..3].iter_mut().for_each(|velocity| *velocity += velocity_noise * normal(random));
+        pose.qvel[3..].iter_mut().for_each(|velocity| *velocity += angular_velocity_noise * normal(random));
+        pose
+    }
+
+    /// A lying pose at rest on the ground.
+    fn lying(&self, stage: &mut Stage, random: &mut Pcg64) -> Pose {
+        if let Some(poses) = &self.lying {
+            return poses.draw(random).turned(UP, random.random_range(-PI..PI));
+        }
+        loop {
+            let dropped = dropped(stage, random);
+            stage.place(&dropped.qpos, &dropped.qvel);
+            for _ in 0..SETTLING_STEPS {
+                stage.step(&[0.0; 56]);
+            }
+            if is_healthy(&stage.data) {
+                let mut pose = Pose::upright();
+                pose.qpos.copy_from_slice(stage.data.qpos());
+                return pose.moved(-pose.qpos[0], -pose.qpos[1]);
+            }
+        }
+    }
+}
+
+/// A random pose with a random orientation, just above the ground.
+fn dropped(stage: &mut Stage, random: &mut Pcg64) -> Pose {
+    let mut pose = Pose::upright();
+    // A normalised vector of normal numbers has a uniform direction.
+    let orientation = normalize(std::array::from_fn(|_| normal(random)));
+    pose.qpos[3..7].copy_from_slice(&orientation);
+    disturb_joints(&mut pose, DROPPED_JOINTS, random);
+    pose.position_mut()[2] = 0.0;
+    loop {
+        pose.position_mut()[2] += DROP_STEP;
+        stage.place(&pose.qpos, &pose.qvel);
+        // Parts of the body may touch each other.
+        if !stage.contacts().any(|(one, other, _)| one == Part::Ground || other == Part::Ground) {
+            return pose;
+        }
+    }
+}
+
+/// Adds noise of this standard deviation to the joints, within their ranges.
+fn disturb_joints(pose: &mut Pose, deviation: f64, random: &mut Pcg64) {
+    for (joint, [low, high]) in pose.joints_mut().iter_mut().zip(JOINT_RANGES) {
+        *joint = (*joint + deviation * normal(random)).clamp(low, high);
+    }
+}
+
+fn normal(random: &mut Pcg64) -> f64 {
+    StandardNormal.sample(random)
+}
+
+/// exp(−(h − h_target)²), heights in m.
+pub(crate) fn standing_reward(height: f64, target: f64) -> f64 {
+    (-(height - target).powi(2)).exp()
+}
+
+impl Rules for GetUpRules {
+    type State = State;
+
+    fn stage(&self, _: &mut Pcg64) -> Result<Stage, Error> {
+        Ok(Stage::new(Arc::clone(&self.arena)))
+    }
+
+    fn begin(&self, stage: &mut Stage, _: &mut State, random: &mut Pcg64) {
+        let lies = random.random_bool(self.config.lying_share);
+        let pose = if lies { self.lying(stage, random) } else { self.standing(random) };
+        stage.place(&pose.qpos, &pose.qvel);
+    }
+
+    fn judge(&self, stage: &mut Stage, _: &mut State, _: &mut Pcg64) -> Verdict {
+        Verdict::of(standing_reward(stage.head_height(), self.config.target_height), false)
+    }
+
+    fn observe<T: Number>(&self, stage: &Stage, _: &State, out: &mut [T]) {
+        fill(out, [stage.root().0[2]]);
+    }
+
+    fn time_limit(&self) -> f64 {
+        self.config.time_limit
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use comic_experiment::{ClipSource, StartPose};
+    use rand::SeedableRng as _;
+
+    use super::*;
+
+    fn rules(config: &GetUp) -> GetUpRules {
+        GetUpRules::new(config, &Catalogue::open(&[ClipSource::whole("builtin:stand")]).unwrap()).unwrap()
+    }
+
+    /// Heights of the head (m) after each of `count` resets.
+    fn starts(config: &GetUp, count: u64) -> Vec<f64> {
+        let (rules, mut random) = (rules(config), Pcg64::seed_from_u64(1));
+        let mut stage = rules.stage(&mut random).unwrap();
+        let mut start = |_| {
+            rules.begin(&mut stage, &mut State, &mut random);
+            stage.head_height()
+        };
+        (0..count).map(&mut start).collect()
+    }
+
+    #[test]
+    fn about_one_start_in_twenty_is_lying_and_the_others_are_standing() {
+        let heights = starts(&GetUp::default(), 1000);
+        let lying = heights.iter().filter(|height| **height < 0.6).count();
+        // Binomial with mean 50 and standard deviation 6.9.
+        assert!((22..=78).contains(&lying), "{lying} of 1000 lie");
+        assert!(heights.iter().all(|height| *height < 0.6 || *height > 1.5), "no other starts");
+    }
+
+    #[test]
+    fn a_lying_start_is_at_rest_on_the_ground() {
+        let (config, mut random) = (GetUp { lying_share: 1.0, ..GetUp::default() }, Pcg64::seed_from_u64(2));
+        let rules = rules(&config);
+        let mut stage = rules.stage(&mut random).unwrap();
+        for _ in 0..20 {
+            rules.begin(&mut stage, &mut State, &mut random);
+            assert!(stage.has_fallen(), "some part of it touches the ground");
+            assert!(stage.data.qvel().iter().all(|velocity| *velocity == 0.0));
+            assert!(stage.head_height() < 0.6, "{}", stage.head_height());
+            // It stays there: no overlap with the ground throws it up.
+            for _ in 0..10 {
+                stage.step(&[0.0; 56]);
+            }
+            assert!(stage.head_height() < 0.7, "{}", stage.head_height());
+        }
+    }
+
+    #[test]
+    fn a_standing_start_is_above_the_ground_and_falls_without_control() {
+        let config = GetUp { lying_share: 0.0, ..GetUp::default() };
+        let (rules, mut random) = (rules(&config), Pcg64::seed_from_u64(3));
+        let mut stage = rules.stage(&mut random).unwrap();
+        for _ in 0..10 {
+            rules.begin(&mut stage, &mut State, &mut random);
+            assert!(stage.head_height() > 1.5);
+            for _ in 0..100 {
+                stage.step(&[0.0; 56]);
+            }
+            assert!(stage.head_height() < 1.0, "{}", stage.head_height());
+        }
+    }
+
+    #[test]
+    fn first_frames_of_clips_can_be_the_lying_poses() {
+        let config = GetUp { lying_share: 1.0, lying_pose: LyingPose::Clips, ..GetUp::default() };
+        assert!(starts(&config, 5).iter().all(|height| *height > 1.5), "this clip is of standing");
+    }
+
+    #[test]
+    fn the_reward_is_1_for_standing_upright_and_follows_the_formula() {
+        let config = GetUp { lying_share: 0.0, drop_height: [0.0, 0.0], ..still() };
+        let (rules, mut random) = (rules(&config), Pcg64::seed_from_u64(4));
+        let mut stage = rules.stage(&mut random).unwrap();
+        rules.begin(&mut stage, &mut State, &mut random);
+        let Verdict { reward_terms, failed } = rules.judge(&mut stage, &mut State, &mut random);
+        assert!((reward_terms[0] - 1.0).abs() < 1e-5, "{reward_terms:?}");
+        assert!(!failed, "falling does not end the episode");
+        // By hand: exp(−(0.14 − 1.808)²) and exp(−0.808²).
+        assert!((standing_reward(0.14, 1.808) - 0.061_9).abs() < 1e-4);
+        assert!((standing_reward(1.0, 1.808) - 0.520_5).abs() < 1e-4);
+    }
+
+    fn still() -> GetUp {
+        GetUp {
+            tilt: 0.0,
+            joint_noise: 0.0,
+            velocity_noise: 0.0,
+            angular_velocity_noise: 0.0,
+            start_pose: StartPose::Upright,
+            ..GetUp::default()
+        }
+    }
+}

@@ -1,0 +1,236 @@
+//! One simulation of the tracking task.
+
+use std::sync::Arc;
+
+use comic_clips::pose_to_action;
+use comic_experiment::{TaskSpec, Tracking};
+use mujoco_rs::prelude::MjModel;
+use rand::SeedableRng;
+use rand_pcg::Pcg64;
+
+use super::observation::{Observation, View};
+use super::reference::Reference;
+use super::reward;
+use super::task::TrackingTask;
+use crate::environment::{ClipStarts, Environment, Episode, Outcome, Scenery, Simulated, Step, Task, control};
+use crate::error::Error;
+use crate::humanoid::observation::Body;
+use crate::physics::{Data, Simulation, is_healthy};
+use crate::registry::{BuildTask, Context};
+
+impl BuildTask for Tracking {
+    fn build(&self, context: &Context<'_>) -> Result<Arc<dyn Task>, Error> {
+        Ok(Arc::new(TrackingTask::new(self, context.catalogue)?))
+    }
+}
+
+impl Task for TrackingTask {
+    fn spec(&self) -> &TaskSpec {
+        &self.spec
+    }
+
+    fn starts(&self) -> &[ClipStarts] {
+        self.starts.clips()
+    }
+
+    /// The time between two frames, which is the same for all clips.
+    fn control_timestep(&self) -> f64 {
+        self.models.control_timestep()
+    }
+
+    fn environment(self: Arc<Self>, seed: u64) -> Result<Box<dyn Simulated>, Error> {
+        Ok(Box::new(TrackingEnvironment::new(self, seed)))
+    }
+}
+
+impl TrackingTask {
+    /// A new environment after its first reset. `seed` decides all its random numbers.
+    pub fn tracking_environment(self: &Arc<Self>, seed: u64) -> TrackingEnvironment {
+        TrackingEnvironment::new(Arc::clone(self), seed)
+    }
+}
+
+/// An environment of a [`TrackingTask`]. It has its own simulation state and random numbers.
+#[derive(Debug)]
+pub struct TrackingEnvironment {
+    task: Arc<TrackingTask>,
+    data: Data,
+    random: Pcg64,
+    clip: usize,
+    /// The episode's start frame and the current frame, counted from the sub-range's first frame.
+    start: usize,
+    frame: usize,
+    /// Coordinates of the root and the joints one control step ago.
+    previous: [f64; 63],
+    error: f64,
+    diverged: bool,
+}
+
+impl TrackingEnvironment {
+    fn new(task: Arc<TrackingTask>, seed: u64) -> Self {
+        let data = task.models.data();
+        let random = Pcg64::seed_from_u64(seed);
+        let mut environment =
+            Self { task, data, random, clip: 0, start: 0, frame: 0, previous: [0.0; 63], error: 0.0, diverged: false };
+        environment.reset();
+        environment
+    }
+
+    /// dm_control's whole observation dictionary, in its order, in double precision; for comparisons.
+    pub fn dictionary(&self) -> Vec<(&'static str, Vec<f64>)> {
+        let (view, steps) = (self.view(), self.task.config.reference_steps.len());
+        let value = |one: Observation| {
+            let mut value = vec![0.0; one.size(&self.task.walker, steps)];
+            one.write(&view, &mut value);
+            (one.name(), value)
+        };
+        Observation::all().map(value).collect()
+    }
+
+    /// The current frame of the reference, counted from the first frame of the clip's range.
+    pub fn frame(&self) -> usize {
+        self.frame
+    }
+
+    /// The termination error ε after the last reset or step.
+    pub fn termination_error(&self) -> f64 {
+        self.error
+    }
+
+    fn place(&mut self, clip: usize, frame: usize) {
+        let Self { task, data, .. } = self;
+        let reference = &task.references[clip];
+        let preset = task.config.preset_actuators.then(|| pose_to_action(reference.joints(frame)));
+        let activation = preset.as_ref().map(<[f64; 56]>::as_slice).filter(|_| task.walker.activations == 56);
+        task.models.place(data, &reference.qpos(frame), &reference.qvel(frame), activation);
+        self.error = reward::termination_error(task.config.termination_error, &task.walker, data, reference, frame);
+        self.previous.copy_from_slice(data.qpos());
+        (self.clip, self.start, self.frame, self.diverged) = (clip, frame, frame, false);
+    }
+
+    fn diverge(&mut self) -> Step {
+        self.diverged = true;
+        Step::DIVERGED
+    }
+
+    fn reference(&self) -> &Reference {
+        &self.task.references[self.clip]
+    }
+
+    fn view(&self) -> View<'_> {
+        View {
+            body: Body { walker: &self.task.walker, data: &self.data },
+            reference: self.reference(),
+            steps: &self.task.config.reference_steps,
+            previous: &self.previous,
+            clip: self.clip,
+            start: self.start,
+            frame: self.frame,
+        }
+    }
+}
+
+impl Environment for TrackingEnvironment {
+    fn reset(&mut self) {
+        let (clip, start) = self.task.starts.draw(&mut self.random);
+        let first = self.task.references[clip].first;
+        self.place(clip, start.saturating_sub(first));
+    }
+
+    fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error> {
+        let (first, frames) = self
+            .task
+            .references
+            .get(clip)
+            .map_or((0, 0), |reference| (reference.first, reference.last_step(self.task.look_ahead)));
+        match start.checked_sub(first) {
+            Some(frame) if frame < frames => {
+                self.place(clip, frame);
+                Ok(())
+            }
+            _ => Err(Error::Start { clip, start, first, frames }),
+        }
+    }
+
+    fn step(&mut self, action: &[f32]) -> Step {
+        self.step_control(&control(action))
+    }
+
+    fn observe(&self, proprioception: &mut [f32], task: &mut [f32]) {
+        if self.diverged {
+            proprioception.fill(0.0);
+            task.fill(0.0);
+            return;
+        }
+        let view = self.view();
+        view.body.write_proprioception(proprioception);
+        let (mut rest, steps) = (task, self.task.config.reference_steps.len());
+        for one in &self.task.observations {
+            let (place, after) = rest.split_at_mut(one.size(&self.task.walker, steps));
+            one.write(&view, place);
+            rest = after;
+        }
+    }
+
+    fn draw(&mut self, _: &mut [u8]) -> Result<(), Error> {
+        Ok(())
+    }
+
+    fn episode(&self) -> Episode {
+        let reference = self.reference();
+        let steps_left = reference.last_step(self.task.look_ahead).saturating_sub(self.start);
+        Episode { clip: self.clip, start: reference.first + self.start, steps_left, task: 0 }
+    }
+
+    fn servo_action(&self, action: &mut [f32]) {
+        let target = pose_to_action(self.reference().joints(self.frame + 1));
+        for (place, value) in action.iter_mut().zip(target) {
+            *place = value as f32;
+        }
+    }
+}
+
+impl Simulated for TrackingEnvironment {
+    /// References stay at the clip's last frame when a caller steps after the clip's end.
+    fn step_control(&mut self, control: &[f64; 56]) -> Step {
+        if self.diverged || !control.iter().all(|value| value.is_finite()) {
+            return self.diverge();
+        }
+        self.previous.copy_from_slice(self.data.qpos());
+        self.task.models.step(&mut self.data, control);
+        self.frame += 1;
+        if !is_healthy(&self.data) {
+            return self.diverge();
+        }
+        let Self { task, data, frame, .. } = self;
+        let (reference, config) = (&task.references[self.clip], &task.config);
+        self.error = reward::termination_error(config.termination_error, &task.walker, data, reference, *frame);
+        let reward_terms =
+            reward::terms(&task.walker, data, reference, *frame, self.error, config.termination_threshold);
+        let outcome = if self.error > config.termination_threshold {
+            Outcome::Terminated
+        } else if *frame >= reference.last_step(task.look_ahead) || data.time() >= config.time_limit {
+            Outcome::Truncated
+        } else {
+            Outcome::Running
+        };
+        let discount = if outcome == Outcome::Terminated { 0.0 } else { 1.0 };
+        Step { reward_terms, discount, outcome, head_height: task.walker.head_height(data) }
+    }
+
+    fn model(&self) -> Arc<MjModel> {
+        self.task.models.shared()
+    }
+
+    fn simulation(&self) -> &Simulation {
+        &self.data
+    }
+
+    fn simulation_mut(&mut self) -> &mut Simulation {
+        &mut self.data
+    }
+
+    fn scenery(&self) -> Scenery {
+        Scenery { reference: Some(self.reference().qpos(self.frame).to_vec()), target: None }
+    }
+}
