@@ -134,7 +134,7 @@ impl Download<'_> {
             if fruitless == FRUITLESS {
                 return Err(self.failed(&format!(
                     "{reason}; check the network, or fetch it elsewhere and put it in place (--url names another \
-                     address). {there} of {} bytes are kept, and the same command goes on from there",
+                     address). {there} of {} bytes are kept, and the same command continues from there",
                     self.expected.size
                 )));
             }
