@@ -51,7 +51,7 @@ fn run(options: &Options) -> Result<()> {
         Some(Command::Status(status)) => status.run(),
         Some(Command::Health(_)) => Ok(()),
         Some(Command::Certs(certs)) => certs.run(),
-        Some(Command::Metrics) => Ok(comic_learner::observe::telemetry::print_reference()?),
+        Some(Command::Metrics) => comic_learner::observe::telemetry::print_reference(),
         Some(Command::Manual(manual)) => manual
             .write(Options::command())
             .map_err(|source| Error::System { what: "cannot write the manual".into(), source }),

@@ -4,7 +4,6 @@
 
 use crate::support::RUN;
 use comic_learner::checkpoint::{Evaluated, Judgement, Name, Snapshot, Store, find, read};
-use comic_learner::error::Error;
 use comic_proto::chain;
 use proptest::prelude::*;
 
@@ -72,7 +71,7 @@ fn an_unreadable_checkpoint_is_not_damaged_and_stays_in_place() {
     // The system refuses to open a link to itself, for every user.
     std::fs::remove_file(newest.join("part")).unwrap();
     std::os::unix::fs::symlink("part", newest.join("part")).unwrap();
-    let refused = Error::from(store.newest().unwrap_err());
+    let refused = store.newest().unwrap_err();
     assert_eq!(refused.exit_code(), 1, "{refused}");
     assert!(chain(&refused).contains("cannot read"), "{}", chain(&refused));
     assert!(newest.is_dir());
@@ -101,7 +100,7 @@ fn a_run_with_only_damaged_checkpoints_does_not_begin_again() {
     let only = store.write(Name::Updates(1), &snapshot("one")).unwrap();
     std::fs::write(only.join("part"), "øne").unwrap();
     for start in 1..=2 {
-        let refused = Error::from(Store::open(run.path(), 3).unwrap().newest().unwrap_err());
+        let refused = Store::open(run.path(), 3).unwrap().newest().unwrap_err();
         assert_eq!(refused.exit_code(), 2, "a restart cannot help: {refused}");
         assert!(refused.to_string().contains("--run"), "start {start}: {refused}");
     }
@@ -204,7 +203,7 @@ fn a_run_keeps_its_number_and_every_other_run_has_another() {
     assert_eq!(number(&run).unwrap(), drawn);
     assert_ne!(number(&other).unwrap(), drawn);
     std::fs::write(run.path().join("checkpoints/run"), "the best").unwrap();
-    let damaged = Error::from(number(&run).unwrap_err());
+    let damaged = number(&run).unwrap_err();
     assert!(damaged.exit_code() == 2 && damaged.to_string().contains("checkpoints/run is damaged"), "{damaged}");
 }
 
@@ -213,7 +212,7 @@ fn a_damaged_epoch_is_an_error_that_names_the_file() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 1).unwrap();
     std::fs::write(run.path().join("checkpoints/epoch"), "many").unwrap();
-    let damaged = Error::from(store.begin_epoch().unwrap_err());
+    let damaged = store.begin_epoch().unwrap_err();
     assert!(damaged.exit_code() == 2 && damaged.to_string().contains("checkpoints/epoch is damaged"), "{damaged}");
 }
 
