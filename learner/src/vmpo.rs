@@ -12,6 +12,7 @@
 mod improvement;
 mod learner;
 mod multipliers;
+mod report;
 mod returns;
 mod stores;
 
