@@ -4,7 +4,7 @@
 //! - [`Experiment`] is the resolved document. The learner is started with it; actors receive the same document when they
 //!   join.
 //! - [`presets`] holds the built-in documents: every file `presets/*.toml`.
-//! - [`resolve`] turns a preset or a file plus `--set key=value` overrides into an [`Experiment`]. It refuses unknown
+//! - [`resolve()`] turns a preset or a file plus `--set key=value` overrides into an [`Experiment`]. It refuses unknown
 //!   fields and names the nearest known one.
 //! - [`find_field`] finds a field by the end of its name. [`Experiment::differences`] compares two experiments.
 //! - [`for_each_task`] lists all tasks. [`TaskSpec`] is what networks, wire and learner know of a task: sizes and names.
@@ -44,7 +44,4 @@ pub use network::{InitialPose, Latent, LowLevelName, Lstm, Mlp, Network, Primiti
 pub use resolve::resolve;
 pub use settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
 pub use spec::{TaskPart, TaskSpec};
-pub use tasks::{
-    BallCatch, Corridor, Gaps, GetUp, GoToTarget, LyingPose, StartPose, TRACKING_MAX_REWARD, TRACKING_OBSERVATIONS,
-    TRACKING_REWARD_TERMS, TaskName, TerminationError, Tracking, Vision, WallSide, Walls, tracking_observation_size,
-};
+pub use tasks::*;

@@ -17,7 +17,7 @@ pub struct DocumentArguments {
     /// Override any field, for instance --set vmpo.epsilon_eta=0.2.
     #[arg(long = "set", value_name = "FIELD=VALUE", global = true)]
     pub overrides: Vec<String>,
-    /// Where the update runs: cpu, cuda[:N] or xla[:N]. The same as --set learner.device=D.
+    /// Where the update runs: cpu, cuda, cuda:N, xla or xla:N. The same as --set learner.device=D.
     #[arg(long, value_name = "DEVICE", global = true)]
     pub device: Option<DeviceName>,
     /// Learn reproducibly with any number of actors, for debugging. The same as --set unroll.lockstep=true and --set

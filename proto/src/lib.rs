@@ -8,7 +8,7 @@
 //! - [`UnrollBuffer`] is an unroll that an actor writes.
 //! - [`ReceivedUnroll`] is an unroll that a learner has received, in the [`Pieces`] of the network.
 //! - [`Access`] is a client's access to a learner: URL, TLS, and [`Token`].
-//! - [`validate`] checks a payload before it is copied into a batch.
+//! - [`validate()`] checks a payload before it is copied into a batch.
 //!
 //! # An unroll
 //! An unroll has `T` transitions and `T + 1` rows of observations. Row `t` has the observation before transition `t`.

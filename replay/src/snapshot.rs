@@ -83,7 +83,7 @@ impl Ledger {
     /// The ledger of a new learner epoch. The unrolls that were in flight are lost at restart.
     ///
     /// # Errors
-    /// [`Error`](enum@Error) if the snapshot is inconsistent.
+    /// [`enum@Error`] if the snapshot is inconsistent.
     pub fn restore(snapshot: &LedgerSnapshot) -> Result<Self, Error> {
         let mut ledger = Self::new();
         let (mut incarnations, mut in_accounts) = (HashSet::new(), 0u64);
