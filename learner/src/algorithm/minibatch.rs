@@ -123,10 +123,10 @@ impl MinibatchTensors {
             routing: Routing::blocked(&tasks, self.shape.tasks, self.device()),
             tasks,
             shape: MinibatchShape { unrolls: unrolls.len(), ..self.shape },
-            fields: self.fields.each_ref().map(|_, tensor| match tensor.defined() {
-                true => tensor.index_select(0, &indices),
-                false => Tensor::new(),
-            }),
+            fields: self
+                .fields
+                .each_ref()
+                .map(|_, tensor| if tensor.defined() { tensor.index_select(0, &indices) } else { Tensor::new() }),
             clips: self.clips,
         }
     }
