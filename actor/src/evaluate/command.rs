@@ -7,9 +7,8 @@ use std::path::PathBuf;
 use clap::Args;
 use comic_clips::Catalogue;
 use comic_experiment::Experiment;
-use comic_proto::Access;
-use comic_proto::UnrollShape;
 use comic_proto::v1::EvaluationReport;
+use comic_proto::{Access, UnrollShape};
 use comic_tasks::{Simulated, Task};
 
 use super::delivery::deliver;
