@@ -6,10 +6,10 @@
 
 pub mod command;
 mod delivery;
-mod options;
 mod report;
 mod rewards;
 mod rollout;
+mod settings;
 mod table;
 
 use std::sync::Arc;
@@ -24,9 +24,9 @@ use crate::Error;
 use crate::acting::ForwardPass;
 use crate::acting_loop::Controller;
 
-pub use options::Options;
 pub use report::{ClipReport, Finished, Report};
 pub use rollout::{Audience, Start};
+pub use settings::RolloutSettings;
 
 /// Rolls out the starts of the clips of `task` that the options choose; `shape` is the shape of its experiment's
 /// unrolls.
@@ -37,7 +37,7 @@ pub fn evaluate<F: ForwardPass>(
     controller: &mut Controller<'_, F>,
     task: &Arc<dyn Task>,
     shape: &UnrollShape,
-    options: &Options,
+    options: &RolloutSettings,
     audience: &mut dyn Audience<Box<dyn Simulated>>,
 ) -> Result<Vec<Finished>, Error> {
     let starts = chosen(task.starts(), options);
@@ -53,7 +53,7 @@ pub fn roll_out<F: ForwardPass>(
     task: &Arc<dyn Task>,
     shape: &UnrollShape,
     starts: &[Start],
-    options: &Options,
+    options: &RolloutSettings,
     audience: &mut dyn Audience<Box<dyn Simulated>>,
 ) -> Result<Vec<Finished>, Error> {
     let environments = (0..options.environments.min(starts.len()).max(1) as u64)
@@ -63,7 +63,7 @@ pub fn roll_out<F: ForwardPass>(
 }
 
 /// The starts to roll out: all of them, or random ones.
-fn chosen(clips: &[ClipStarts], options: &Options) -> Vec<Start> {
+fn chosen(clips: &[ClipStarts], options: &RolloutSettings) -> Vec<Start> {
     let mut rng = Pcg64::seed_from_u64(derive(options.seed, u64::MAX));
     let mut chosen = Vec::new();
     for ClipStarts { clip, frames, .. } in clips.iter().filter(|clip| !clip.frames.is_empty()) {
@@ -84,9 +84,9 @@ mod tests {
     fn every_start_is_chosen_once_or_random_ones_by_the_seed() {
         let clips = [0..3, 0..0, 5..6].into_iter().enumerate();
         let clips: Vec<_> = clips.map(|(clip, frames)| ClipStarts { clip, frames, probability: 0.0 }).collect();
-        let all = chosen(&clips, &Options::default());
+        let all = chosen(&clips, &RolloutSettings::default());
         assert_eq!(all.iter().map(|s| (s.clip, s.start)).collect::<Vec<_>>(), [(0, 0), (0, 1), (0, 2), (2, 5)]);
-        let random = Options { episodes: Some(4), ..Options::default() };
+        let random = RolloutSettings { episodes: Some(4), ..RolloutSettings::default() };
         let some = chosen(&clips, &random);
         assert_eq!(some.len(), 8);
         assert!(some.iter().all(|s| clips[s.clip].frames.contains(&s.start)));

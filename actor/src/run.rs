@@ -20,7 +20,7 @@ use crate::liveness::Liveness;
 use crate::mailbox::Mailbox;
 use crate::policy::TorchPolicy;
 use crate::seeds::EnvironmentSeeds;
-use crate::session::{self, Joined, Limits};
+use crate::session::{self, ExchangeLimits, Joined};
 use crate::worker::{FinishedUnroll, Pace, Progress, Worker};
 
 /// How long a stopped actor sends finished unrolls. It promises to exit within five seconds; this is one second less.
@@ -80,7 +80,7 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
     let (stopping, stop) = watch::channel(false);
     let closing = Closing { mailbox: Arc::clone(&mailbox), stopping };
     stop_on_signal(runtime, closing.clone())?;
-    let session = session::Options {
+    let session = session::JoinSettings {
         learner: options.learner.clone(),
         access: options.access.clone(),
         cache: options.cache.clone(),
@@ -102,7 +102,7 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
     tracing::info!(experiment = joined.experiment.name, threads = workers.len(), environments, ?pace, "acting");
 
     let unacknowledged = environments.saturating_mul(2).clamp(FEWEST_UNACKNOWLEDGED, MOST_UNACKNOWLEDGED);
-    let limits = Limits { window: unacknowledged, parameters: parameters + PARAMETERS_SLACK, flush: FLUSH };
+    let limits = ExchangeLimits { window: unacknowledged, parameters: parameters + PARAMETERS_SLACK, flush: FLUSH };
     // One round of unrolls fits, so a worker continues to step while the connection takes its unrolls.
     let (sender, unrolls) = mpsc::channel(unacknowledged / 2);
     let progress = Arc::new(Progress::default());

@@ -44,7 +44,7 @@ const STABLE: Duration = Duration::from_secs(5);
 
 /// The learner's address, the asset cache, and the size of this actor.
 #[derive(Clone, Debug)]
-pub struct Options {
+pub struct JoinSettings {
     /// For instance `http://host:7070`.
     pub learner: String,
     /// Certificates and token.
@@ -59,9 +59,9 @@ pub struct Options {
     pub environments: Option<usize>,
 }
 
-/// Limits of an exchange.
+/// ExchangeLimits of an exchange.
 #[derive(Clone, Copy, Debug)]
-pub struct Limits {
+pub struct ExchangeLimits {
     /// Most unrolls without acknowledgement; when there are so many, no unroll is taken from the workers.
     pub window: usize,
     /// Most bytes of parameters in one version.
@@ -130,14 +130,14 @@ fn lasting(document: &str) -> String {
 /// # Errors
 /// A refusal, an experiment that cannot be used, no cache directory, a full disk; [`Error::Stopped`] when `stop` became
 /// true first.
-pub async fn join(options: &Options, mut stop: watch::Receiver<bool>) -> Result<Joined, Error> {
+pub async fn join(options: &JoinSettings, mut stop: watch::Receiver<bool>) -> Result<Joined, Error> {
     tokio::select! {
         joined = join_for_ever(options) => joined,
         _ = stop.wait_for(|stop| *stop) => Err(Error::Stopped),
     }
 }
 
-async fn join_for_ever(options: &Options) -> Result<Joined, Error> {
+async fn join_for_ever(options: &JoinSettings) -> Result<Joined, Error> {
     let mut connector = Connector::new(options)?;
     let mut backoff = Backoff::default();
     loop {
@@ -165,7 +165,7 @@ async fn join_for_ever(options: &Options) -> Result<Joined, Error> {
 
 type Reply = (Link, CheckedReply, HashMap<String, PathBuf>);
 
-async fn attempt(options: &Options, connector: &mut Connector) -> Result<Reply, Failure> {
+async fn attempt(options: &JoinSettings, connector: &mut Connector) -> Result<Reply, Failure> {
     let mut link = connector.connect(0).await?;
     let checked = read_reply(&link.reply).map_err(Failure::Fatal)?;
     let assets = assets::fetch(&mut link, options.cache.as_deref()).await?;
@@ -212,7 +212,7 @@ impl Joined {
     /// [`Error::Changed`], a refusal at a reconnect.
     pub async fn run(
         self,
-        limits: Limits,
+        limits: ExchangeLimits,
         unrolls: mpsc::Receiver<FinishedUnroll>,
         mailbox: Arc<Mailbox>,
         stop: watch::Receiver<bool>,
@@ -231,7 +231,7 @@ impl Joined {
     /// Returns whether it ended because the run is over.
     async fn keep_connected(
         mut self,
-        limits: Limits,
+        limits: ExchangeLimits,
         mut unrolls: mpsc::Receiver<FinishedUnroll>,
         mailbox: Arc<Mailbox>,
         outbox: &mut Outbox,

@@ -7,13 +7,12 @@ use std::path::PathBuf;
 use clap::Args;
 use comic_clips::Catalogue;
 use comic_experiment::Experiment;
-use comic_proto::Access;
-use comic_proto::UnrollShape;
 use comic_proto::v1::EvaluationReport;
+use comic_proto::{Access, UnrollShape};
 use comic_tasks::{Simulated, Task};
 
 use super::delivery::deliver;
-use super::{Audience, Options, Report, evaluate};
+use super::{Audience, Report, RolloutSettings, evaluate};
 use crate::Error;
 use crate::acting_loop::Controller;
 use crate::checkpoint::{self, Checkpoint, Position};
@@ -130,11 +129,11 @@ impl Evaluate {
         let experiment = experiment.with_clips(&self.clips);
         let catalogue = Catalogue::open(&experiment.clips)?;
         let task = comic_tasks::build(&experiment, &catalogue)?;
-        let options = Options {
+        let options = RolloutSettings {
             episodes: self.episodes.map(|episodes| episodes as usize),
             deterministic: self.deterministic,
             seed: self.seed,
-            ..Options::default()
+            ..RolloutSettings::default()
         };
         let shape = UnrollShape::new(task.spec(), &experiment);
         let mut policy = self.policy(&experiment, task.as_ref(), own.as_ref(), parameters.as_deref())?;

@@ -6,7 +6,7 @@ use comic_experiment::{TaskPart, TaskSpec};
 use comic_tasks::MAX_REWARD_TERMS;
 use serde::{Deserialize, Serialize};
 
-use super::options::Options;
+use super::settings::RolloutSettings;
 
 /// An episode that is over.
 #[derive(Clone, Debug, PartialEq)]
@@ -79,7 +79,7 @@ pub struct ClipReport {
 
 impl Report {
     /// Sums up `finished` over the clips of `spec`.
-    pub fn new(spec: &TaskSpec, finished: &[Finished], options: &Options) -> Self {
+    pub fn new(spec: &TaskSpec, finished: &[Finished], options: &RolloutSettings) -> Self {
         let clips = spec
             .clips
             .iter()
@@ -167,7 +167,7 @@ mod tests {
     #[test]
     fn the_formulas_by_hand() {
         let finished = [episode(0, 10, 5, 2.9, 1.45), episode(0, 20, 20, 14.5, 14.5), episode(1, 4, 4, 0.0, 5.8)];
-        let report = Report::new(&spec(), &finished, &Options::default());
+        let report = Report::new(&spec(), &finished, &RolloutSettings::default());
         let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-12, "{a} is not {b}");
         assert_eq!(report.clips.len(), 2, "a clip without an episode has no row");
 
@@ -194,19 +194,19 @@ mod tests {
         spec.tasks[0].clips = 2;
         spec.tasks.push(TaskPart { name: "get-up".into(), max_reward: 1.0, clips: 1, ..spec.tasks[0].clone() });
         let finished = [episode(0, 10, 10, 14.5, 0.0), episode(1, 10, 10, 0.0, 0.0), episode(2, 10, 10, 5.0, 0.0)];
-        let report = Report::new(&spec, &finished, &Options::default());
+        let report = Report::new(&spec, &finished, &RolloutSettings::default());
         let rows: Vec<_> =
             report.tasks.iter().map(|row| (row.clip.as_str(), row.episodes, row.normalised_reward)).collect();
         assert_eq!(rows, [("tracking", 2, 0.5), ("get-up", 1, 0.5)]);
         assert!(
-            Report::new(&self::spec(), &finished[..2], &Options::default()).tasks.is_empty(),
+            Report::new(&self::spec(), &finished[..2], &RolloutSettings::default()).tasks.is_empty(),
             "a single task has no rows of tasks"
         );
     }
 
     #[test]
     fn a_report_without_episodes_has_no_nan() {
-        let report = Report::new(&spec(), &[], &Options::default());
+        let report = Report::new(&spec(), &[], &RolloutSettings::default());
         let json = serde_json::to_string(&report).unwrap();
         assert_eq!(serde_json::from_str::<Report>(&json).unwrap(), report);
     }

@@ -9,8 +9,8 @@ use comic_tasks::{Environment, Outcome};
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
 
-use super::options::Options;
 use super::report::Finished;
+use super::settings::RolloutSettings;
 use crate::Error;
 use crate::acting::{ActingRow, ForwardPass};
 use crate::acting_loop::{ActingLoop, Controller, Recorder, Rollout};
@@ -53,7 +53,7 @@ pub(super) fn run<E: Environment, F: ForwardPass>(
     environments: Vec<E>,
     shape: &UnrollShape,
     starts: &[Start],
-    options: &Options,
+    options: &RolloutSettings,
     audience: &mut dyn Audience<E>,
 ) -> Result<Vec<Finished>, Error> {
     let mut acting = ActingLoop::new(environments, shape);
@@ -259,7 +259,7 @@ mod tests {
     fn episodes(controller: &mut Controller<'_, Quarter>, environments: usize) -> Vec<(usize, usize, f64)> {
         let environments = (0..environments).map(|_| Fixed { start: 0, step: 0 }).collect();
         let starts: Vec<Start> = (0..7).map(|start| Start { clip: 0, start }).collect();
-        let options = Options { deterministic: true, ..Options::default() };
+        let options = RolloutSettings { deterministic: true, ..RolloutSettings::default() };
         let finished = run(controller, environments, &SHAPE, &starts, &options, &mut |_: usize, _: usize| ()).unwrap();
         let mut found: Vec<_> = finished.iter().map(|e| (e.steps(), e.steps_left, e.returns[0])).collect();
         found.sort_by(|a, b| a.partial_cmp(b).unwrap());
@@ -299,7 +299,7 @@ mod tests {
         let all: Vec<_> = steps(0, 3).chain(steps(1, 3)).chain(steps(2, 10)).collect();
         for (patience, episodes) in [(1, 0), (3, 0), (4, 1), (5, 1), (8, 2), (100, 3)] {
             let mut spectator = Spectator { watched: Vec::new(), patience };
-            let (environments, options) = (vec![Fixed { start: 0, step: 0 }], Options::default());
+            let (environments, options) = (vec![Fixed { start: 0, step: 0 }], RolloutSettings::default());
             let finished =
                 run(&mut Controller::<Quarter>::Zero, environments, &SHAPE, &starts, &options, &mut spectator).unwrap();
             assert_eq!(spectator.watched, all[..patience.min(all.len())]);

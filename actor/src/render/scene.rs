@@ -12,7 +12,7 @@ use comic_tasks::{Simulated, Task};
 use crate::Error;
 use crate::acting_loop::Controller;
 use crate::checkpoint::{self, Checkpoint};
-use crate::evaluate::{Audience, Finished, Options, Start, roll_out};
+use crate::evaluate::{Audience, Finished, RolloutSettings, Start, roll_out};
 use crate::policy::TorchPolicy;
 
 /// The preset of tracking; every other task's preset has the task's name.
@@ -56,7 +56,7 @@ pub(super) struct Cast {
     shape: UnrollShape,
     name: TaskName,
     starts: Vec<Start>,
-    options: Options,
+    options: RolloutSettings,
 }
 
 impl Scene {
@@ -80,8 +80,12 @@ impl Scene {
             .transpose()?;
         let starts = self.starts(task.as_ref())?;
         let name = self.task;
-        let options =
-            Options { deterministic: self.deterministic, seed: self.seed, environments: 1, ..Options::default() };
+        let options = RolloutSettings {
+            deterministic: self.deterministic,
+            seed: self.seed,
+            environments: 1,
+            ..RolloutSettings::default()
+        };
         let shape = UnrollShape::new(task.spec(), &experiment);
         Ok(Cast { task, policy, shape, name, starts, options })
     }

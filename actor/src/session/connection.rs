@@ -8,7 +8,7 @@ use comic_proto::{Access, AccessError, Client, PROTOCOL_VERSION, chain, distrust
 use tonic::transport::Endpoint;
 use tonic::{Code, Request, Status};
 
-use super::{Options, Terms};
+use super::{JoinSettings, Terms};
 use crate::Error;
 
 /// Deadline of a unary call.
@@ -60,7 +60,7 @@ pub(super) struct Connector {
 
 impl Connector {
     /// Checks address, certificates and token, so that their errors are reported at once.
-    pub(super) fn new(options: &Options) -> Result<Self, Error> {
+    pub(super) fn new(options: &JoinSettings) -> Result<Self, Error> {
         let number = |given: Option<usize>| given.map(|number| u32::try_from(number).unwrap_or(u32::MAX));
         let connector = Self {
             address: options.learner.clone(),

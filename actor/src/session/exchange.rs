@@ -9,7 +9,7 @@ use tokio::task::JoinSet;
 use tokio_stream::wrappers::ReceiverStream;
 
 use super::connection::{Link, describe};
-use super::{Assembled, Assembler, Limits, Outbox};
+use super::{Assembled, Assembler, ExchangeLimits, Outbox};
 use crate::mailbox::Mailbox;
 use crate::worker::FinishedUnroll;
 
@@ -31,7 +31,7 @@ pub(super) struct Exchange<'a> {
     pub(super) unrolls: &'a mut mpsc::Receiver<FinishedUnroll>,
     pub(super) outbox: &'a mut Outbox,
     pub(super) mailbox: &'a Arc<Mailbox>,
-    pub(super) limits: Limits,
+    pub(super) limits: ExchangeLimits,
 }
 
 impl Exchange<'_> {

@@ -9,10 +9,10 @@ use super::*;
 use crate::mailbox::Directive;
 use learner::{FakeLearner, Script};
 
-const LIMITS: Limits = Limits { window: 4, parameters: 1000, flush: Duration::from_secs(60) };
+const LIMITS: ExchangeLimits = ExchangeLimits { window: 4, parameters: 1000, flush: Duration::from_secs(60) };
 
-fn options_for(learner: impl Into<String>) -> Options {
-    Options {
+fn options_for(learner: impl Into<String>) -> JoinSettings {
+    JoinSettings {
         learner: learner.into(),
         access: Access::default(),
         cache: None,
@@ -88,7 +88,7 @@ async fn connections_dropped_in_mid_stream_lose_nothing_repeat_nothing_and_keep_
 #[tokio::test]
 async fn an_actor_sends_its_name_and_superseding_it_is_no_configuration_error() {
     let learner = FakeLearner::start(Script { superseded: true, ..Script::default() }).await;
-    let options = Options { name: Some("pod-0".into()), ..options_for(learner.address()) };
+    let options = JoinSettings { name: Some("pod-0".into()), ..options_for(learner.address()) };
     let (_stop, stopped) = watch::channel(false);
     let error = join(&options, stopped).await.unwrap_err();
     assert!(matches!(error, Error::Superseded { .. }) && !error.is_configuration(), "{error}");
@@ -179,7 +179,7 @@ async fn stopping_does_not_wait_for_a_silent_learner() {
     let options = options_for(learner.address());
     let joined = join(&options, stopped.clone()).await.unwrap();
     let (unrolls, receiver) = mpsc::channel(1);
-    let limits = Limits { flush: Duration::from_millis(20), ..LIMITS };
+    let limits = ExchangeLimits { flush: Duration::from_millis(20), ..LIMITS };
     let session = tokio::spawn(joined.run(limits, receiver, Arc::default(), stopped));
     unrolls.send(unroll(0)).await.unwrap();
     stop.send_replace(true);
@@ -257,7 +257,7 @@ mod assets {
 
     async fn fetch(learner: &FakeLearner, cache: &std::path::Path) -> Result<HashMap<String, PathBuf>, Error> {
         let (_stop, stopped) = watch::channel(false);
-        let options = Options { cache: Some(cache.to_path_buf()), ..options_for(learner.address()) };
+        let options = JoinSettings { cache: Some(cache.to_path_buf()), ..options_for(learner.address()) };
         Ok(join(&options, stopped).await?.assets)
     }
 

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, anyhow, ensure};
 use comic_actor::mailbox::Mailbox;
-use comic_actor::session::{self, Limits};
+use comic_actor::session::{self, ExchangeLimits};
 use comic_actor::worker::FinishedUnroll;
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
 use comic_proto::v1::*;
@@ -117,7 +117,7 @@ fn still_unroll(layout: &UnrollLayout) -> FinishedUnroll {
 /// Processor time of this thread from the first unroll sent to the last acknowledgement.
 async fn send(address: &str, unroll: &FinishedUnroll, unrolls: usize) -> Result<Duration> {
     let (_stop, stopped) = watch::channel(false);
-    let options = session::Options {
+    let options = session::JoinSettings {
         learner: address.to_string(),
         access: Access::default(),
         cache: None,
@@ -127,7 +127,7 @@ async fn send(address: &str, unroll: &FinishedUnroll, unrolls: usize) -> Result<
     };
     let joined = session::join(&options, stopped.clone()).await?;
     let (sender, receiver) = mpsc::channel(super::ENVIRONMENTS);
-    let limits = Limits { window: 2 * super::ENVIRONMENTS, parameters: 0, flush: Duration::ZERO };
+    let limits = ExchangeLimits { window: 2 * super::ENVIRONMENTS, parameters: 0, flush: Duration::ZERO };
     let begin = Clock::start();
     let session = tokio::spawn(joined.run(limits, receiver, Arc::new(Mailbox::default()), stopped));
     for _ in 0..unrolls {

@@ -1,8 +1,8 @@
-//! How a policy is evaluated.
+//! The settings of a rollout.
 
-/// How to evaluate.
+/// Starts, noise and parallel environments of a rollout.
 #[derive(Clone, Copy, Debug)]
-pub struct Options {
+pub struct RolloutSettings {
     /// Episodes of each clip from random starts; every start once when absent.
     pub episodes: Option<usize>,
     /// The mean action and the latent's mean instead of samples.
@@ -13,7 +13,7 @@ pub struct Options {
     pub environments: usize,
 }
 
-impl Default for Options {
+impl Default for RolloutSettings {
     fn default() -> Self {
         Self { episodes: None, deterministic: false, seed: 1, environments: 16 }
     }
