@@ -1,4 +1,4 @@
-//! Compiles `comic/v1/learner.proto` with protox, so that no protoc has to be installed.
+//! Compiles `comic/v1/learner.proto` with protox, so protoc need not be installed.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -9,11 +9,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     const PROTO: &str = "comic/v1/learner.proto";
     println!("cargo:rerun-if-changed={PROTO}");
     let descriptors = protox::compile([PROTO], ["."])?;
-    // What reflection answers with.
+    // The descriptors for gRPC reflection.
     let out = PathBuf::from(std::env::var_os("OUT_DIR").ok_or("cargo sets OUT_DIR")?);
     std::fs::write(out.join("descriptors.bin"), descriptors.encode_to_vec())?;
     tonic_prost_build::configure()
-        // The bulky fields, and no others: a `bytes::Bytes` field keeps the whole message it was cut from alive.
+        // Only the large fields are `bytes::Bytes`: such a field keeps its whole message in memory.
         .bytes(".comic.v1.UnrollMessage.payload")
         .bytes(".comic.v1.ParametersChunk.data")
         .bytes(".comic.v1.AssetChunk.data")

@@ -1,4 +1,4 @@
-//! Unrolls of the real task under a real policy: what a learner will find in them.
+//! Checks unrolls of the tracking task under a real policy as a learner receives them.
 
 #![allow(clippy::unwrap_used, reason = "tests")]
 
@@ -66,7 +66,7 @@ fn unrolls_pass_the_learners_validation() {
 }
 
 #[test]
-fn the_behaviour_policy_follows_from_what_is_recorded() {
+fn the_behaviour_policy_follows_from_the_recorded_fields() {
     let mut setup = setup();
     for round in record(&setup, Behaviour::Policy) {
         let mut unrolls: Vec<_> =
@@ -98,7 +98,7 @@ fn rewards_are_the_tracking_tasks() {
         let buffer = UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap();
         for t in 0..setup.layout.shape().length {
             let reward: f32 = buffer.row(Field::Reward, t).iter().sum();
-            // Beyond the threshold, at a failure, the termination term turns negative.
+            // At a failure, beyond the threshold, the termination term is negative.
             assert!(reward <= 1.45 && (reward >= 0.0 || buffer.row(Field::Discount, t) == [0.0]), "{reward}");
             best = best.max(reward);
         }

@@ -42,7 +42,7 @@ pub struct Update {
     /// Joint training of two tasks, and beside it the first task alone
     #[arg(long, conflicts_with = "low_level")]
     joint: bool,
-    /// Where the update runs: cpu, cuda[:N] or xla[:N]
+    /// Where the update runs: cpu, cuda, cuda:N, xla or xla:N
     #[arg(long, value_name = "DEVICE", default_value_t = DeviceName::default())]
     device: DeviceName,
 }

@@ -1,5 +1,5 @@
-//! Clips that need no file.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+//! The built-in clips.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
 mod support;
 
@@ -52,7 +52,7 @@ fn there_are_walks_a_run_a_jump_squats_and_a_turn() {
 }
 
 #[test]
-fn motion_moves_as_its_name_says() {
+fn the_motions_match_their_names() {
     let forward = |name: &str| {
         let clip = load(name);
         let (first, last) = (clip.motion.position[0], clip.motion.position[clip.steps() - 1]);
@@ -62,7 +62,7 @@ fn motion_moves_as_its_name_says() {
     assert!(forward("run") > 2.0, "{}", forward("run"));
     assert_eq!(forward("stand"), 0.0);
     let lowest = load("squat").motion.position.iter().map(|root| root[2]).fold(f64::INFINITY, f64::min);
-    assert!(lowest < 0.8, "a squat lowers the root, here to {lowest}");
+    assert!(lowest < 0.8, "a squat must lower the root, which is at least at {lowest} m");
 }
 
 #[test]
@@ -106,7 +106,7 @@ fn recorded_motion_is_bit_for_bit_the_motion_that_dm_control_computed() {
 }
 
 #[test]
-fn provenance_and_acknowledgement_lie_beside_the_data() {
+fn the_data_has_its_provenance_and_acknowledgement() {
     let manifest = include_str!("../data/builtin.json");
     for name in builtin_names().into_iter().filter(|name| name.starts_with("CMU_")) {
         assert!(manifest.contains(&format!("\"key\": \"{name}\"")), "{name}");
@@ -120,7 +120,7 @@ fn provenance_and_acknowledgement_lie_beside_the_data() {
 }
 
 #[test]
-fn an_unknown_name_is_refused_with_the_nearest_and_all_names() {
+fn the_error_of_an_unknown_name_lists_the_nearest_and_all_names() {
     let message = refused(ClipSource::whole("builtin:walking"));
     assert!(
         message.starts_with("no built-in clip `walking` (did you mean `walk`?); built-in clips are stand, walk, "),

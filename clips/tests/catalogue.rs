@@ -7,7 +7,7 @@ use comic_experiment::ClipSource;
 use support::{defects, golden, names, recordings, refused, tiny, wheel_clips, whole, with_ids};
 
 #[test]
-fn a_whole_file_is_all_its_clips_sorted_by_name() {
+fn a_whole_file_gives_all_its_clips_sorted_by_name() {
     let catalogue = Catalogue::open(&[whole(tiny())]).unwrap();
     assert_eq!(names(&catalogue), ["TINY_001_01", "TINY_001_02"]);
     let first = &catalogue.entries()[0];
@@ -78,8 +78,8 @@ fn clips_that_a_script_wrote_with_h5py_open() {
 }
 
 #[test]
-fn opening_reads_the_chosen_clips_attributes_and_nothing_else() {
-    // Nearly every clip of this file is defective; what is not chosen, or not loaded, does not matter.
+fn opening_reads_only_the_attributes_of_the_chosen_clips() {
+    // Nearly every clip of this file is defective. Clips that are not chosen, or not loaded, give no error.
     let catalogue = Catalogue::open(&[with_ids(defects(), &["sound", "joints_missing", "sound_2019"])]).unwrap();
     assert_eq!(names(&catalogue), ["joints_missing", "sound", "sound_2019"]);
     assert!(catalogue.load(0).is_err());
@@ -88,7 +88,7 @@ fn opening_reads_the_chosen_clips_attributes_and_nothing_else() {
 }
 
 #[test]
-fn a_subset_is_picked_from_a_file_and_what_is_missing_is_counted() {
+fn a_subset_is_chosen_from_a_file_and_missing_clips_are_counted() {
     let source = ClipSource { subset: Some("get_up".into()), ..whole(tiny()) };
     assert_eq!(
         refused(source),
@@ -110,7 +110,7 @@ fn ids_beside_a_subset_choose_from_it() {
 }
 
 #[test]
-fn a_catalogue_finds_files_where_it_is_told() {
+fn a_catalogue_finds_files_through_the_callers_function() {
     let sources = [with_ids("motion.h5", &["TINY_001_01"]), ClipSource::whole("builtin:stand")];
     let catalogue = Catalogue::open_with(&sources, |source| (source == "motion.h5").then(|| tiny().into())).unwrap();
     assert_eq!(names(&catalogue), ["TINY_001_01", "stand"]);
@@ -120,7 +120,7 @@ fn a_catalogue_finds_files_where_it_is_told() {
 }
 
 #[test]
-fn assets_are_the_files_hashed_each_once() {
+fn assets_are_the_files_each_hashed_once() {
     let sources =
         [with_ids(tiny(), &["TINY_001_01"]), ClipSource::whole("builtin:walk"), with_ids(tiny(), &["TINY_001_02"])];
     let assets = Catalogue::open(&sources).unwrap().assets().unwrap();
@@ -141,7 +141,7 @@ fn the_mean_action_is_the_mean_over_frames_in_use_by_weight() {
     };
     let catalogue = Catalogue::open(&[source("TINY_001_01", 3.0, 5), source("TINY_001_02", 1.0, 9)]).unwrap();
     let mut expected = [0.0; 56];
-    // dm_control's slices: 2..=5 is four frames; 9 is the second clip's end, which leaves seven.
+    // dm_control's slices: 2..=5 are four frames. The end step 9 is the second clip's end, so seven frames are left.
     for (index, weight, frames) in [(0, 3.0, 2..6), (1, 1.0, 2..9)] {
         for pose in &catalogue.load(index).unwrap().motion.joints[frames] {
             for (sum, action) in expected.iter_mut().zip(pose_to_action(pose)) {

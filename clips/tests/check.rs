@@ -1,5 +1,5 @@
-//! Every defect at once, and none where there is none.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+//! The check finds every defect of a file, and none in a sound one.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
 mod support;
 
@@ -60,7 +60,7 @@ fn clips_that_another_program_made_have_no_defect() {
 }
 
 #[test]
-fn each_defect_is_found_with_its_frames_and_its_size() {
+fn each_defect_is_found_with_its_frames_and_size() {
     let directory = tempfile::tempdir().unwrap();
     let mut clip = walk();
     let steps = clip.steps();
@@ -94,7 +94,7 @@ fn each_defect_is_found_with_its_frames_and_its_size() {
     assert_eq!(places, [("root", 2, 30), ("ltibiarx", 2, 20)]);
 }
 
-/// The file has a clip per defect, its name.
+/// The file has one clip for each defect, with the defect's name.
 #[test]
 fn a_defective_file_is_searched_to_its_end() {
     let all = check(defects().as_ref(), &[]).unwrap();
@@ -119,7 +119,7 @@ fn a_defective_file_is_searched_to_its_end() {
 }
 
 #[test]
-fn a_clip_that_is_not_there_is_named_with_the_nearest() {
+fn the_error_of_a_missing_clip_names_the_nearest() {
     let message = check(defects().as_ref(), &["sonud".into()]).unwrap_err().to_string();
     assert!(message.contains("no clip `sonud` (did you mean `sound`"), "{message}");
 }

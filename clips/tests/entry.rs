@@ -1,4 +1,4 @@
-//! Which frames of a clip are used, which can be starts, and which clips a task refuses.
+//! The frames of a clip in use, its start frames, and the clips that a task refuses.
 
 mod support;
 

@@ -1,5 +1,5 @@
 //! Every message names the file, the item and the remedy.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
 mod support;
 
@@ -7,7 +7,7 @@ use comic_clips::{Catalogue, Error};
 use comic_experiment::ClipSource;
 use support::{defects, load_one, refused, tiny, whole, with_ids};
 
-/// Asserts that the defect named like the clip is found, and how it is put.
+/// Asserts that loading the clip gives the error of its defect, with this text.
 fn assert_defect(clip: &str, item: &str, reason: &str) {
     let error = load_one(&defects(), clip).unwrap_err();
     assert!(matches!(error, Error::Malformed { .. }), "{clip}: {error}");
@@ -20,7 +20,7 @@ fn the_sound_clip_is_sound() {
 }
 
 #[test]
-fn missing_items() {
+fn missing_items_are_named() {
     let missing = "missing; every clip of dm_control's layout has it";
     assert_defect("joints_missing", "/walkers/walker_0/joints", missing);
     assert_defect("walker_missing", "/walkers/walker_0", missing);
@@ -28,7 +28,7 @@ fn missing_items() {
 }
 
 #[test]
-fn shapes() {
+fn wrong_shapes_are_named_with_the_expected_ones() {
     let expected = |shape: &str, width: usize| {
         format!(
             "has shape {shape}, expected [{width}, 3]: {width} numbers for each of num_steps frames of the CMU \
@@ -46,7 +46,7 @@ fn shapes() {
 }
 
 #[test]
-fn numbers_that_are_none() {
+fn numbers_that_are_not_finite_or_of_another_type() {
     let walker = "/walkers/walker_0";
     assert_defect("joints_nan", &format!("{walker}/joints"), "NaN in row 5, frame 1; every number must be finite");
     let place = format!("{walker}/center_of_mass");
@@ -60,7 +60,7 @@ fn numbers_that_are_none() {
 }
 
 #[test]
-fn attributes() {
+fn wrong_attributes_are_named() {
     for (clip, number) in [("dt_zero", "0"), ("dt_nan", "NaN"), ("dt_huge", "30")] {
         assert_defect(clip, "@dt", &format!("{number} s is not a valid time step; dm_control uses 0.03 s"));
     }
@@ -78,7 +78,7 @@ fn a_defect_in_the_attributes_is_found_when_the_file_is_opened() {
 }
 
 #[test]
-fn no_such_clip_names_the_nearest() {
+fn the_error_of_a_missing_clip_names_the_nearest() {
     let message = refused(with_ids(tiny(), &["TINY_001_03"]));
     assert_eq!(message, format!("{}: no clip `TINY_001_03` (did you mean `TINY_001_01` or `TINY_001_02`?)", tiny()));
     let message = refused(with_ids(tiny(), &["zebra"]));
@@ -88,13 +88,13 @@ fn no_such_clip_names_the_nearest() {
 }
 
 #[test]
-fn a_clip_listed_twice() {
+fn a_clip_that_is_listed_twice_is_refused() {
     let message = refused(with_ids(tiny(), &["TINY_001_01", "TINY_001_02", "TINY_001_01"]));
     assert_eq!(message, format!("{}: clip `TINY_001_01` is listed twice; set weight to use it more often", tiny()));
 }
 
 #[test]
-fn no_such_file_names_the_nearest() {
+fn the_error_of_a_missing_file_names_the_nearest() {
     let missing = tiny().replace("tiny.h5", "tinny.h5");
     assert_eq!(refused(whole(&missing)), format!("no clip file `{missing}` (did you mean `tiny.h5`?)"));
     assert_eq!(
@@ -104,7 +104,7 @@ fn no_such_file_names_the_nearest() {
 }
 
 #[test]
-fn a_file_that_is_no_hdf5() {
+fn a_file_that_is_not_hdf5_is_refused() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("text.h5");
     std::fs::write(&path, "walk this way\n".repeat(100)).unwrap();
@@ -116,7 +116,7 @@ fn a_file_that_is_no_hdf5() {
 }
 
 #[test]
-fn sub_ranges_that_the_clip_does_not_have() {
+fn sub_ranges_outside_the_clip_are_refused() {
     let range = |start_step, end_step| ClipSource { start_step, end_step, ..with_ids(tiny(), &["TINY_001_02"]) };
     assert_eq!(refused(range(9, None)), "clip `TINY_001_02`: start_step = 9: must be at most 8; the clip has 9 frames");
     for end in [0, 4, 10, usize::MAX] {
@@ -131,7 +131,7 @@ fn sub_ranges_that_the_clip_does_not_have() {
 }
 
 #[test]
-fn weights_that_are_none() {
+fn negative_or_infinite_weights_are_refused() {
     for weight in [-1.0, f64::NAN, f64::INFINITY] {
         let message = refused(ClipSource { weight, ..ClipSource::whole("builtin:walk") });
         assert!(
@@ -142,11 +142,11 @@ fn weights_that_are_none() {
 }
 
 #[test]
-fn no_source_at_all() {
+fn sources_without_any_weight_are_refused() {
     let expected = "clips: no source with a weight above 0; name a file or a built-in clip";
     assert_eq!(Catalogue::open(&[]).unwrap_err().to_string(), expected);
     let never = |name| ClipSource { weight: 0.0, ..ClipSource::whole(name) };
     assert_eq!(refused(never("builtin:walk")), expected);
-    // As in dm_control, a clip may be there and never be drawn.
+    // As in dm_control, a clip may have weight 0, so that it is never drawn.
     assert!(Catalogue::open(&[never("builtin:walk"), ClipSource::whole("builtin:run")]).is_ok());
 }

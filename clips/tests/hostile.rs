@@ -1,5 +1,5 @@
-//! Whatever the bytes, the outcome is a catalogue or an error.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+//! Any bytes give a catalogue or an error.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
 mod support;
 
@@ -26,7 +26,7 @@ fn read_everything(bytes: &[u8]) {
     let _ = catalogue.mean_action();
 }
 
-/// One damaged clip must not hide what the others do.
+/// Reads clips one by one, since one damaged clip makes the whole catalogue an error.
 fn read_known_clips(path: &Path) {
     for name in ["TINY_001_01", "TINY_001_02", "sound", "sound_2019"] {
         if let Ok(catalogue) = Catalogue::open(&[with_ids(path, &[name])]) {
@@ -54,7 +54,7 @@ proptest! {
         read_everything(&bytes);
     }
 
-    /// Metadata lies in clusters: a burst of changes hits one structure hard.
+    /// HDF5's metadata is clustered, so a burst of changes damages one structure in many places.
     #[test]
     fn a_burst_of_changed_bytes_never_panics(
         mut bytes in sound_file(),

@@ -17,7 +17,7 @@ fn actuators_are_the_joints_in_alphabetical_order() {
 }
 
 #[test]
-fn v2020_has_one_body_more_than_v2019_its_face() {
+fn v2020_has_one_body_more_than_v2019() {
     assert_eq!((WalkerModel::Cmu2019.bodies(), WalkerModel::Cmu2020.bodies()), (30, 31));
 }
 

@@ -1,5 +1,5 @@
-//! Clips from CMU's recordings, compared with clips that another program made of them.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+//! Compares imported recordings of the CMU database with the clips that MuJoCo and dm_control made of them.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
 mod support;
 
@@ -48,7 +48,7 @@ fn builtin(name: &str) -> Clip {
     Catalogue::open(&[ClipSource::whole(format!("builtin:{name}"))]).unwrap().load(0).unwrap()
 }
 
-/// `builtin:run` was made of the same recording, with MuJoCo and dm_control (`data/README.md`).
+/// MuJoCo and dm_control made `builtin:run` of the same recording (`data/README.md`).
 #[test]
 fn the_run_of_subject_2_is_the_built_in_one() {
     let (clip, taken) = import(&run_take()).unwrap();
@@ -71,10 +71,10 @@ fn recordings_become_the_clips_that_mujoco_and_dm_control_made_of_them() {
 }
 
 #[test]
-fn without_constants_soles_and_floor_are_found_and_told() {
+fn without_constants_soles_and_floor_are_found_and_reported() {
     let (clip, taken) = import(&Take { constants: Constants::default(), ..run_take() }).unwrap();
     println!("{taken}");
-    // What a person chose from several takes of this subject: 13.5, 12 and a drifting floor.
+    // A person chose these constants from several takes of this subject: 13.5, 12 and a drifting floor.
     for (found, chosen) in taken.sole_degrees.into_iter().zip([13.5, 12.0]) {
         assert!((found - chosen).abs() <= 4.0, "{found} degrees, chosen {chosen}");
     }

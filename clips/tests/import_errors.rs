@@ -1,5 +1,5 @@
-//! Whatever is in an ASF or AMC file, the outcome is a clip or an error that names file, line and remedy.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+//! Any ASF or AMC file gives a clip or an error that names file, line and remedy.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
 mod support;
 
@@ -9,7 +9,7 @@ use comic_clips::import::{Constants, Take, import, read_manifest};
 use proptest::prelude::*;
 use support::{law, run_take};
 
-/// The run with one of its files changed, imported.
+/// Imports the run with changed files.
 fn changed(directory: &Path, asf: impl Fn(String) -> String, amc: impl Fn(String) -> String) -> Result<(), String> {
     let take = run_take();
     let read = |path: &Path| std::fs::read_to_string(path).unwrap().replace("\r\n", "\n");
@@ -56,7 +56,7 @@ fn a_bad_line_is_named_with_its_number_and_what_it_should_be() {
 }
 
 #[test]
-fn a_recording_that_was_cut_off_is_recognised_by_the_bones_it_lacks() {
+fn a_truncated_recording_is_recognised_by_its_missing_bones() {
     let directory = tempfile::tempdir().unwrap();
     let cut = |text: String| text[..text.rfind("\nlfemur").unwrap() + 1].to_string();
     let message = changed(directory.path(), same, cut).unwrap_err();
@@ -101,7 +101,7 @@ fn a_gap_in_the_frame_numbers_is_a_note() {
 }
 
 #[test]
-fn a_manifest_that_is_none_says_where() {
+fn the_error_of_a_malformed_manifest_names_the_place() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("manifest.json");
     std::fs::write(&path, "[\n {\"key\": \"A\", \"asf\": \"a.asf\"}\n]").unwrap();
@@ -120,7 +120,7 @@ proptest! {
         let take = run_take();
         let directory = tempfile::tempdir().unwrap();
         let changed = directory.path().join("changed");
-        // Some frames are enough: what is read of each is the same.
+        // Some frames are enough, since every frame is read alike.
         let mut bytes = std::fs::read(if asf { &take.asf } else { &take.amc }).unwrap();
         bytes.truncate(30_000);
         for (place, value) in changes {

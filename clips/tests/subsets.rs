@@ -25,13 +25,13 @@ fn no_clip_is_named_twice_and_all_contains_the_others() {
 }
 
 #[test]
-fn get_up_is_these_seven() {
+fn get_up_has_these_seven_clips() {
     let expected = ["139_16", "139_17", "139_18", "140_01", "140_02", "140_08", "140_09"].map(|id| format!("CMU_{id}"));
     assert_eq!(subset("get_up").unwrap(), expected);
 }
 
 #[test]
-fn an_unknown_subset_is_refused_with_the_nearest_and_all_names() {
+fn the_error_of_an_unknown_subset_lists_the_nearest_and_all_names() {
     assert_eq!(
         subset("walk-tiny").unwrap_err().to_string(),
         "no subset `walk-tiny` (did you mean `walk_tiny`?); subsets are walk_tiny, run_jump_tiny, get_up, \

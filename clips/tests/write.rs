@@ -1,5 +1,5 @@
-//! Files written here, read back here; `tests/tests/clips_in_dm_control.rs` has dm_control read them.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on fails")]
+//! Reads back the files that it writes. In `tests/tests/clips_in_dm_control.rs` dm_control reads such files.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
 mod support;
 
@@ -19,7 +19,7 @@ fn files_in(directory: &Path) -> usize {
 }
 
 #[test]
-fn what_is_written_is_read_back_bit_for_bit() {
+fn clips_are_read_back_bit_for_bit() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("out.h5");
     let mut writer = ClipWriter::create(&path, false).unwrap();
@@ -32,11 +32,11 @@ fn what_is_written_is_read_back_bit_for_bit() {
     for (index, clip) in clips().into_iter().enumerate() {
         assert_eq!(catalogue.load(index).unwrap(), clip);
     }
-    assert_eq!(files_in(directory.path()), 1, "nothing temporary is left");
+    assert_eq!(files_in(directory.path()), 1, "a temporary file is left");
 }
 
 #[test]
-fn a_file_is_there_whole_or_not_at_all_and_never_replaced_unasked() {
+fn a_file_is_whole_or_absent_and_only_replaced_on_demand() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("out.h5");
     let mut writer = ClipWriter::create(&path, false).unwrap();
@@ -47,7 +47,7 @@ fn a_file_is_there_whole_or_not_at_all_and_never_replaced_unasked() {
 
     let writer = ClipWriter::create(&path, false).unwrap();
     std::fs::write(&path, "mine").unwrap();
-    assert!(matches!(writer.finish(), Err(Error::Exists { .. })), "it came there meanwhile");
+    assert!(matches!(writer.finish(), Err(Error::Exists { .. })), "the file appeared after the writer was made");
     let message = ClipWriter::create(&path, false).map(drop).unwrap_err().to_string();
     assert!(message.ends_with("out.h5 exists; add --force to replace it, or name another file"), "{message}");
     assert_eq!(std::fs::read(&path).unwrap(), b"mine");
@@ -59,7 +59,7 @@ fn a_file_is_there_whole_or_not_at_all_and_never_replaced_unasked() {
 }
 
 #[test]
-fn names_are_unique_and_can_be_chosen_on_a_command_line() {
+fn names_are_unique_and_valid_on_a_command_line() {
     let directory = tempfile::tempdir().unwrap();
     let mut writer = ClipWriter::create(&directory.path().join("out.h5"), false).unwrap();
     let [clip, _] = clips().try_into().unwrap();

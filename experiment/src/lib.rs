@@ -4,7 +4,7 @@
 //! - [`Experiment`] is the resolved document. The learner is started with it; actors receive the same document when they
 //!   join.
 //! - [`presets`] holds the built-in documents: every file `presets/*.toml`.
-//! - [`resolve`] turns a preset or a file plus `--set key=value` overrides into an [`Experiment`]. It refuses unknown
+//! - [`resolve()`] turns a preset or a file plus `--set key=value` overrides into an [`Experiment`]. It refuses unknown
 //!   fields and names the nearest known one.
 //! - [`find_field`] finds a field by the end of its name. [`Experiment::differences`] compares two experiments.
 //! - [`for_each_task`] lists all tasks. [`TaskSpec`] is what networks, wire and learner know of a task: sizes and names.

@@ -1,4 +1,4 @@
-//! The tasks. [`for_each_task`] is the list of them; each has a file of its own with its parameters.
+//! The tasks. `for_each_task` is the list of them; each has a file of its own with its parameters.
 //!
 //! (S) is the CoMic supplement, (C) dm_control's published task code where the supplement is silent, (D) a decision of
 //! this project. Where dm_control's own default differs from the supplement, the field's comment names it.

@@ -1,10 +1,10 @@
 //! Adam (Kingma & Ba, 2015), with a state that can be saved and restored bit for bit.
 //!
-//! libtorch's own optimiser keeps its moments where no checkpoint reaches them. Here they are plain tensors, one pair a
-//! parameter, updated in place; the update is written so that a parameter takes eight passes over memory.
+//! libtorch's own optimiser gives no access to its moments, so no checkpoint could hold them. Here they are plain tensors, one
+//! pair for each parameter, updated in place. The update makes eight passes over the memory of a parameter.
 //!
-//! Whether a step counts is decided on the device: the step is computed either way, and one that does not count adds
-//! nothing. So nobody waits for the device within an update.
+//! Whether a step counts is decided on the device. The step is computed either way, and one that does not count adds nothing.
+//! So no thread waits for the device within an update.
 
 use std::collections::HashMap;
 
@@ -52,9 +52,9 @@ struct Group {
     first: Vec<Tensor>,
     /// v, the mean of the squared gradient.
     second: Vec<Tensor>,
-    /// Steps that counted, int64: only the device knows how many they are.
+    /// Steps that counted, int64, on the device.
     steps: Tensor,
-    /// Float64, a tensor so that it is saved like everything else.
+    /// Float64; a tensor, so that it is saved like everything else.
     learning_rate: Tensor,
 }
 
@@ -108,7 +108,7 @@ impl Adam {
         }
     }
 
-    /// Forgets moments and step counts, and keeps the learning rates.
+    /// Sets moments and step counts to zero, and keeps the learning rates.
     pub fn reset(&mut self) {
         for group in &mut self.groups {
             for moment in group.first.iter_mut().chain(&mut group.second) {
@@ -126,7 +126,7 @@ impl Adam {
         let learning_rate = group.learning_rate.double_value(&[]);
         tch::no_grad(|| {
             let _ = group.steps.g_add_(&counts.to_kind(Kind::Int64));
-            // Before the first step that counts there is nothing to correct.
+            // Before the first step that counts, there is nothing to correct.
             let steps = group.steps.clamp_min(1).to_kind(Kind::Double);
             let bias1: Tensor = 1.0 - Tensor::pow_scalar(beta1, &steps);
             let bias2: Tensor = 1.0 - Tensor::pow_scalar(beta2, &steps);
@@ -134,7 +134,7 @@ impl Adam {
             // lr · (m / bias1) / (√v / bias2_root + ε) with both corrections moved into two scalars.
             let step_size = learning_rate * &bias2_root / bias1;
             let epsilon = bias2_root * epsilon;
-            // A step that does not count divides by infinity and blends in zeros by −0, which unlike 0 leaves −0 as it is.
+            // A step that does not count divides by infinity, and blends in zeros with weight −0: unlike 0, this keeps −0.
             let scale = (-step_size.reciprocal()).where_scalarother(counts, f64::NEG_INFINITY);
             let scalar = (Kind::Float, counts.device());
             let [weight1, weight2] = [1.0 - beta1, 1.0 - beta2]
@@ -171,7 +171,7 @@ impl Adam {
         entries
     }
 
-    /// Restores what [`Adam::state`] gave.
+    /// Restores a state of [`Adam::state`].
     ///
     /// # Errors
     /// [`StateError`] when names, shapes or element types differ; nothing is changed then.

@@ -1,4 +1,4 @@
-//! What `comic-learner` does other than serve: one file for each command.
+//! The commands of `comic-learner` besides serving and training: one file for each.
 
 pub mod certs;
 pub mod export;

@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 /// The experiment and its changes.
 #[derive(Clone, Debug, Args)]
 pub struct DocumentArguments {
-    /// Name of a preset (README.md lists them), or path of an experiment file [default: tracking-mlp].
+    /// Name of a preset (docs/experiments.md lists them), or path of an experiment file [default: tracking-mlp].
     #[arg(long, value_name = "NAME|FILE", global = true)]
     pub preset: Option<String>,
     /// Clips to track instead of the experiment's: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP.
@@ -17,7 +17,7 @@ pub struct DocumentArguments {
     /// Override any field, for instance --set vmpo.epsilon_eta=0.2.
     #[arg(long = "set", value_name = "FIELD=VALUE", global = true)]
     pub overrides: Vec<String>,
-    /// Where the update runs: cpu, cuda[:N] or xla[:N]. The same as --set learner.device=D.
+    /// Where the update runs: cpu, cuda, cuda:N, xla or xla:N. The same as --set learner.device=D.
     #[arg(long, value_name = "DEVICE", global = true)]
     pub device: Option<DeviceName>,
     /// Learn reproducibly with any number of actors, for debugging. The same as --set unroll.lockstep=true and --set

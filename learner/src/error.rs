@@ -91,9 +91,6 @@ pub enum Error {
         /// The error.
         source: Box<Error>,
     },
-    /// An error of a module that does not use this type yet.
-    #[error(transparent)]
-    Other(#[from] anyhow::Error),
 }
 
 impl Error {
@@ -106,7 +103,6 @@ impl Error {
             | Self::Access(_)
             | Self::Networks(comic_networks::Error::Experiment(_)) => 2,
             Self::Within { source, .. } => source.exit_code(),
-            Self::Other(error) => error.chain().find_map(known).unwrap_or(1),
             Self::Networks(_)
             | Self::Accounting(_)
             | Self::Update(_)
@@ -131,9 +127,6 @@ impl Error {
         match self {
             Self::Torch(_) | Self::Device(_) | Self::Networks(comic_networks::Error::Torch(_)) => true,
             Self::Within { source, .. } => source.is_device_failure(),
-            Self::Other(error) => error
-                .chain()
-                .any(|cause| cause.is::<tch::TchError>() || cause.downcast_ref().is_some_and(Self::is_device_failure)),
             _ => false,
         }
     }
@@ -168,14 +161,6 @@ impl Error {
     }
 }
 
-/// The exit code of a cause inside an [`Error::Other`], if the cause decides it.
-fn known(cause: &(dyn std::error::Error + 'static)) -> Option<u8> {
-    let configuration = cause.is::<comic_experiment::Error>()
-        || cause.is::<comic_clips::Error>()
-        || cause.is::<comic_proto::AccessError>();
-    if configuration { Some(2) } else { cause.downcast_ref().map(Error::exit_code) }
-}
-
 /// A result with the learner's [`Error`].
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
@@ -190,7 +175,5 @@ mod tests {
         for (error, code) in [(wrong(), 2), (failed(), 1)] {
             assert_eq!(Error::within("cannot resume")(error).exit_code(), code);
         }
-        assert_eq!(Error::from(anyhow::Error::from(wrong()).context("cannot resume")).exit_code(), 2);
-        assert_eq!(Error::from(anyhow::Error::from(failed())).exit_code(), 1);
     }
 }

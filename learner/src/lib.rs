@@ -1,22 +1,19 @@
 //! The learner: one process that serves thousands of actors and learns from what they send.
 //!
 //! # Layout
-//! - [`run`] puts the parts together and takes them apart again.
-//! - [`service`] is gRPC on tokio; [`publish`] is parameters on their way down.
-//! - [`trainer`] is the OS thread that owns the device: batches in, gradient steps, parameters out; `minibatches` is what
-//!   it makes of a batch. [`warm_start`] is what it does before.
-//! - [`device`] is where it computes: CPU, CUDA, XLA.
-//! - [`algorithm`] is what the loop needs of a learning algorithm; [`vmpo`] is V-MPO: losses, and the gradient step. [`adam`] is its optimiser.
-//! - `skipped_steps` counts gradient steps that were skipped, and leads back to the last good state.
-//! - `state` turns the trainer into a snapshot and back. [`checkpoint`] is the run's checkpoint directory, [`writer`] the thread that fills it.
-//! - [`export`] makes a checkpoint's policy a file that others read.
-//! - [`metrics`] is what a person sees of learning, [`telemetry`] what Prometheus sees of the service, by way of [`probes`].
-//! - [`quarantine`] keeps unrolls that were refused, for whoever looks into it.
-//! - [`security`] is who may talk to it; [`certs`] makes certificates for trying that out.
-//! - [`status`] and [`health`] are commands that ask another learner how it is.
-//! - [`sizes`] counts parameters, [`memory`] the bytes that buffers can take.
+//! - [`run`] puts the parts of a learner epoch together, and ends them in order.
+//! - [`service`] is gRPC on tokio. [`publish`] encodes parameters for the actors. [`security`] is who may use the service.
+//! - [`train`] is the OS thread that owns the device: batches in, gradient steps, parameters out. [`device`] is where it
+//!   computes: CPU, CUDA or XLA.
+//! - [`algorithm`] is what the trainer needs of a learning algorithm. [`vmpo`] is V-MPO: its losses and its gradient step.
+//!   [`adam`] is its optimiser, and [`tensors`] reads and writes its state.
+//! - [`checkpoint`] is the run's checkpoint directory. No other module touches it.
+//! - [`observe`] is what people and Prometheus see of a run: metrics, telemetry and probes.
+//! - [`commands`] are the commands besides serving and training. [`options`] is the whole command line, and [`document`] its
+//!   arguments for the experiment.
+//! - [`error`] is the one error type, which also decides the exit code. `log_limiter` keeps faulty peers from flooding the log.
 //!
-//! There is no MuJoCo here: whatever needs a simulator is done by actors.
+//! The learner does not link MuJoCo: actors do everything that needs a simulator.
 
 pub mod adam;
 pub mod algorithm;

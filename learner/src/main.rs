@@ -11,7 +11,7 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
 
 /// glibc's allocator does not reuse the memory that thousands of connections freed: under 4000 actors the learner grew by
-/// 27 MB a minute, without end. With this allocator it stays at its size. docs/operations.md has the figures.
+/// 27 MB a minute, without end. With this allocator it stays at its size. docs/benchmarks.md has the figures.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
@@ -51,7 +51,7 @@ fn run(options: &Options) -> Result<()> {
         Some(Command::Status(status)) => status.run(),
         Some(Command::Health(_)) => Ok(()),
         Some(Command::Certs(certs)) => certs.run(),
-        Some(Command::Metrics) => Ok(comic_learner::observe::telemetry::print_reference()?),
+        Some(Command::Metrics) => comic_learner::observe::telemetry::print_reference(),
         Some(Command::Manual(manual)) => manual
             .write(Options::command())
             .map_err(|source| Error::System { what: "cannot write the manual".into(), source }),

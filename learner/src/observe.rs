@@ -1,5 +1,6 @@
-//! What people and Prometheus see of a run.
+//! Metrics of a run for people and for Prometheus.
 
+mod catalogue;
 pub mod evaluation;
 pub mod metrics;
 pub mod probes;

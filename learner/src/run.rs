@@ -22,7 +22,8 @@ use crate::publish::Publisher;
 use crate::security::Security;
 use crate::service::process::{allow_descriptors, runtime};
 use crate::service::{Service, serve};
-use crate::train::trainer::{Ending, Setup, Trainer};
+use crate::train::setup::{Ending, Setup};
+use crate::train::trainer::Trainer;
 
 /// File descriptors besides those of connections to actors.
 const OTHER_FILES: u64 = 256;
@@ -200,7 +201,7 @@ fn start_trainer(setup: Setup) -> Result<Training> {
     std::thread::Builder::new()
         .name("trainer".into())
         .spawn(move || {
-            let ending = catch_unwind(AssertUnwindSafe(|| Ok(Trainer::new(setup)?.run()?)));
+            let ending = catch_unwind(AssertUnwindSafe(|| Trainer::new(setup)?.run()));
             let _ = ended.send(ending.unwrap_or(Err(Error::Panicked("the trainer"))));
         })
         .map_err(Error::system("cannot start the trainer's thread"))?;

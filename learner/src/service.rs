@@ -1,9 +1,9 @@
 //! The learner as actors see it: gRPC over tokio.
 //!
 //! # Layout
-//! - [`assembly`] makes the parts of a service from its [`Setup`], and hands the trainer what it needs of them. [`serve()`] runs
-//!   the server until its end, [`shutdown`] is the state of that end, [`http2`] the protocol's settings, and [`process`] the
-//!   threads and file descriptors.
+//! - `assembly` makes the parts of a [`Service`] from its [`Setup`], and a [`TrainerHandle`] of those that the trainer needs.
+//!   [`serve()`] runs the server until its end, `shutdown` is the state of that end, [`http2`] the protocol's settings, and
+//!   [`process`] the threads and file descriptors.
 //! - Every connection passes `acceptor`, and every call `admission`: they alone check TLS, tokens and limits.
 //! - `calls` is the service that tonic decodes. `join` accepts actors, `assets` sends files, `evaluations` keeps reports for the
 //!   trainer, and `status` shows the learner's state.
@@ -17,7 +17,7 @@
 
 mod acceptor;
 mod admission;
-pub mod assembly;
+mod assembly;
 mod assets;
 mod assignments;
 mod calls;

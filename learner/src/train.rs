@@ -2,6 +2,7 @@
 //!
 //! # Layout
 //! - [`trainer`] is the loop; the other modules own its parts and know nothing of it.
+//! - [`setup`] is what it begins with, and how it ends.
 //! - `state` is what changes and is saved: the algorithm, [`statistics`] of the observations, and the progress.
 //! - `minibatches` puts a batch on the device and draws the unrolls of each gradient step.
 //! - `warm_start` gathers demonstrations and regresses on them.
@@ -13,6 +14,7 @@ mod budget;
 mod checkpoints;
 mod minibatches;
 mod reports;
+pub mod setup;
 mod skipped_steps;
 mod state;
 pub mod statistics;

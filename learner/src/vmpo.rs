@@ -1,7 +1,7 @@
 //! V-MPO (Song et al., 2020) as CoMic uses it: pure loss functions, and the learner that steps them.
 //!
 //! # Layout
-//! - [`returns`]: n-step targets to the end of the unroll (or λ-returns).
+//! - [`mod@returns`]: n-step targets to the end of the unroll (or λ-returns).
 //! - [`policy_improvement`]: L_π, L_η and L_α from log-probabilities, advantages and the two KLs.
 //! - [`Multipliers`]: η, α_μ and α_Σ.
 //! - [`VmpoLearner`]: networks, multipliers and Adam; one gradient step at a time.
@@ -12,6 +12,7 @@
 mod improvement;
 mod learner;
 mod multipliers;
+mod report;
 mod returns;
 mod stores;
 

@@ -1,5 +1,5 @@
-//! The same updates on another device as on the CPU: on XLA where it was built in, as `cargo xtask test --xla` does, else on
-//! what `COMIC_TEST_DEVICE` names. Where that is the CPU itself, two learners with two lives are compared.
+//! Updates on another device equal those on the CPU. The device is XLA if it was built in, as `cargo xtask test --xla` does,
+//! otherwise the one that `COMIC_TEST_DEVICE` names. If that is the CPU, two learners on the CPU are compared.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
@@ -20,7 +20,7 @@ use vmpo_support::{Unrolls, every_low_level, joint_spec, learner_on, spec, state
 const COUNT: usize = 12;
 const BATCHES: u64 = 30;
 
-/// One for the process: a plugin is started once.
+/// One for the process, because a plugin is started only once.
 fn backend() -> &'static Backend {
     static BACKEND: OnceLock<Backend> = OnceLock::new();
     BACKEND.get_or_init(|| {
@@ -52,7 +52,7 @@ fn experiments() -> Vec<(String, Experiment, TaskSpec)> {
 }
 
 fn step(learner: &mut VmpoLearner, unrolls: &Unrolls) -> LossValues {
-    // As of several gradient steps on a batch, whose order is another one.
+    // In another order, as for one of several gradient steps on a batch.
     let order: Vec<usize> = (0..COUNT).rev().collect();
     let minibatch = unrolls.minibatch_on(learner.device()).select(&order);
     let losses = [learner.step(&minibatch).unwrap()];
@@ -63,8 +63,8 @@ fn step(learner: &mut VmpoLearner, unrolls: &Unrolls) -> LossValues {
     Losses::mean(&losses).unwrap().to_values()
 }
 
-/// The largest difference of what the two learners hold under names that begin so, relative to the largest number of the
-/// same tensor or to `floor`.
+/// The largest difference between the tensors of two learners whose names begin with `prefix`, relative to the largest number
+/// of the same tensor or to `floor`.
 fn distance(left: &VmpoLearner, right: &VmpoLearner, prefix: &str, floor: f64) -> (f64, String) {
     let mut worst = (0.0, String::new());
     for ((name, left), (_, right)) in state(left).into_iter().zip(state(right)) {
@@ -81,7 +81,7 @@ fn distance(left: &VmpoLearner, right: &VmpoLearner, prefix: &str, floor: f64) -
 }
 
 #[test]
-fn the_first_update_and_thirty_are_the_cpus_for_every_low_level() {
+fn the_first_update_and_the_thirtieth_equal_the_cpus_for_every_low_level() {
     for (name, experiment, spec) in experiments() {
         let mut host = learner_on(Device::Cpu, &spec, &experiment, 3);
         let mut there = learner_on(backend().device(), &spec, &experiment, 3);
@@ -105,7 +105,7 @@ fn the_first_update_and_thirty_are_the_cpus_for_every_low_level() {
 }
 
 #[test]
-fn what_one_device_saved_the_other_goes_on_with() {
+fn a_state_saved_on_one_device_is_restored_on_the_other() {
     for (name, experiment, spec) in experiments() {
         let unrolls = |seed| Unrolls::recorded(&experiment, &spec, seed, COUNT);
         let mut host = learner_on(Device::Cpu, &spec, &experiment, 4);
@@ -133,7 +133,7 @@ fn whatever_the_mix_of_tasks_and_ends_nothing_is_compiled_twice() {
             if seed == 3 {
                 after_warm_up = backend().compilations().unwrap();
             }
-            // What a schedule changes must be no constant of a program.
+            // A value that a schedule changes must not be a constant of a program.
             learner.set_learning_rates(1e-3 * (1.0 - f64::from(seed) / 300.0), 1e-3);
             let losses = step(&mut learner, &Unrolls::recorded(&experiment, &spec, 1000 + seed as u64, COUNT));
             assert!(losses.is_finite(), "{name}");
@@ -144,7 +144,7 @@ fn whatever_the_mix_of_tasks_and_ends_nothing_is_compiled_twice() {
 
 #[cfg(feature = "xla")]
 #[test]
-fn no_other_thread_goes_backward_in_which_gradients_could_outlive_their_step() {
+fn no_other_thread_runs_backward_passes() {
     let (_, experiment, spec) = experiments().remove(0);
     std::thread::scope(|scope| {
         let trains = || {
@@ -154,11 +154,11 @@ fn no_other_thread_goes_backward_in_which_gradients_could_outlive_their_step() {
                 step(&mut learner, &Unrolls::recorded(&experiment, &spec, seed, COUNT));
             }
         };
-        // Of this thread.
+        // Opened by this thread.
         backend();
         scope.spawn(trains);
     });
-    // libtorch starts its threads whether they are used or not; one that is waits for each pass.
+    // libtorch starts its threads in any case. A thread that is used waits for each pass.
     for thread in std::fs::read_dir("/proc/self/task").unwrap() {
         let status = std::fs::read_to_string(thread.unwrap().path().join("status")).unwrap_or_default();
         let field = |name: &str| status.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_default().trim();

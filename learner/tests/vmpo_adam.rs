@@ -63,7 +63,7 @@ proptest! {
 }
 
 #[test]
-fn groups_have_learning_rates_of_their_own() {
+fn each_group_has_its_own_learning_rate() {
     let mut adam = Adam::new(&Optimiser::default());
     let (slow, fast) = (parameter(&[0.0]), parameter(&[0.0]));
     let slow_group = adam.add_group("slow", vec![("a".into(), slow.shallow_clone())], 1e-3);
@@ -77,7 +77,7 @@ fn groups_have_learning_rates_of_their_own() {
 }
 
 #[test]
-fn a_restored_adam_goes_on_bit_for_bit_and_a_reset_one_starts_anew() {
+fn a_restored_adam_continues_bit_for_bit_and_a_reset_one_starts_again() {
     let make = |start: &Tensor| {
         let mut adam = Adam::new(&Optimiser::default());
         let learnt = start.detach().copy().set_requires_grad(true);
@@ -124,7 +124,7 @@ impl OnTheHost {
 }
 
 #[test]
-fn a_step_that_counts_is_bit_for_bit_one_that_asks_nobody() {
+fn a_step_that_counts_equals_the_same_step_computed_on_the_host() {
     let start = Tensor::linspace(-1.0, 1.0, 37, (Kind::Float, Device::Cpu));
     let mut adam = Adam::new(&Optimiser::default());
     let learnt = start.copy().set_requires_grad(true);
@@ -151,7 +151,7 @@ fn a_step_that_does_not_count_changes_not_one_bit() {
         let (parameter_before, state_before) = (bits(&learnt), state(&adam));
         adam.step(group, &[poison.copy()], &counts(false));
         assert_eq!((bits(&learnt), state(&adam)), (parameter_before, state_before), "before step {step}");
-        // A moment that is −0 by the end.
+        // A moment that is −0 at the end.
         adam.step(group, &[Tensor::from_slice(&[1.0, -1e-30, -1e-45, step as f32])], &counts(true));
     }
 }

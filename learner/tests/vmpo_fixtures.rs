@@ -1,7 +1,7 @@
-//! Numbers of other people's code: rlax's `vmpo_loss`, PyTorch's distributions, rlax's returns.
+//! Numbers of other code: rlax's `vmpo_loss`, PyTorch's distributions, rlax's returns.
 //!
 //! Reads every `vmpo_*.npz`, `gaussian_*.npz`, `mixture_*.npz`, `product_*.npz` and `returns_*.npz` of the folder that
-//! COMIC_VMPO_FIXTURES names, of `tests/fixtures/vmpo` without it. `tests/python/make_vmpo_fixtures.py` and
+//! COMIC_VMPO_FIXTURES names, by default `tests/fixtures/vmpo`. `tests/python/make_vmpo_fixtures.py` and
 //! `make_distribution_fixtures.py` make them.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
@@ -60,7 +60,7 @@ impl Fixture {
     }
 }
 
-/// Every fixture of one kind. A folder without any is no failure as long as it has fixtures of another kind.
+/// Every fixture of one kind. A folder may lack a kind if it has fixtures of another kind.
 fn fixtures(kind: &str) -> Vec<Fixture> {
     let named = std::env::var_os("COMIC_VMPO_FIXTURES").map(PathBuf::from);
     let own = named.is_none();
@@ -154,7 +154,7 @@ fn returns_equal_rlax_on_each_episodes_piece() {
     }
 }
 
-/// The arrays that gradients are taken of.
+/// The arrays with gradients.
 const LEARNT: [&str; 3] = ["logits", "mean", "std"];
 
 fn log_softmax(logits: &Tensor) -> Tensor {
@@ -192,7 +192,7 @@ fn mixtures_equal_pytorchs_distributions() {
 }
 
 #[test]
-fn products_equal_gaussian_distributions_made_by_hand() {
+fn products_equal_gaussian_distributions_computed_by_hand() {
     for mut fixture in fixtures("product_") {
         let learnt = LEARNT.map(|name| fixture.array(name).set_requires_grad(true));
         let [logits, mean, std] = &learnt;

@@ -22,8 +22,8 @@ fn learner(experiment: &Experiment) -> VmpoLearner {
     learner_of(&joint_spec(), experiment, 1)
 }
 
-/// Unrolls of both tasks as this learner's own policy makes them, acting step by step: one with two episodes, and one
-/// whose second half is padding.
+/// Unrolls of both tasks that this learner's own policy makes, acting step by step: one with two episodes, and one whose
+/// second half is padding.
 fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls {
     let mut unrolls = Unrolls::random(seed, COUNT).end_episode(0, 3, true);
     let mut numbers = Numbers::new(seed + 100);
@@ -38,7 +38,7 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
             observation[..WIDTHS.0 - WIDTHS.1].fill(0.0);
         }
     }
-    // Unroll 1 ends its episode in row 4, and the next one's is another task's.
+    // Unroll 1 ends its episode in row 4, and the next episode belongs to another task.
     for t in 4..LENGTH {
         unrolls.valid[LENGTH + t] = 0.0;
         unrolls.discount[LENGTH + t] = 0.0;
@@ -47,7 +47,7 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
     let (latent, state) = (experiment.network.latent.size, experiment.network.state_size());
     unrolls.state = numbers.take(COUNT * state);
     let matrix = |values: &[f32], width: usize| Tensor::from_slice(values).reshape([COUNT as i64, width as i64]);
-    let mut remembered = matrix(&unrolls.state, state);
+    let mut recurrent_state = matrix(&unrolls.state, state);
     let mut previous = matrix(&numbers.take(COUNT * latent), latent);
     let at = |values: &[f32], length: usize, t: usize| {
         let width = values.len() / (COUNT * length);
@@ -56,17 +56,17 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
     let (mut means, mut stds, mut weights, mut latents) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for t in 0..LENGTH {
         let within = 1.0 - at(&unrolls.first, LENGTH + 1, t);
-        (previous, remembered) = (previous * &within, remembered * within);
+        (previous, recurrent_state) = (previous * &within, recurrent_state * within);
         latents.push(previous.copy());
         let acting = tch::no_grad(|| {
             let (proprioception, task) = (at(&unrolls.proprioception, LENGTH + 1, t), at(&unrolls.task, LENGTH + 1, t));
             let routing = Routing::grouped(&TASKS, 2);
             let observation = learner.policy().normalise(&proprioception, &task, None, &routing);
-            let memory = RecurrentState { state: &remembered, first: None };
-            learner.policy().act(&observation, &previous, &at(&unrolls.latent_noise, LENGTH, t), memory)
+            let recurrent = RecurrentState { state: &recurrent_state, first: None };
+            learner.policy().act(&observation, &previous, &at(&unrolls.latent_noise, LENGTH, t), recurrent)
         });
         let (mean, std, log_weights) = acting.action.to_rows();
-        (previous, remembered) = (acting.latent, acting.state);
+        (previous, recurrent_state) = (acting.latent, acting.state);
         means.push(mean);
         stds.push(std);
         weights.extend(log_weights);
@@ -80,7 +80,7 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
     unrolls
 }
 
-/// Steps two learners, one on each minibatch, and gives the difference of everything they hold.
+/// Steps two learners, one on each minibatch, and returns the difference of their states.
 fn compare(experiment: &Experiment, left: &MinibatchTensors, right: &MinibatchTensors) -> f64 {
     let (mut one, mut other) = (learner(experiment), learner(experiment));
     one.step(left).unwrap();
@@ -88,7 +88,7 @@ fn compare(experiment: &Experiment, left: &MinibatchTensors, right: &MinibatchTe
     difference(&one, &other)
 }
 
-/// What a step changed, by name.
+/// The names of what a step changed.
 fn changed(experiment: &Experiment, unrolls: &Unrolls) -> Vec<String> {
     let mut learner = learner(experiment);
     let before = state(&learner);
@@ -103,7 +103,7 @@ fn acting_step_by_step_is_acting_on_the_whole_unroll() {
     for experiment in every_low_level() {
         let learner = learner(&experiment);
         let unrolls = unrolls(&learner, &experiment, 2);
-        // Who acts has a row for each environment, who learns one for each unroll, in blocks.
+        // An actor has a row for each environment, the learner one for each unroll, in blocks.
         let acting = unrolls.act_at_once(&learner, &experiment, &Routing::blocked(&TASKS, 2, Device::Cpu));
         unrolls.assert_decided(experiment.network.low_level.name(), &acting);
     }
@@ -193,7 +193,7 @@ fn padding_changes_nothing() {
 fn a_task_teaches_its_own_encoder_value_and_temperature_and_the_shared_low_level() {
     let experiment = vmpo_support::experiment();
     let mut unrolls = unrolls(&learner(&experiment), &experiment, 4);
-    // Nothing but getting up is left.
+    // Only getting up is left.
     for (row, valid) in unrolls.valid.iter_mut().enumerate() {
         *valid = if TASKS[row / LENGTH] == 1 { *valid } else { 0.0 };
     }
@@ -231,7 +231,7 @@ fn advantages_of_one_task_do_not_crowd_out_the_others() {
 }
 
 #[test]
-fn with_one_temperature_there_is_one() {
+fn without_a_temperature_for_each_task_there_is_one() {
     let mut experiment = vmpo_support::experiment();
     assert_eq!(learner(&experiment).multipliers().temperatures().size(), [2]);
     experiment.vmpo.temperature_per_task = false;

@@ -25,7 +25,7 @@ fn kl_to_an_unchanged_policy_is_exactly_zero_with_equal_batch_shapes() {
     let mut unrolls = unrolls(2);
     unrolls.behave(&learner, UNROLLS * LENGTH);
     let losses = learner.step(&unrolls.minibatch()).unwrap().to_values();
-    // Rows that are no transition are blanked to another distribution, and still do not count.
+    // Rows without a transition are blanked to another distribution, and still do not count.
     assert_eq!((losses.get("kl_mean"), losses.get("kl_std")), (0.0, 0.0));
 }
 
@@ -49,7 +49,7 @@ fn a_changed_policy_has_a_kl() {
     assert!(losses.get("kl_mean") > 0.0 && losses.get("kl_std") > 0.0, "{losses:?}");
 }
 
-/// Steps two learners, one on each minibatch, and gives the difference of everything they hold.
+/// Steps two learners, one on each minibatch, and returns the difference of their states.
 fn compare(left: &MinibatchTensors, right: &MinibatchTensors) -> f64 {
     let mut experiment = experiment();
     experiment.network.latent.prior = Prior::Ar1 { alpha: 0.95 };
@@ -61,7 +61,7 @@ fn compare(left: &MinibatchTensors, right: &MinibatchTensors) -> f64 {
 }
 
 #[test]
-fn the_contents_of_a_row_that_is_no_transition_change_nothing() {
+fn the_contents_of_a_row_without_a_transition_change_nothing() {
     let base = unrolls(3);
     let mut other = base.clone();
     for (row, valid) in base.valid.iter().enumerate().filter(|(_, valid)| **valid == 0.0) {
@@ -92,7 +92,7 @@ fn the_last_observation_of_a_terminated_episode_changes_nothing() {
 }
 
 #[test]
-fn the_last_observation_of_a_truncated_episode_is_bootstrapped_from() {
+fn a_truncated_episode_is_bootstrapped_from_its_last_observation() {
     let base = unrolls(3);
     let mut other = base.clone();
     let row = LENGTH + 1 + 5; // row 5 of unroll 1
@@ -101,7 +101,7 @@ fn the_last_observation_of_a_truncated_episode_is_bootstrapped_from() {
 }
 
 #[test]
-fn an_unroll_of_nothing_but_masked_rows_changes_nothing() {
+fn an_unroll_of_masked_rows_only_changes_nothing() {
     let base = unrolls(4);
     let padding = Unrolls::random(5, 1);
     let mut padded = base.clone();
@@ -123,7 +123,7 @@ fn an_unroll_of_nothing_but_masked_rows_changes_nothing() {
 }
 
 #[test]
-fn a_batch_without_a_transition_is_survived() {
+fn a_batch_without_a_transition_gives_finite_losses() {
     let mut learner = learner(&experiment(), 1);
     let mut unrolls = unrolls(6);
     unrolls.valid.fill(0.0);
@@ -134,7 +134,7 @@ fn a_batch_without_a_transition_is_survived() {
 
 #[test]
 fn a_clipped_action_would_be_scored_differently() {
-    // The policy is trained on the action that was drawn, wherever it lies; only the simulator sees the clipped one.
+    // The policy is trained on the action that was sampled, without clipping. Only the simulator gets the clipped one.
     let base = unrolls(7);
     let loss = |size: f32| {
         let mut unrolls = base.clone();
@@ -145,7 +145,7 @@ fn a_clipped_action_would_be_scored_differently() {
 }
 
 #[test]
-fn the_same_clip_index_is_refused_where_the_task_has_fewer_clips() {
+fn a_clip_index_is_refused_if_the_task_has_fewer_clips() {
     let mut learner = learner(&experiment(), 1);
     let before = state(&learner);
     let mut unrolls = unrolls(8);
@@ -222,7 +222,7 @@ proptest! {
         experiment.optimiser.multiplier_learning_rate = rate.max(1e-6);
         let mut learner = learner(&experiment, 1);
         let mut unrolls = unrolls(seed);
-        // Far inside its limits, so α falls as fast as it can.
+        // The KLs are far below their limits, so α falls as fast as it can.
         unrolls.behave(&learner, UNROLLS * LENGTH);
         let minibatch = unrolls.minibatch();
         for _ in 0..4 {

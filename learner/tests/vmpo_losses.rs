@@ -1,4 +1,4 @@
-//! The known mistakes of public V-MPO code, each with the number that tells it apart.
+//! Known mistakes of public V-MPO code, each with a number that shows the difference.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
@@ -9,7 +9,7 @@ use tch::{Device, Kind, Tensor};
 const LIMITS: KlLimits =
     KlLimits { epsilon_eta: 0.1, epsilon_mean: 0.2, epsilon_std: 0.3, epsilon_discrete: 0.4, top_fraction: 0.5 };
 
-/// Four steps, all valid unless said otherwise, whose every tensor can be differentiated.
+/// Four steps, all valid by default. Every tensor can be differentiated.
 struct Case {
     log_prob: Tensor,
     advantage: Tensor,
@@ -90,7 +90,7 @@ fn the_policy_imitates_the_top_half_in_proportion_to_exp_advantage() {
 }
 
 #[test]
-fn the_weights_are_no_path_for_gradients() {
+fn no_gradient_flows_through_the_weights() {
     let case = Case::new(&[2.0, 0.0, 1.0, -3.0]);
     let losses = case.losses();
     // ψ depends on η and on A (so on the value function), and teaches neither.
@@ -172,7 +172,7 @@ proptest! {
         let losses = case.losses();
         let weights: Vec<f32> = case.gradient(&losses.policy, &case.log_prob).iter().map(|value| -value).collect();
         prop_assert!((weights.iter().sum::<f32>() - 1.0).abs() < 1e-5);
-        // A step belongs to the top half when fewer steps than that are better; so do those that tie with its last.
+        // A step belongs to the top half when fewer steps than that are better, or when it ties with the last of them.
         let half = (advantage.len() / 2).max(1);
         for (value, weight) in advantage.iter().zip(&weights) {
             let better = advantage.iter().filter(|other| *other > value).count();
@@ -195,7 +195,7 @@ proptest! {
 }
 
 #[test]
-fn groups_have_an_e_step_each_and_their_losses_are_weighed_by_their_steps() {
+fn each_group_has_its_own_e_step_and_its_losses_are_weighted_by_its_steps() {
     let case = Case::new(&[2.0, 300.0, 0.0, 100.0, 1.0, -3.0]);
     let of = |members: [bool; 6]| Tensor::from_slice(&members);
     let groups = [of([true, false, true, false, true, true]), of([false, true, false, true, false, false])];
@@ -225,6 +225,6 @@ fn groups_have_an_e_step_each_and_their_losses_are_weighed_by_their_steps() {
     assert_close(both.1, share(first.1, second.1));
     assert_close(both.2[0], first.2[0] * 4.0 / 6.0);
     assert_close(both.2[1], second.2[0] * 2.0 / 6.0);
-    // A group without a step leaves its temperature alone.
+    // A group without a step does not change its temperature.
     assert_eq!(losses(&groups, &[1.0, 50.0], &groups[0].to_kind(Kind::Float)).2[1], 0.0);
 }

@@ -1,5 +1,5 @@
-//! Every low level, through the same learner: acting step by step is learning on the whole unroll, and what V-MPO may not
-//! depend on it does not depend on.
+//! Every low level with the same learner: acting step by step equals learning on the whole unroll, and V-MPO depends on
+//! nothing that it must not depend on.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
@@ -39,12 +39,12 @@ fn every_low_level() -> Vec<(&'static str, Experiment)> {
     ]
 }
 
-/// What a policy did, step by step.
+/// The actions of a policy, step by step.
 struct Acted {
     unrolls: Unrolls,
     /// z_t, unroll by unroll.
     latents: Vec<f32>,
-    /// What is remembered after the last step, `[B, S]`.
+    /// The recurrent state after the last step, `[B, S]`.
     state: Tensor,
 }
 
@@ -52,8 +52,8 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
     acted(learner, experiment, seed).unrolls
 }
 
-/// Unrolls as this learner's own policy makes them, acting step by step, one episode ending and another beginning inside
-/// the first, and every unroll in the middle of an episode at its start.
+/// Unrolls that this learner's own policy makes, acting step by step. In the first one an episode ends and another begins;
+/// every unroll starts in the middle of an episode.
 fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
     let count = 3;
     let mut unrolls = Unrolls::random(seed, count).end_episode(0, 3, true).end_episode(1, 5, false);
@@ -61,7 +61,7 @@ fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
     let mut numbers = Numbers::new(seed + 100);
     unrolls.latent_noise = numbers.take(count * LENGTH * latent);
     unrolls.state = numbers.take(count * state);
-    let mut remembered = Tensor::from_slice(&unrolls.state).reshape([count as i64, state as i64]);
+    let mut recurrent_state = Tensor::from_slice(&unrolls.state).reshape([count as i64, state as i64]);
     let mut previous = Tensor::from_slice(&numbers.take(count * latent)).reshape([count as i64, latent as i64]);
     let rows = |values: &[f32], length: usize, t: usize| {
         let width = values.len() / (count * length);
@@ -74,7 +74,7 @@ fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
     for t in 0..LENGTH {
         let begins = rows(&unrolls.first, LENGTH + 1, t);
         previous = (1.0 - &begins) * previous;
-        remembered = (1.0 - begins) * remembered;
+        recurrent_state = (1.0 - begins) * recurrent_state;
         previous_latents.push(previous.copy());
         let acting = tch::no_grad(|| {
             let observation = learner.policy().normalise(
@@ -83,11 +83,11 @@ fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
                 None,
                 &Routing::single(),
             );
-            let memory = RecurrentState { state: &remembered, first: None };
-            learner.policy().act(&observation, &previous, &rows(&unrolls.latent_noise, LENGTH, t), memory)
+            let recurrent = RecurrentState { state: &recurrent_state, first: None };
+            learner.policy().act(&observation, &previous, &rows(&unrolls.latent_noise, LENGTH, t), recurrent)
         });
         let (mean, std, log_weights) = acting.action.to_rows();
-        (previous, remembered) = (acting.latent, acting.state);
+        (previous, recurrent_state) = (acting.latent, acting.state);
         latents.push(previous.copy());
         means.push(mean);
         stds.push(std);
@@ -99,7 +99,7 @@ fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
     };
     (unrolls.mean, unrolls.std) = (unrolled(&means), unrolled(&stds));
     (unrolls.log_weights, unrolls.previous_latent) = (unrolled(&weights), unrolled(&previous_latents));
-    Acted { unrolls, latents: unrolled(&latents), state: remembered }
+    Acted { unrolls, latents: unrolled(&latents), state: recurrent_state }
 }
 
 fn minibatch(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> MinibatchTensors {
@@ -119,11 +119,11 @@ fn acting_step_by_step_is_acting_on_the_whole_unroll() {
 }
 
 #[test]
-fn what_acted_is_what_is_learnt_from() {
+fn the_acting_policy_is_the_one_that_is_learnt_from() {
     for (name, experiment) in every_low_level() {
         let mut learner = learner(&experiment, 1);
         let losses = learner.step(&minibatch(&learner, &experiment, 2)).unwrap().to_values();
-        // Nothing has changed since the policy acted: a limit of 0 on every part of its distribution.
+        // Nothing has changed since the policy acted, so every KL is 0.
         for kl in [losses.get("kl_mean"), losses.get("kl_std"), losses.get("kl_weights")] {
             assert!(kl.abs() < 1e-5, "{name}: {losses:?}");
         }
@@ -131,7 +131,7 @@ fn what_acted_is_what_is_learnt_from() {
 }
 
 #[test]
-fn a_wrong_memory_is_noticed() {
+fn a_wrong_recurrent_state_is_noticed() {
     let (_, experiment) = every_low_level().remove(1);
     let mut learner = learner(&experiment, 1);
     let mut unrolls = unrolls(&learner, &experiment, 2);
@@ -157,7 +157,7 @@ fn a_changed_policy_has_a_kl_in_every_part_and_multipliers_that_move() {
     }
 }
 
-/// Steps two learners, one on each minibatch, and gives the difference of everything they hold.
+/// Steps two learners, one on each minibatch, and returns the difference of their states.
 fn compare(experiment: &Experiment, left: &MinibatchTensors, right: &MinibatchTensors) -> f64 {
     let (mut one, mut other) = (learner(experiment, 1), learner(experiment, 1));
     one.step(left).unwrap();
@@ -175,7 +175,7 @@ fn permuting_the_batch_changes_nothing() {
 }
 
 #[test]
-fn what_stands_in_a_row_that_is_no_transition_changes_nothing() {
+fn the_contents_of_a_row_without_a_transition_change_nothing() {
     for (name, experiment) in every_low_level() {
         let base = unrolls(&learner(&experiment, 1), &experiment, 3);
         let mut other = base.clone();
@@ -193,12 +193,12 @@ fn what_stands_in_a_row_that_is_no_transition_changes_nothing() {
 }
 
 #[test]
-fn a_policy_never_looks_across_an_episodes_beginning() {
+fn a_policy_uses_nothing_from_before_its_episode() {
     for (name, experiment) in every_low_level() {
         let learner = learner(&experiment, 1);
         let base = unrolls(&learner, &experiment, 4);
         let mut other = base.clone();
-        // Unroll 0 ends an episode in row 3: what was before has no influence on rows 4 and later.
+        // Unroll 0 ends an episode in row 3: the rows before have no influence on rows 4 and later.
         other.proprioception[..3 * 5].fill(0.9);
         other.task[..3 * 4].fill(-0.9);
         let state = other.state.len() / other.count;
@@ -222,8 +222,8 @@ fn a_policy_never_looks_across_an_episodes_beginning() {
             let first = tensor(&unrolls.first, LENGTH + 1).squeeze_dim(-1).narrow(1, 0, LENGTH as i64);
             let previous = tensor(&unrolls.previous_latent, LENGTH);
             let noise = tensor(&unrolls.latent_noise, LENGTH);
-            let memory = RecurrentState { state: &state, first: Some(&first) };
-            learner.policy().act(&observation, &previous, &noise, memory).action.mean()
+            let recurrent = RecurrentState { state: &state, first: Some(&first) };
+            learner.policy().act(&observation, &previous, &noise, recurrent).action.mean()
         };
         let change = (means(&base) - means(&other)).abs().amax([-1], false);
         let largest = |from: i64, rows: i64| change.narrow(0, from, rows).max().double_value(&[]);
@@ -241,8 +241,8 @@ fn primitives_never_see_the_reference() {
             let reference = zeros(4).set_requires_grad(true);
             let observation = learner.policy().normalise(&zeros(5), &reference, None, &Routing::single());
             let latent = experiment.network.latent.size as i64;
-            let memory = RecurrentState { state: &zeros(0), first: None };
-            let acting = learner.policy().act(&observation, &zeros(latent), &zeros(latent), memory);
+            let recurrent = RecurrentState { state: &zeros(0), first: None };
+            let acting = learner.policy().act(&observation, &zeros(latent), &zeros(latent), recurrent);
             let total = acting.action.mean().square().sum(Kind::Float) + acting.action.std().sum(Kind::Float);
             Tensor::run_backward(&[total], &[&reference], false, false)
                 .remove(0)
@@ -251,7 +251,7 @@ fn primitives_never_see_the_reference() {
                 .double_value(&[])
         };
         assert!(influence() > 0.0, "{name}: the reference reaches the action");
-        // Where the weights no longer hang on it, nothing does.
+        // If the weights do not depend on the reference, nothing does.
         let gate = if experiment.network.latent.size > 0 {
             "low_level.gate.head.weight"
         } else {
@@ -264,7 +264,7 @@ fn primitives_never_see_the_reference() {
 }
 
 #[test]
-fn a_warm_start_makes_whatever_acts_aim_at_the_demonstration() {
+fn a_warm_start_moves_every_low_level_to_the_demonstration() {
     let mixtures = every_low_level().into_iter().filter(|(name, _)| !name.starts_with("product"));
     for (name, mut experiment) in mixtures {
         experiment.optimiser.epsilon = 1e-8;
@@ -275,7 +275,7 @@ fn a_warm_start_makes_whatever_acts_aim_at_the_demonstration() {
         let minibatch = demonstration.minibatch();
         learner.set_learning_rates(3e-3, 1e-3);
         let target = |learner: &VmpoLearner| {
-            // How far the components are from one another's demonstrations, whichever is drawn.
+            // The largest distance of any component from the demonstrations.
             let unrolls = unrolls(learner, &experiment, 5);
             let components = experiment.network.components();
             let actions = unrolls.action.len() / unrolls.valid.len();
@@ -291,20 +291,20 @@ fn a_warm_start_makes_whatever_acts_aim_at_the_demonstration() {
         let losses: Vec<f32> =
             (0..150).map(|_| learner.regress(&minibatch).unwrap().0.to_values().get("regression_loss")).collect();
         assert!(losses[149] < 0.5 * losses[0], "{name}: {} to {}", losses[0], losses[149]);
-        // Fixed biases set a mixture's components apart; regression brings each of them to the demonstration.
+        // Fixed biases separate a mixture's components; regression moves each of them to the demonstration.
         assert!(!name.starts_with("mixture") || target(&learner) < 0.7 * before, "{name}: {before}");
     }
 }
 
 #[test]
-fn burnt_in_rows_teach_nothing_and_the_next_one_does() {
+fn burn_in_rows_are_not_learnt_from_and_the_next_row_is() {
     let (_, mut experiment) = every_low_level().remove(1);
     experiment.vmpo.value_burn_in = 2;
     let base = unrolls(&learner(&experiment, 1), &experiment, 6);
     let changed = |row: usize| {
         let mut other = base.clone();
         let width = other.action.len() / other.valid.len();
-        // Unroll 2 has no episode's end.
+        // In unroll 2 no episode ends.
         let start = (2 * LENGTH + row) * width;
         other.action[start..start + width].fill(0.9);
         other.mean[start..start + width].fill(-0.9);

@@ -1,4 +1,4 @@
-//! Targets of the value function: the recursion, and what an episode's end stops.
+//! Targets of the value function: the recursion, and the ends of episodes.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
@@ -32,7 +32,7 @@ impl Unroll {
         Vec::try_from(targets.view(-1)).unwrap()
     }
 
-    /// The definition, written as the recursion it is.
+    /// The definition, as a recursion.
     fn definition(&self, lambda: f32) -> Vec<f32> {
         let mut next = self.values[self.reward.len()];
         let mut targets: Vec<f32> = (0..self.reward.len())
@@ -70,7 +70,7 @@ fn the_return_runs_to_the_unrolls_end_and_bootstraps_there() {
 }
 
 #[test]
-fn a_failure_pays_its_reward_and_nothing_after_it() {
+fn after_a_termination_nothing_counts_but_its_own_reward() {
     let unroll = Unroll {
         reward: vec![1.0, 2.0, 0.0, 4.0],
         discount: vec![1.0, 0.0, 1.0, 1.0],
@@ -116,7 +116,7 @@ proptest! {
         unroll.valid[boundary] = 0.0;
         let before = unroll.targets(lambda);
         let mut other = unroll;
-        // The boundary row's own reward and discount, and all that comes after it.
+        // The boundary row's own reward and discount, and everything after it.
         other.reward[boundary..].fill(noise);
         other.discount[boundary..].fill(0.5);
         other.values[boundary + 1..].fill(noise);

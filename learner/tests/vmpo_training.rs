@@ -29,7 +29,7 @@ fn unrolls(seed: u64) -> Unrolls {
 }
 
 #[test]
-fn a_restored_learner_goes_on_bit_for_bit() {
+fn a_restored_learner_continues_bit_for_bit() {
     let mut original = learner(&training(), 1);
     for seed in 0..3 {
         original.step(&unrolls(seed).minibatch()).unwrap();
@@ -95,7 +95,7 @@ fn a_state_holds_everything_that_is_trained() {
     assert!(names.iter().any(|name| name == "value.tracking.clip_embedding"));
 }
 
-/// Rewards whose squares overflow, and an observation that is no number; the wire would let neither through.
+/// Rewards whose squares overflow, and an observation that is NaN. The validation would refuse both.
 fn poisoned(seed: u64) -> Unrolls {
     let mut unrolls = unrolls(seed);
     unrolls.reward.fill(1e30);
@@ -124,7 +124,7 @@ fn a_step_that_is_not_finite_changes_not_one_bit_and_is_reported() {
 }
 
 #[test]
-fn what_was_skipped_leaves_no_trace_in_the_steps_after_it() {
+fn a_skipped_step_does_not_change_the_steps_after_it() {
     let (mut spared, mut struck) = (learner(&training(), 1), learner(&training(), 1));
     for seed in 0..4 {
         let _ = struck.step(&poisoned(seed).minibatch()).unwrap();
@@ -153,17 +153,17 @@ fn a_mean_is_over_the_steps_that_were_taken_and_counts_the_others() {
 }
 
 #[test]
-fn parameters_that_are_lost_are_noticed() {
+fn parameters_that_are_not_finite_are_noticed() {
     let mut experiment = training();
     experiment.optimiser.learning_rate = 1e38;
     let mut learner = learner(&experiment, 1);
     assert!(learner.is_finite());
     let report = learner.step(&unrolls(1).minibatch()).unwrap().to_values();
-    assert_eq!(report.skipped, 0, "the step itself is one of finite numbers");
+    assert_eq!(report.skipped, 0, "all numbers of the step itself are finite");
     assert!(!learner.is_finite());
 }
 
-/// A task of one step: the nearer the action to a target, the higher the reward.
+/// A task of one step. The reward is higher if the action is nearer to a target.
 fn reach(learner: &VmpoLearner, seed: u64) -> (Unrolls, f32) {
     const TARGET: [f32; 3] = [0.6, -0.5, 0.0];
     let mut unrolls = Unrolls::random(seed, 48);
@@ -199,7 +199,7 @@ fn rewarded_actions_become_likelier() {
         }
     }
     let (_, after) = reach(&learner, 0);
-    // What remains at best is the noise: three dimensions of variance σ².
+    // The noise remains at best: three dimensions of variance σ².
     assert!(after > 0.5 * before, "mean reward went from {before} to {after}");
 }
 
@@ -253,7 +253,7 @@ fn a_warm_starts_masked_rows_change_nothing() {
 }
 
 #[test]
-fn a_masked_unroll_teaches_a_warm_start_as_little_as_one_that_is_not_there() {
+fn a_masked_unroll_has_no_more_influence_on_a_warm_start_than_an_absent_one() {
     let all = unrolls(1);
     let mut masked = all.clone();
     masked.valid[3 * LENGTH..4 * LENGTH].fill(0.0);

@@ -1,4 +1,4 @@
-//! The learner's program with XLA in it: how it starts, stops and fails.
+//! The learner's program with XLA: how it starts, stops and fails.
 
 #![cfg(feature = "xla")]
 
@@ -16,7 +16,7 @@ fn learner(run: &Path, arguments: &[&str]) -> Command {
     command
 }
 
-/// When it serves.
+/// Starts a learner, and returns when it serves.
 fn started(mut command: Command) -> Child {
     let mut child = command.spawn().unwrap();
     let mut line = String::new();
@@ -29,7 +29,7 @@ fn started(mut command: Command) -> Child {
 }
 
 #[test]
-fn ctrl_c_leaves_a_checkpoint_that_another_device_goes_on_with() {
+fn ctrl_c_leaves_a_checkpoint_that_another_device_resumes() {
     let directory = tempfile::tempdir().unwrap();
     let run = directory.path().join("run");
     for (device, signal) in [("xla", Signal::INT), ("cpu", Signal::TERM), ("xla:0", Signal::TERM)] {
@@ -44,7 +44,7 @@ fn ctrl_c_leaves_a_checkpoint_that_another_device_goes_on_with() {
 }
 
 #[test]
-fn a_device_that_is_not_there_is_a_configuration_that_is_wrong() {
+fn a_missing_device_is_a_wrong_configuration() {
     let directory = tempfile::tempdir().unwrap();
     for (device, word) in [("xla:200", "PJRT_DEVICE"), ("cuda:200", "setup --cuda")] {
         let output = learner(&directory.path().join("run"), &["--device", device]).output().unwrap();
@@ -58,9 +58,9 @@ fn a_device_that_is_not_there_is_a_configuration_that_is_wrong() {
     assert!(output.status.code() == Some(2) && log.contains("setup --xla"), "{log}");
 }
 
-/// As of a torch_xla that was put together by hand.
+/// For instance of a torch_xla that was installed by hand.
 #[test]
-fn a_part_of_the_plugin_that_is_not_there_is_a_configuration_that_is_wrong() {
+fn a_missing_part_of_the_plugin_is_a_wrong_configuration() {
     let directory = tempfile::tempdir().unwrap();
     let packages = directory.path().join("packages");
     std::fs::create_dir(&packages).unwrap();

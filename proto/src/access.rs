@@ -1,4 +1,4 @@
-//! How a client finds a learner, proves who it is, and knows whom it talks to.
+//! A client's access to a learner: address, TLS, and token.
 
 use std::error::Error;
 use std::io;
@@ -12,24 +12,25 @@ use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 use tonic::{Request, Status};
 
-use crate::Token;
+use crate::access_error::AccessError;
+use crate::token::Token;
 use crate::v1::learner_client::LearnerClient;
 
-/// TCP, and then TLS, have to be there in this time.
+/// Time limit of connecting by TCP, and again of the TLS handshake.
 const CONNECT: Duration = Duration::from_secs(5);
-/// A learner that answers nothing for twice as long is not there any more.
+/// Interval of HTTP/2 pings, and time limit of their answers. A learner without an answer for both is lost.
 const KEEP_ALIVE: Duration = Duration::from_secs(10);
 
-/// Bytes of the largest HTTP/2 frame that an actor takes.
+/// Size of the largest HTTP/2 frame that an actor accepts, bytes.
 pub const FRAME_BYTES: usize = 64 * 1024;
 
 /// A client of the learner that sends its token, if it has one, with every call.
 pub type Client = LearnerClient<Authorised>;
 
-/// A connection whose calls bear the token.
+/// A connection whose calls have the token.
 pub type Authorised = InterceptedService<Channel, Bearer>;
 
-/// A client's side of TLS and tokens. Files are read anew for every connection, so renewed ones are taken up.
+/// TLS and token of a client. Files are read again for every connection, so renewed files are used.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct Access {
     /// Certificates (PEM) of the authority that signed the learner's; https:// needs it.
@@ -41,16 +42,17 @@ pub struct Access {
     /// Private key (PEM) of the certificate.
     #[arg(long, value_name = "FILE", env = "COMIC_KEY", requires = "cert", help_heading = "Access")]
     pub key: Option<PathBuf>,
-    /// File with the learner's token in its first line; without one the token is what COMIC_TOKEN holds.
+    /// File with the learner's token in its first line. Default: the token in COMIC_TOKEN.
     #[arg(long, value_name = "FILE", env = "COMIC_TOKEN_FILE", help_heading = "Access")]
     pub token_file: Option<PathBuf>,
 }
 
 impl Access {
-    /// Where `url` leads, with TLS if it begins with `https://`. Connecting is limited to 5 s.
+    /// The endpoint of `url`, with TLS if it begins with `https://`. The time limit of connecting is 5 s.
     ///
     /// # Errors
-    /// A URL that is none, `https://` without an authority or an authority without `https://`, files that cannot be read.
+    /// [`AccessError`], if the URL is invalid, if `https://` has no authority or an authority is given without
+    /// `https://`, or if a file cannot be read.
     pub fn endpoint(&self, url: &str) -> Result<Endpoint, AccessError> {
         let unusable = || AccessError::Url { url: url.to_owned() };
         let endpoint = Endpoint::from_shared(url.to_owned()).map_err(|_| unusable())?.connect_timeout(CONNECT);
@@ -73,12 +75,13 @@ impl Access {
         }
     }
 
-    /// The same for an actor, whose connection lasts as long as it does. Keep-alive while idle: a learner that vanished without
-    /// a word is otherwise never noticed. The connection's window exceeds the parameter stream's, so that a version nobody has
-    /// read yet cannot stall the acknowledgements, and a frame holds a piece of parameters.
+    /// Like [`endpoint`](Self::endpoint), for the long connection of an actor. It sends pings while it is idle;
+    /// otherwise a learner that vanished would never be noticed. The window of the connection is larger than that of
+    /// the parameter stream, so unread parameters cannot block the acknowledgements. A piece of parameters fits into
+    /// one frame.
     ///
     /// # Errors
-    /// As of [`endpoint`](Self::endpoint).
+    /// As [`endpoint`](Self::endpoint).
     pub fn lasting_endpoint(&self, url: &str) -> Result<Endpoint, AccessError> {
         Ok(self
             .endpoint(url)?
@@ -94,7 +97,7 @@ impl Access {
     fn tls(&self, ca: &Path) -> Result<ClientTlsConfig, AccessError> {
         let authority = read(ca)?;
         if !authority.windows(5).any(|window| window == b"BEGIN") {
-            return Err(AccessError::Tls { reason: format!("{} holds no PEM", ca.display()) });
+            return Err(AccessError::Tls { reason: format!("{} is not a PEM file", ca.display()) });
         }
         let tls = ClientTlsConfig::new().ca_certificate(Certificate::from_pem(authority)).timeout(CONNECT);
         Ok(match (&self.cert, &self.key) {
@@ -103,10 +106,10 @@ impl Access {
         })
     }
 
-    /// What puts the token into every call.
+    /// The interceptor that adds the token to every call.
     ///
     /// # Errors
-    /// A file that cannot be read, or without a usable token.
+    /// [`AccessError`], if the file cannot be read or has no valid token.
     pub fn bearer(&self) -> Result<Bearer, AccessError> {
         let Some(token) = Token::read(self.token_file.as_deref())?.into_iter().next() else {
             return Ok(Bearer { header: None });
@@ -126,7 +129,7 @@ fn read(path: &Path) -> Result<Vec<u8>, AccessError> {
 /// Sends the token with every call.
 #[derive(Clone, Debug)]
 pub struct Bearer {
-    /// Marked as sensitive: its `Debug` form is `Sensitive`, and HTTP/2 never puts it into a table.
+    /// The value is marked as sensitive: `Debug` prints `Sensitive`, and HTTP/2 never adds it to its header table.
     header: Option<MetadataValue<Ascii>>,
 }
 
@@ -139,52 +142,8 @@ impl Interceptor for Bearer {
     }
 }
 
-/// What is wrong with a client's URL, certificates or token.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum AccessError {
-    /// The learner's address is no URL.
-    #[error("`{url}` is no address of a learner: give one like http://host:7070")]
-    Url {
-        /// What was given.
-        url: String,
-    },
-    /// `https://`, and nobody to trust.
-    #[error("{url} needs --ca FILE, the authority that signed the learner's certificate")]
-    NoAuthority {
-        /// The learner's address.
-        url: String,
-    },
-    /// An authority, and nothing to check with it.
-    #[error("--ca is given, but {url} does not use TLS: write https://")]
-    NotSecure {
-        /// The learner's address.
-        url: String,
-    },
-    /// A file cannot be read.
-    #[error("cannot read {}", path.display())]
-    File {
-        /// Which.
-        path: PathBuf,
-        /// Why not.
-        source: io::Error,
-    },
-    /// No token, or none that can stand in a header.
-    #[error("{origin} holds no usable token: a token is one line of visible ASCII characters without spaces")]
-    Token {
-        /// File or variable.
-        origin: String,
-    },
-    /// Certificates or keys that are none, or that do not belong together.
-    #[error("the certificates cannot be used: {reason}")]
-    Tls {
-        /// What rustls says.
-        reason: String,
-    },
-}
-
-/// Whether TLS failed because one side does not trust the other's certificate, and will not in a minute either. An
-/// expired certificate is no such case: both sides take up a renewed one without a restart.
+/// Whether TLS failed for a permanent reason: one side does not trust the other's certificate. An expired certificate
+/// is not permanent, because both sides use a renewed certificate without a restart.
 pub fn distrusted(error: &(dyn Error + 'static)) -> bool {
     links(error).any(|link| match tls_error(link) {
         Some(rustls::Error::InvalidCertificate(reason)) => !matches!(
@@ -196,7 +155,7 @@ pub fn distrusted(error: &(dyn Error + 'static)) -> bool {
         ),
         Some(rustls::Error::AlertReceived(alert)) => DISTRUST.contains(alert),
         Some(_) => false,
-        // HTTP/2 keeps of an error off its connection nothing but the text.
+        // HTTP/2 keeps only the text of an error of its connection.
         None => DISTRUST.iter().any(|alert| {
             let text = rustls::Error::AlertReceived(*alert).to_string();
             link.to_string().contains(&text)
@@ -204,7 +163,7 @@ pub fn distrusted(error: &(dyn Error + 'static)) -> bool {
     })
 }
 
-/// What a peer says that does not take a certificate, or misses one.
+/// The alerts of a peer that refuses a certificate or requires one.
 const DISTRUST: [AlertDescription; 9] = [
     AlertDescription::AccessDenied,
     AlertDescription::BadCertificate,
@@ -217,23 +176,24 @@ const DISTRUST: [AlertDescription; 9] = [
     AlertDescription::UnsupportedCertificate,
 ];
 
-/// An error and its sources as one line: the transport's own message is `transport error`. Of a status its message is
-/// taken, which is for a person.
+/// An error and its sources as one line. The sources are needed because the transport's own message is `transport
+/// error`. A gRPC status is represented by its message.
 pub fn chain(error: &(dyn Error + 'static)) -> String {
-    let said = |link: &(dyn Error + 'static)| match link.downcast_ref::<Status>() {
+    let text = |link: &(dyn Error + 'static)| match link.downcast_ref::<Status>() {
         Some(status) => status.message().to_owned(),
         None => link.to_string(),
     };
-    let mut parts: Vec<String> = links(error).map(said).collect();
+    let mut parts: Vec<String> = links(error).map(text).collect();
     parts.dedup();
     parts.join(": ")
 }
 
+/// An error, its source, and so on.
 fn links<'a>(error: &'a (dyn Error + 'static)) -> impl Iterator<Item = &'a (dyn Error + 'static)> {
     std::iter::successors(Some(error), |&error| error.source())
 }
 
-/// rustls hands its errors on inside those of the socket.
+/// The error of rustls. It may be inside an error of the socket.
 fn tls_error<'a>(error: &'a (dyn Error + 'static)) -> Option<&'a rustls::Error> {
     let inner = || error.downcast_ref::<io::Error>()?.get_ref()?.downcast_ref();
     error.downcast_ref().or_else(inner)
@@ -244,7 +204,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn addresses_that_are_none_are_refused_with_the_remedy() {
+    fn invalid_addresses_are_refused_with_a_remedy() {
         let refused = |url: &str, access: &Access| access.endpoint(url).unwrap_err();
         for url in ["host:7070", "", "http://", "ftp://host", "not a url"] {
             let error = refused(url, &Access::default());
@@ -258,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bearer_shows_no_secret() {
+    fn the_debug_form_of_a_bearer_does_not_show_the_token() {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), "open-sesame\n").unwrap();
         let access = Access { token_file: Some(file.path().into()), ..Access::default() };
@@ -269,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn expiry_is_waited_for_and_distrust_is_not() {
+    fn an_expired_certificate_is_not_permanent_and_distrust_is() {
         let failed = |error| io::Error::new(io::ErrorKind::InvalidData, error);
         let lasting = rustls::Error::InvalidCertificate(CertificateError::UnknownIssuer);
         assert!(distrusted(&failed(lasting)));

@@ -1,12 +1,14 @@
-//! An unroll under construction.
+//! An unroll that an actor writes.
 
 use bytes::Bytes;
 
-use crate::{Field, Invalid, UnrollLayout};
+use crate::field::Field;
+use crate::layout::UnrollLayout;
+use crate::validate::Invalid;
 
 /// An unroll that an actor writes row by row and sends as one payload.
 ///
-/// Memory is a `Vec<u32>`, so every row is aligned whatever the layout.
+/// Its memory is a `Vec<u32>`, so every row is aligned for every layout.
 #[derive(Clone, Debug)]
 pub struct UnrollBuffer {
     layout: UnrollLayout,
@@ -14,15 +16,15 @@ pub struct UnrollBuffer {
 }
 
 impl UnrollBuffer {
-    /// An unroll of zeros, except that standard deviations are 1 and components weigh the same, so that a row nobody acts
-    /// in is valid as it stands.
+    /// A new unroll. All numbers are 0, except that standard deviations are 1 and all components have the same weight.
+    /// So a row without a transition is valid.
     pub fn new(layout: &UnrollLayout) -> Self {
         let mut buffer = Self { layout: layout.clone(), words: vec![0; layout.size() / size_of::<u32>()] };
         buffer.clear();
         buffer
     }
 
-    /// Back to the state of a new buffer, keeping its memory.
+    /// Resets the buffer to the state of a new one, and keeps its memory.
     pub fn clear(&mut self) {
         self.words.fill(0);
         let std = self.words(Field::Std);
@@ -32,15 +34,15 @@ impl UnrollBuffer {
         self.words[weights].fill(even.to_bits());
     }
 
-    /// The layout it follows.
+    /// The layout of the unroll.
     pub fn layout(&self) -> &UnrollLayout {
         &self.layout
     }
 
-    /// Row `t` of a field of `f32`. ([`Field::Clip`], which holds `u32`, and [`Field::Image`], which holds bytes, have methods of their own.)
+    /// Row `t` of a field of `f32`. [`Field::Clip`] (`u32`) and [`Field::Image`] (bytes) have their own methods.
     ///
     /// # Panics
-    /// When the field has no row `t`.
+    /// If the field has no row `t`.
     pub fn row_mut(&mut self, field: Field, t: usize) -> &mut [f32] {
         let range = self.row_words(field, t);
         bytemuck::cast_slice_mut(&mut self.words[range])
@@ -49,15 +51,15 @@ impl UnrollBuffer {
     /// Row `t` of a field of `f32`.
     ///
     /// # Panics
-    /// When the field has no row `t`.
+    /// If the field has no row `t`.
     pub fn row(&self, field: Field, t: usize) -> &[f32] {
         bytemuck::cast_slice(&self.words[self.row_words(field, t)])
     }
 
-    /// The image of row `t`; empty when the humanoid is blind.
+    /// The camera image of row `t`; empty if the humanoid has no camera.
     ///
     /// # Panics
-    /// When there is no row `t`.
+    /// If there is no row `t`.
     pub fn image_mut(&mut self, t: usize) -> &mut [u8] {
         let range = self.row_words(Field::Image, t);
         bytemuck::cast_slice_mut(&mut self.words[range])
@@ -66,7 +68,7 @@ impl UnrollBuffer {
     /// Sets the clip of row `t`.
     ///
     /// # Panics
-    /// When there is no row `t`.
+    /// If there is no row `t`.
     pub fn set_clip(&mut self, t: usize, clip: u32) {
         let range = self.row_words(Field::Clip, t);
         self.words[range].fill(clip);
@@ -75,24 +77,25 @@ impl UnrollBuffer {
     /// The clip of row `t`.
     ///
     /// # Panics
-    /// When there is no row `t`.
+    /// If there is no row `t`.
     pub fn clip(&self, t: usize) -> u32 {
         self.words[self.row_words(Field::Clip, t).start]
     }
 
-    /// Row `t` as padding: the observation of the row before it again, as if an episode began there that takes no step.
+    /// Makes row `t` padding: it gets the observation of the previous row, as the first observation of an episode
+    /// without steps.
     ///
     /// # Panics
-    /// When there is no row `t`, or none before it.
+    /// If there is no row `t`, or no row before it.
     pub fn repeat_observation(&mut self, t: usize) {
         for field in [Field::Proprioception, Field::Task, Field::Clip, Field::Image] {
-            let (before, place) = (self.row_words(field, t - 1), self.row_words(field, t).start);
-            self.words.copy_within(before, place);
+            let (before, start) = (self.row_words(field, t - 1), self.row_words(field, t).start);
+            self.words.copy_within(before, start);
         }
         self.row_mut(Field::First, t).fill(1.0);
     }
 
-    /// The payload, copied: the buffer can be written again at once.
+    /// A copy of the payload. The buffer can be reused.
     pub fn to_bytes(&self) -> Bytes {
         Bytes::copy_from_slice(bytemuck::cast_slice(&self.words))
     }
@@ -102,11 +105,10 @@ impl UnrollBuffer {
         Bytes::from_owner(Payload(self.words))
     }
 
-    /// The unroll that lies in a payload.
+    /// The unroll of a payload. The content is not checked; [`validate`](crate::validate()) does that.
     ///
     /// # Errors
-    /// [`Invalid::Length`] when the payload is no unroll of this layout. Contents are not checked: that is
-    /// [`validate`](crate::validate)'s job.
+    /// [`Invalid::Length`] if the length of the payload is not that of the layout.
     pub fn from_payload(layout: &UnrollLayout, payload: &[u8]) -> Result<Self, Invalid> {
         if payload.len() != layout.size() {
             return Err(Invalid::Length { found: payload.len(), expected: layout.size() });
@@ -116,21 +118,23 @@ impl UnrollBuffer {
         Ok(buffer)
     }
 
+    /// The words of a field.
     fn words(&self, field: Field) -> std::ops::Range<usize> {
         let bytes = self.layout.range(field);
         bytes.start / size_of::<u32>()..bytes.end / size_of::<u32>()
     }
 
+    /// The words of row `t` of a field.
     fn row_words(&self, field: Field, t: usize) -> std::ops::Range<usize> {
         let rows = self.layout.rows(field);
-        assert!(t < rows, "row {t} of {field}, which has {rows}");
+        assert!(t < rows, "row {t} of {field}, which has {rows} rows");
         let width = self.words(field).len() / rows;
         let start = self.words(field).start + t * width;
         start..start + width
     }
 }
 
-/// Lets [`Bytes`] own the words.
+/// An owner of the words for [`Bytes`].
 struct Payload(Vec<u32>);
 
 impl AsRef<[u8]> for Payload {

@@ -1,10 +1,10 @@
-//! Messages that are encoded before anybody asks for them.
+//! Messages that are encoded in advance.
 
 use bytes::{BufMut as _, Bytes, BytesMut};
 use prost::Message;
 
-/// A message as gRPC sends it: the byte 0 for "not compressed", the length in four bytes, big end first, the message,
-/// which is smaller than 4 GiB.
+/// A message as gRPC sends it: the byte 0 for "not compressed", the length in four bytes (big-endian), the message. The
+/// message must be smaller than 4 GiB.
 pub fn frame(message: &impl Message) -> Bytes {
     let length = message.encoded_len();
     let mut frame = BytesMut::with_capacity(5 + length);

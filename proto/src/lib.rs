@@ -1,26 +1,29 @@
-//! The wire between actors and the learner: messages, the unroll's layout, and the checks on what arrives.
+//! The protocol between actors and learner: messages, the layout of an unroll, and the validation of received data.
 //!
 //! # Layout
 //! - [`v1`] is generated from `comic/v1/learner.proto`: messages, client and server.
-//! - [`UnrollLayout`] says where each [`Field`] of an unroll lies in the payload, and hashes that into what both sides
-//!   compare. It follows from an [`UnrollShape`], and that from the experiment and the task's spec alone.
+//! - [`UnrollLayout`] has the position of each [`Field`] of an unroll in the payload, and a hash that both sides
+//!   compare. It follows from an [`UnrollShape`], which follows from the experiment and the task spec.
 //! - [`PerField`] is an array with one value for each field.
 //! - [`UnrollBuffer`] is an unroll that an actor writes.
-//! - [`ReceivedUnroll`] is one that a learner receives, in the [`Pieces`] in which it came.
-//! - [`Access`] is a client's way to a learner: URL, TLS, and the [`Token`] it shows.
-//! - [`validate`] is what a payload has to pass before it touches a batch.
+//! - [`ReceivedUnroll`] is an unroll that a learner has received, in the [`Pieces`] of the network.
+//! - [`Access`] is a client's access to a learner: URL, TLS, and [`Token`].
+//! - [`validate()`] checks a payload before it is copied into a batch.
 //!
 //! # An unroll
-//! `T` slots for transitions and `T + 1` rows of observations. Row `t` holds the observation before transition `t`.
+//! An unroll has `T` transitions and `T + 1` rows of observations. Row `t` has the observation before transition `t`.
 //! `Valid[t] = 1`: action, reward and discount of row `t` lead to the observation in row `t + 1`; a step that
-//! terminated has discount 0, one that was truncated discount 1. `Valid[t] = 0`: row `t` is the last observation of an
-//! episode and has no action; row `t + 1` is the first observation of the next one, and `First[t + 1] = 1`.
+//! terminates the episode has discount 0, a step that truncates it discount 1. `Valid[t] = 0`: row `t` is the last
+//! observation of an episode and has no action; row `t + 1` is the first observation of the next one, and `First[t + 1]
+//! = 1`.
 
 #[cfg(target_endian = "big")]
 compile_error!("the payload of an unroll is little-endian and is copied, not converted");
 
 mod access;
+mod access_error;
 mod buffer;
+mod field;
 mod frame;
 mod layout;
 mod per_field;
@@ -34,17 +37,19 @@ pub mod v1 {
     tonic::include_proto!("comic.v1");
 }
 
-pub use access::{Access, AccessError, Authorised, Bearer, Client, FRAME_BYTES, chain, distrusted};
+pub use access::{Access, Authorised, Bearer, Client, FRAME_BYTES, chain, distrusted};
+pub use access_error::AccessError;
 pub use buffer::UnrollBuffer;
+pub use field::{Field, UnrollShape};
 pub use frame::frame;
-pub use layout::{Field, UnrollLayout, UnrollShape};
+pub use layout::UnrollLayout;
 pub use per_field::PerField;
 pub use pieces::{Malformed, Pieces, ReceivedUnroll};
 pub use token::{TOKEN_VARIABLE, Token};
 pub use validate::{Expected, Invalid, MAX_SEQUENCE, validate};
 
-/// The protocol's descriptors, as gRPC reflection hands them out.
+/// The descriptors of the protocol for gRPC reflection.
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
-/// Version of the protocol, which `Join` compares; it changes whenever an old peer would misunderstand a new one.
+/// Version of the protocol. `Join` compares it. It changes if an older peer would misunderstand a newer one.
 pub const PROTOCOL_VERSION: u32 = 3;

@@ -3,7 +3,7 @@
 use std::array;
 use std::ops::{Index, IndexMut};
 
-use crate::Field;
+use crate::field::Field;
 
 /// An array with one value for each [`Field`], indexed by the field.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -1,4 +1,4 @@
-//! Bytes as the network delivered them.
+//! Received bytes in the pieces of the network.
 
 use std::collections::VecDeque;
 use std::ops::Range;
@@ -8,32 +8,32 @@ use thiserror::Error;
 
 use crate::v1::UnrollHeader;
 
-/// Bytes in the pieces in which they came: the large ones stay where they are, and are never copied to join them.
+/// Bytes in pieces, as they were received. Large pieces stay in their buffers and are never copied to join them.
 #[derive(Clone, Debug, Default)]
 pub struct Pieces {
-    /// None is empty.
+    /// No piece is empty.
     pieces: VecDeque<Bytes>,
-    /// After them, what came in small ones.
+    /// The small pieces after the last large one, joined.
     tail: BytesMut,
     length: usize,
 }
 
 impl Pieces {
-    /// A piece of so many bytes is kept where it lies, with the buffer it is a part of. Smaller ones are copied: a peer
-    /// that sends single bytes must not have us keep a buffer for each.
+    /// A piece of at least this number of bytes keeps its buffer. Smaller pieces are copied, so that a peer that sends
+    /// single bytes cannot occupy a buffer for each of them.
     pub const KEPT: usize = 128 * 1024;
 
-    /// How many bytes there are.
+    /// Number of bytes.
     pub fn len(&self) -> usize {
         self.length
     }
 
-    /// Whether there is none.
+    /// Whether there are no bytes.
     pub fn is_empty(&self) -> bool {
         self.length == 0
     }
 
-    /// More bytes, after all others.
+    /// Appends bytes.
     pub fn push(&mut self, piece: Bytes) {
         self.length += piece.len();
         if piece.len() < Self::KEPT {
@@ -44,13 +44,14 @@ impl Pieces {
         self.pieces.push_back(piece);
     }
 
+    /// Makes a piece of the tail.
     fn seal(&mut self) {
         if !self.tail.is_empty() {
             self.pieces.push_back(self.tail.split().freeze());
         }
     }
 
-    /// Takes so many bytes off the front; `None`, and all stays, when there are fewer.
+    /// Removes the first `length` bytes and returns them. If there are fewer, returns `None` and changes nothing.
     pub fn split_to(&mut self, length: usize) -> Option<Self> {
         let rest = self.length.checked_sub(length)?;
         self.seal();
@@ -68,44 +69,45 @@ impl Pieces {
         Some(front)
     }
 
-    /// The bytes of a range, piece by piece; of one that goes beyond the end, those that there are.
+    /// The bytes of a range, piece by piece. A range beyond the end is shortened.
     pub fn range(&self, range: Range<usize>) -> impl Iterator<Item = &[u8]> {
         let mut begin = 0;
         let pieces = self.pieces.iter().map(|piece| &piece[..]).chain([&self.tail[..]]);
         pieces.filter_map(move |piece| {
-            let place = begin;
+            let start = begin;
             begin += piece.len();
-            let within = |end: usize| end.saturating_sub(place).min(piece.len());
+            let within = |end: usize| end.saturating_sub(start).min(piece.len());
             let bytes = &piece[within(range.start)..within(range.end.max(range.start))];
             (!bytes.is_empty()).then_some(bytes)
         })
     }
 
-    /// Copies what begins at `start`.
+    /// Copies the bytes from `start` on into `into`, which is filled.
     ///
     /// # Panics
-    /// When there is less than `into` has room for.
+    /// If there are fewer bytes.
     pub fn copy_to(&self, start: usize, into: &mut [u8]) {
         self.copy_by(start, into, |from, into| into.copy_from_slice(from));
     }
 
-    /// The same by another way of copying, which is called with two slices of one length.
+    /// Like [`copy_to`](Self::copy_to), with another function that copies. The function gets two slices of equal
+    /// length.
     ///
     /// # Panics
-    /// When there is less than `into` has room for.
+    /// If there are fewer bytes.
     pub fn copy_by(&self, start: usize, into: &mut [u8], copy: impl Fn(&[u8], &mut [u8])) {
         let mut rest = into;
         for bytes in self.range(start..start + rest.len()) {
-            let (place, after) = rest.split_at_mut(bytes.len());
-            copy(bytes, place);
+            let (target, after) = rest.split_at_mut(bytes.len());
+            copy(bytes, target);
             rest = after;
         }
-        assert!(rest.is_empty(), "{} bytes are missing from {start} on: there are {}", rest.len(), self.length);
+        assert!(rest.is_empty(), "{} bytes are missing after {start}: there are {}", rest.len(), self.length);
     }
 
-    /// Does something with each word, little end first, of a range of whole words.
+    /// Calls `visit` with each little-endian word of a range of whole words.
     pub(crate) fn for_each_word(&self, range: Range<usize>, mut visit: impl FnMut(u32)) {
-        // Of a word that was cut.
+        // The bytes of a word that is in two or more pieces.
         let (mut word, mut have) = ([0; 4], 0);
         for mut bytes in self.range(range) {
             if have > 0 {
@@ -125,7 +127,7 @@ impl Pieces {
     }
 }
 
-/// Each stays as it is, however small.
+/// Pieces of any size keep their buffers.
 impl FromIterator<Bytes> for Pieces {
     fn from_iter<I: IntoIterator<Item = Bytes>>(pieces: I) -> Self {
         let pieces: VecDeque<_> = pieces.into_iter().filter(|piece| !piece.is_empty()).collect();
@@ -164,43 +166,44 @@ impl Buf for Pieces {
     }
 }
 
-/// A [`UnrollMessage`](crate::v1::UnrollMessage) as it is received: its payload stays in the pieces in which it came.
+/// A received [`UnrollMessage`](crate::v1::UnrollMessage). Its payload stays in the received pieces.
 #[derive(Clone, Debug, Default)]
 pub struct ReceivedUnroll {
-    /// `None` in a message without one.
+    /// The header; `None` if the message has none.
     pub header: Option<UnrollHeader>,
-    /// The bytes of the layout.
+    /// The payload.
     pub payload: Pieces,
 }
 
-/// Bytes that are no message of an unroll.
+/// The bytes are not an `UnrollMessage`.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[error("not a message of this protocol: {0}")]
 pub struct Malformed(String);
 
 impl ReceivedUnroll {
-    /// What the message says, exactly as its generated type would have it, but for groups, which are refused.
+    /// Decodes a message with the same result as the generated type, except that groups are refused.
     ///
     /// # Errors
-    /// [`Malformed`] when it is no such message.
+    /// [`Malformed`] if the bytes are not such a message.
     pub fn decode(mut message: Pieces) -> Result<Self, Malformed> {
         let mut unroll = Self::default();
         while message.has_remaining() {
-            // "Protocol Buffers, Encoding": a field's number and, in three bits, what follows.
-            let key = u32::try_from(varint(&mut message)?).map_err(|_| malformed("a field's number"))?;
+            // See "Encoding" in the documentation of Protocol Buffers: the number of a field, and its wire type in
+            // three bits.
+            let key = u32::try_from(varint(&mut message)?).map_err(|_| malformed("invalid number of a field"))?;
             match (key >> 3, key & 7) {
-                (0, _) => return Err(malformed("a field's number")),
+                (0, _) => return Err(malformed("invalid number of a field")),
                 (1, 2) => {
                     let header = unroll.header.get_or_insert_default();
                     prost::Message::merge(header, part(&mut message)?).map_err(|error| Malformed(error.to_string()))?;
                 }
                 (2, 2) => unroll.payload = part(&mut message)?,
-                (1 | 2, _) => return Err(malformed("a field of another type")),
+                (1 | 2, _) => return Err(malformed("invalid type of a field")),
                 (_, 0) => drop(varint(&mut message)?),
-                (_, 1) => drop(message.split_to(8).ok_or_else(|| malformed("its end is missing"))?),
+                (_, 1) => drop(message.split_to(8).ok_or_else(|| malformed("the message is truncated"))?),
                 (_, 2) => drop(part(&mut message)?),
-                (_, 5) => drop(message.split_to(4).ok_or_else(|| malformed("its end is missing"))?),
-                _ => return Err(malformed("a field of no type")),
+                (_, 5) => drop(message.split_to(4).ok_or_else(|| malformed("the message is truncated"))?),
+                _ => return Err(malformed("unknown wire type")),
             }
         }
         Ok(unroll)
@@ -215,7 +218,8 @@ fn varint(message: &mut Pieces) -> Result<usize, Malformed> {
     prost::decode_length_delimiter(message).map_err(|error| Malformed(error.to_string()))
 }
 
+/// A length and as many bytes.
 fn part(message: &mut Pieces) -> Result<Pieces, Malformed> {
     let length = varint(message)?;
-    message.split_to(length).ok_or_else(|| malformed("its end is missing"))
+    message.split_to(length).ok_or_else(|| malformed("the message is truncated"))
 }

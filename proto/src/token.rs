@@ -1,24 +1,24 @@
-//! Bearer tokens: secrets that are never shown.
+//! Bearer tokens. They are secret and never printed.
 
 use std::fmt;
 use std::path::Path;
 
-use crate::AccessError;
+use crate::access_error::AccessError;
 
-/// The environment variable that holds a token where no file does.
+/// The environment variable with the token, if no file is given.
 pub const TOKEN_VARIABLE: &str = "COMIC_TOKEN";
 
-/// A secret that a client sends with every call. Neither its `Debug` form nor any message shows it.
+/// A secret that a client sends with every call. Neither `Debug` nor an error message prints it.
 #[derive(Clone)]
 pub struct Token(String);
 
 impl Token {
-    /// The secret itself.
+    /// The secret.
     pub fn secret(&self) -> &str {
         &self.0
     }
 
-    /// Checks that `text` can stand in a header: visible ASCII, at least one character.
+    /// Checks that `text` is valid in a header: visible ASCII, at least one character.
     fn new(text: &str, origin: &str) -> Result<Self, AccessError> {
         if text.is_empty() || !text.bytes().all(|byte| byte.is_ascii_graphic()) {
             return Err(AccessError::Token { origin: origin.to_owned() });
@@ -26,11 +26,11 @@ impl Token {
         Ok(Self(text.to_owned()))
     }
 
-    /// The tokens in `file`, one a line, or without a file the one in `COMIC_TOKEN`; none without either. Blank lines
-    /// are skipped.
+    /// The tokens in `file`, one per line. Without a file, the token in `COMIC_TOKEN`, or none. Blank lines are
+    /// skipped.
     ///
     /// # Errors
-    /// A file that cannot be read or holds no token; a token that cannot stand in a header.
+    /// [`AccessError`], if the file cannot be read or has no token, or a token is not valid in a header.
     pub fn read(file: Option<&Path>) -> Result<Vec<Self>, AccessError> {
         let Some(path) = file else {
             return match std::env::var(TOKEN_VARIABLE) {
@@ -64,13 +64,13 @@ mod tests {
     }
 
     #[test]
-    fn a_file_holds_a_token_a_line() {
+    fn a_file_has_one_token_per_line() {
         let tokens = file("one\n\n  two \n").unwrap();
         assert_eq!(tokens.iter().map(Token::secret).collect::<Vec<_>>(), ["one", "two"]);
     }
 
     #[test]
-    fn a_file_without_a_usable_token_is_refused_and_not_quoted() {
+    fn an_invalid_token_is_refused_and_not_printed() {
         for text in ["", "\n \n", "half a secret", "schlüssel"] {
             let error = file(text).unwrap_err();
             assert!(matches!(error, AccessError::Token { .. }), "{error:?}");
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_shows_a_token() {
+    fn the_debug_form_does_not_show_the_token() {
         assert_eq!(format!("{:?}", Token("open sesame".into())), "Token(…)");
     }
 }

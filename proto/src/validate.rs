@@ -1,29 +1,31 @@
-//! What comes off the wire is checked here, before it touches a batch.
+//! The validation of received unrolls, before they are copied into a batch.
 
 use std::ops::Range;
 
 use thiserror::Error;
 
+use crate::field::Field;
+use crate::layout::UnrollLayout;
+use crate::pieces::Pieces;
 use crate::v1::{Behaviour, EpisodeEnd, EpisodeStatistics, UnrollHeader};
-use crate::{Field, Pieces, UnrollLayout};
 
-/// Sequence numbers lie below this. At a thousand unrolls a second an actor reaches it after thirty years; a larger
-/// one is a broken header, and one such number taken seriously would spoil the accounting.
+/// Sequence numbers are below this. With a thousand unrolls per second an actor reaches it after thirty years, so a
+/// larger number is an error. If it were accepted, all numbers that it skips would be counted as lost.
 pub const MAX_SEQUENCE: u64 = 1 << 40;
 
-/// What the learner knows at this moment and a header has to agree with.
+/// The state of the learner that a header must match.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Expected<'a> {
-    /// Number of clips of each task. Clips are numbered through all tasks.
+    /// Number of clips of each task. The indices of clips continue from task to task.
     pub clips: &'a [usize],
-    /// The learner's epoch. An unroll of an earlier one is not invalid but superseded, which is the batcher's to say.
+    /// The learner epoch. An unroll of an earlier epoch is valid here; the batcher drops it as superseded.
     pub epoch: u64,
     /// The newest version of the parameters that was published in this epoch.
     pub newest_version: u64,
 }
 
 impl Expected<'_> {
-    /// The clips of a task; none for a task that the experiment does not have.
+    /// The indices of the clips of a task; `None` for a task that the experiment does not have.
     fn clips_of(&self, task: u32) -> Option<Range<usize>> {
         let task = task as usize;
         let first: usize = self.clips.get(..task)?.iter().sum();
@@ -31,47 +33,47 @@ impl Expected<'_> {
     }
 }
 
-/// Why an unroll is refused as invalid.
+/// The reason why an unroll is invalid.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum Invalid {
     /// The message has no header.
     #[error("unroll has no header")]
     Header,
-    /// A sequence number that no actor can have reached.
-    #[error("sequence {sequence} is beyond {MAX_SEQUENCE}")]
+    /// No actor can have reached the sequence number.
+    #[error("sequence number {sequence} is not below {MAX_SEQUENCE}")]
     Sequence {
-        /// As received.
+        /// The received value.
         sequence: u64,
     },
-    /// Another layout than this learner's.
+    /// The layout is not that of the learner.
     #[error("layout hash differs from the learner's: actor and learner must run the same experiment, join again")]
     LayoutHash,
-    /// An epoch that has not begun.
-    #[error("learner epoch {found} is in the future, this is epoch {newest}")]
+    /// The learner epoch has not begun.
+    #[error("learner epoch {found} is in the future, the learner is in epoch {newest}")]
     Epoch {
-        /// As received.
+        /// The received value.
         found: u64,
-        /// The learner's.
+        /// The epoch of the learner.
         newest: u64,
     },
-    /// A version that was never published.
+    /// The version is not published yet.
     #[error("version {found} is in the future, the newest is {newest}")]
     Version {
-        /// As received.
+        /// The received value.
         found: u64,
-        /// The newest published.
+        /// The newest published version.
         newest: u64,
     },
-    /// Not the layout's size.
-    #[error("payload has {found} bytes, the layout {expected}")]
+    /// The payload does not have the size of the layout.
+    #[error("payload has {found} bytes, but the layout has {expected}")]
     Length {
-        /// Bytes received.
+        /// Received bytes.
         found: usize,
         /// Bytes of the layout.
         expected: usize,
     },
-    /// NaN or infinity.
+    /// A number is NaN or infinite.
     #[error("{field}[{row}] is not finite")]
     NotFinite {
         /// The field.
@@ -79,19 +81,19 @@ pub enum Invalid {
         /// The row.
         row: usize,
     },
-    /// A finite number outside the field's range.
+    /// A finite number is outside the range of the field.
     #[error("{field}[{row}] = {value}, expected {expected}")]
     Range {
         /// The field.
         field: Field,
         /// The row.
         row: usize,
-        /// As received.
+        /// The received value.
         value: f32,
-        /// What is allowed.
+        /// The allowed range.
         expected: &'static str,
     },
-    /// A mixture's weights that do not add up to 1.
+    /// The weights of a mixture do not add up to 1.
     #[error("the weights of row {row} add up to {sum}, expected 1")]
     Weights {
         /// The row.
@@ -99,65 +101,65 @@ pub enum Invalid {
         /// Their sum.
         sum: f32,
     },
-    /// An episode's end and the next one's beginning do not match.
+    /// The end of an episode and the beginning of the next one do not match.
     #[error("valid[{row}] and first[{next}] contradict each other: an episode begins exactly after a row without a transition", next = row + 1)]
     Boundary {
         /// The row of `valid`.
         row: usize,
     },
-    /// No behaviour, or one that this learner does not know.
+    /// The behaviour is unspecified or unknown.
     #[error("the header names no known behaviour: {behaviour}")]
     Behaviour {
-        /// As received.
+        /// The received value.
         behaviour: i32,
     },
-    /// A task that the experiment does not have.
+    /// The experiment does not have the task.
     #[error("the header names task {task}, but the experiment has {tasks} tasks, counted from 0")]
     Task {
-        /// As received.
+        /// The received value.
         task: u32,
         /// Number of tasks.
         tasks: usize,
     },
-    /// A clip that does not belong to the header's task.
+    /// A clip does not belong to the task of the header.
     #[error("clip {clip} in row {row} does not belong to task {task} of the header")]
     Clip {
-        /// As received.
+        /// The received value.
         clip: u32,
         /// The row.
         row: usize,
-        /// The header's task.
+        /// The task of the header.
         task: u32,
     },
-    /// More episodes than an unroll has room for.
+    /// More episodes ended than possible in one unroll.
     #[error("{found} episodes ended in one unroll, at most {limit} can")]
     Episodes {
-        /// As received.
+        /// The received value.
         found: usize,
         /// T + 1.
         limit: usize,
     },
-    /// An episode's statistics make no sense.
+    /// The statistics of an episode are invalid.
     #[error("episode statistics: {problem}")]
     Episode {
-        /// Which number is wrong.
+        /// What is wrong.
         problem: &'static str,
     },
 }
 
-/// MuJoCo's own limit (`mjMAXVAL`): a simulation beyond it has diverged.
+/// MuJoCo's limit (`mjMAXVAL`): a simulation with larger numbers has diverged.
 const LARGEST_OBSERVATION: f32 = 1e10;
-/// No squared ratio of two of these overflows a float32 where the deviation is at least [`SMALLEST_STD`].
+/// With this limit the square of a number divided by [`SMALLEST_STD`] does not overflow a float32.
 const LARGEST_NUMBER: f32 = 1e6;
-/// Float32 sums of a softmax are this close to 1, and closer.
+/// Float32 sums of a softmax differ from 1 by less than this.
 const WEIGHTS_TOLERANCE: f32 = 1e-3;
-/// The least standard deviation an experiment may ask for.
+/// The least standard deviation that an experiment may have.
 const SMALLEST_STD: f32 = 1e-6;
 
-/// Checks header and payload of an unroll against everything both sides agreed on.
+/// Checks header and payload of an unroll against the layout and the state of the learner.
 ///
 /// # Errors
-/// The first [`Invalid`] found.
+/// The first [`Invalid`] that is found.
 pub fn validate(
     layout: &UnrollLayout,
     header: &UnrollHeader,
@@ -208,7 +210,7 @@ fn check_header(
     if header.learner_epoch > expected.epoch {
         return Err(Invalid::Epoch { found: header.learner_epoch, newest: expected.epoch });
     }
-    // Versions of another epoch cannot be compared with this one's.
+    // The versions of another epoch cannot be compared.
     if header.learner_epoch == expected.epoch && header.version > expected.newest_version {
         return Err(Invalid::Version { found: header.version, newest: expected.newest_version });
     }
@@ -224,24 +226,24 @@ fn check_header(
 fn check_episode(layout: &UnrollLayout, episode: &EpisodeStatistics, clips: &Range<usize>) -> Result<(), Invalid> {
     let end = EpisodeEnd::try_from(episode.end).unwrap_or(EpisodeEnd::Unspecified);
     let problem = if !clips.contains(&(episode.clip as usize)) {
-        "its clip does not belong to the header's task"
+        "its clip does not belong to the task of the header"
     } else if episode.steps == 0 || episode.steps_left_at_start == 0 {
         "an episode has at least one step and at least one step left at its start"
     } else if episode.returns.len() != layout.shape().reward_terms {
-        "one return for each reward term is needed"
+        "the number of returns is not the number of reward terms"
     } else if !episode.returns.iter().all(|value| value.is_finite()) {
         "a return is not finite"
     } else if !episode.head_height.is_none_or(f32::is_finite) {
-        "the head's height is not finite"
+        "the height of the head is not finite"
     } else if end == EpisodeEnd::Unspecified {
-        "how the episode ended is missing"
+        "the end of the episode is unspecified"
     } else {
         return Ok(());
     };
     Err(Invalid::Episode { problem })
 }
 
-/// The words of a field that has a few in a row.
+/// The words of a field. It allocates, so it is only for fields with few elements or invalid ones.
 fn words(layout: &UnrollLayout, payload: &Pieces, field: Field) -> Vec<u32> {
     let mut words = Vec::with_capacity(layout.elements(field));
     payload.for_each_word(layout.range(field), |word| words.push(word));
@@ -252,7 +254,8 @@ fn floats(layout: &UnrollLayout, payload: &Pieces, field: Field) -> Vec<f32> {
     words(layout, payload, field).into_iter().map(f32::from_bits).collect()
 }
 
-/// One pass finds whether all is as it should be; only when it is not does a second one look for the place.
+/// Checks that all numbers of a field are allowed. A first pass only finds whether one is not; then a second pass finds
+/// which one.
 fn check_range(
     layout: &UnrollLayout,
     payload: &Pieces,
@@ -260,15 +263,15 @@ fn check_range(
     expected: &'static str,
     allowed: impl Fn(f32) -> bool,
 ) -> Result<(), Invalid> {
-    // No early exit: without one this is a handful of vector instructions per cache line. No NaN is in any range.
-    let mut broken = false;
-    payload.for_each_word(layout.range(name), |word| broken |= !allowed(f32::from_bits(word)));
-    if !broken {
+    // Without an early exit the loop is vectorised. NaN is in no range.
+    let mut is_invalid = false;
+    payload.for_each_word(layout.range(name), |word| is_invalid |= !allowed(f32::from_bits(word)));
+    if !is_invalid {
         return Ok(());
     }
-    let place = floats(layout, payload, name).into_iter().enumerate().find(|(_, value)| !allowed(*value));
-    place.map_or(Ok(()), |(place, value)| {
-        let row = place / layout.width(name).max(1);
+    let first = floats(layout, payload, name).into_iter().enumerate().find(|(_, value)| !allowed(*value));
+    first.map_or(Ok(()), |(index, value)| {
+        let row = index / layout.width(name).max(1);
         Err(match value.is_finite() {
             true => Invalid::Range { field: name, row, value, expected },
             false => Invalid::NotFinite { field: name, row },

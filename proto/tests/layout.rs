@@ -1,4 +1,4 @@
-//! The layout: fields lie one after the other, and the hash knows every dimension.
+//! The layout: fields are contiguous, and the hash depends on every dimension.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -23,7 +23,7 @@ fn shape() -> impl Strategy<Value = UnrollShape> {
 }
 
 #[test]
-fn the_paper_s_unroll_has_the_shapes_of_experiment_and_task() {
+fn the_shapes_of_the_papers_unroll_follow_from_experiment_and_task() {
     let experiment = Experiment::default();
     let spec = TaskSpec::tracking(&Tracking::default(), vec!["walk".into()]).unwrap();
     let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
@@ -57,7 +57,7 @@ fn the_hash_is_the_same_on_every_machine_and_in_every_build() {
 }
 
 #[test]
-fn a_mixture_carries_its_components_and_an_lstm_its_memory() {
+fn a_mixture_adds_its_components_and_an_lstm_its_recurrent_state() {
     let spec = TaskSpec { action: 56, ..TaskSpec::default() };
     let mut experiment = Experiment::default();
     experiment.network.low_level = LowLevelName::Mixture;
@@ -66,14 +66,14 @@ fn a_mixture_carries_its_components_and_an_lstm_its_memory() {
     assert_eq!([Field::Action, Field::LogWeights, Field::State].map(|field| layout.width(field)), [56, 5, 0]);
     experiment.network.low_level = LowLevelName::Lstm;
     let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
-    // A hidden and a cell state of 384 and 256 units.
+    // Hidden state and cell state of 384 and 256 units.
     assert_eq!((layout.rows(Field::State), layout.width(Field::State)), (1, 2 * (384 + 256)));
     assert_eq!([Field::Mean, Field::LogWeights].map(|field| layout.width(field)), [56, 0]);
 }
 
 proptest! {
     #[test]
-    fn fields_lie_one_after_the_other_without_a_gap(shape in shape()) {
+    fn fields_are_contiguous_without_gaps(shape in shape()) {
         let layout = UnrollLayout::new(shape);
         let mut end = 0;
         for field in Field::ALL {
@@ -105,7 +105,7 @@ proptest! {
     }
 
     #[test]
-    fn dimensions_beyond_any_memory_do_not_overflow(length in any::<usize>(), width in any::<usize>()) {
+    fn huge_dimensions_do_not_overflow(length in any::<usize>(), width in any::<usize>()) {
         let shape = UnrollShape {
             length, proprioception: width, task: width, action: width, latent: width, reward_terms: width, image: 0, components: width,
             state: width,
@@ -116,7 +116,7 @@ proptest! {
 }
 
 #[test]
-fn images_travel_as_bytes_and_keep_every_row_aligned() {
+fn images_are_bytes_and_keep_every_row_aligned() {
     let mut spec = TaskSpec { image: 64 * 64 * 3, ..TaskSpec::default() };
     let experiment = Experiment::default();
     let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));

@@ -1,4 +1,4 @@
-//! What comes in pieces means what it would mean in one, wherever it was cut.
+//! Bytes in pieces have the same meaning as in one piece, for all positions of the cuts.
 
 use bytes::{Buf, Bytes};
 use comic_proto::v1::{EpisodeStatistics, UnrollHeader, UnrollMessage};
@@ -6,20 +6,21 @@ use comic_proto::{Pieces, ReceivedUnroll};
 use proptest::prelude::*;
 use prost::Message as _;
 
-/// Cut again and again after each of these lengths in turn, and kept as they are or put together anew.
-fn cut(bytes: &[u8], (lengths, anew): &(Vec<usize>, bool)) -> Pieces {
+/// The bytes, cut into pieces of these lengths, which repeat. If `push` is true, the pieces are pushed one by one;
+/// otherwise all are kept.
+fn cut(bytes: &[u8], (lengths, push): &(Vec<usize>, bool)) -> Pieces {
     let (mut pieces, mut rest, mut lengths) = (Vec::new(), bytes, lengths.iter().cycle());
     while !rest.is_empty() {
         let length = lengths.next().map_or(rest.len(), |length| rest.len().min(*length));
         pieces.push(Bytes::copy_from_slice(&rest[..length]));
         rest = &rest[length..];
     }
-    if !anew {
+    if !push {
         return pieces.into_iter().collect();
     }
-    let mut arrived = Pieces::default();
-    pieces.into_iter().for_each(|piece| arrived.push(piece));
-    arrived
+    let mut pushed = Pieces::default();
+    pieces.into_iter().for_each(|piece| pushed.push(piece));
+    pushed
 }
 
 fn whole(mut pieces: Pieces) -> Vec<u8> {
@@ -32,7 +33,7 @@ fn lengths() -> impl Strategy<Value = (Vec<usize>, bool)> {
     (lengths, any::<bool>())
 }
 
-/// Some that lie in small pieces alone, and some that do not.
+/// Bytes that fit into small pieces, and longer ones.
 fn bytes() -> impl Strategy<Value = Vec<u8>> {
     let length = prop_oneof![0usize..20_000, Pieces::KEPT..3 * Pieces::KEPT];
     (length, any::<u8>()).prop_map(|(length, salt)| (0..length).map(|i| (i % 251) as u8 ^ salt).collect())
@@ -58,7 +59,7 @@ fn header() -> impl Strategy<Value = Option<UnrollHeader>> {
 }
 
 #[test]
-fn a_large_piece_is_never_copied_whatever_small_ones_lie_around_it() {
+fn a_large_piece_between_small_ones_is_not_copied() {
     let large = Bytes::from(vec![1; Pieces::KEPT]);
     let mut pieces = Pieces::default();
     for length in (1..300).rev() {
@@ -76,7 +77,7 @@ fn a_large_piece_is_never_copied_whatever_small_ones_lie_around_it() {
 }
 
 #[test]
-fn a_small_piece_keeps_nothing_of_the_buffer_it_came_in() {
+fn a_small_piece_does_not_keep_its_buffer() {
     let buffer = Bytes::from(vec![1; 4 * Pieces::KEPT]);
     let mut pieces = Pieces::default();
     pieces.push(buffer.slice(..Pieces::KEPT - 1));
@@ -87,7 +88,7 @@ fn a_small_piece_keeps_nothing_of_the_buffer_it_came_in() {
 }
 
 #[test]
-fn a_field_of_the_wrong_type_or_without_an_end_is_no_unroll() {
+fn fields_with_a_wrong_type_and_truncated_messages_are_refused() {
     for bytes in [
         &b"\x08\x01"[..],
         b"\x11",
@@ -103,7 +104,7 @@ fn a_field_of_the_wrong_type_or_without_an_end_is_no_unroll() {
 
 proptest! {
     #[test]
-    fn an_unroll_in_pieces_is_the_one_that_was_sent(
+    fn an_unroll_in_pieces_equals_the_sent_one(
         header in header(),
         payload in bytes(),
         lengths in lengths(),
@@ -115,7 +116,7 @@ proptest! {
     }
 
     #[test]
-    fn of_any_bytes_the_generated_type_says_the_same(
+    fn random_bytes_are_decoded_like_by_the_generated_type(
         bytes in prop::collection::vec(prop_oneof![any::<u8>(), 0u8..32], 0..60),
         lengths in lengths(),
     ) {
@@ -123,17 +124,17 @@ proptest! {
         match ReceivedUnroll::decode(cut(&bytes, &lengths)) {
             Ok(ours) => {
                 let theirs = theirs.unwrap();
-                // NaN differs from itself.
+                // NaN is not equal to itself, so the texts are compared.
                 prop_assert_eq!(format!("{:?}", ours.header), format!("{:?}", theirs.header));
                 prop_assert_eq!(whole(ours.payload), theirs.payload.to_vec());
             }
-            // Groups, which nobody sends, are all that only the generated type takes.
-            Err(error) => prop_assert!(theirs.is_err() || error.to_string().contains("no type"), "{}", error),
+            // Only groups are accepted by the generated type and refused here. They are not used.
+            Err(error) => prop_assert!(theirs.is_err() || error.to_string().contains("wire type"), "{}", error),
         }
     }
 
     #[test]
-    fn pieces_are_split_copied_and_read_like_the_whole(
+    fn pieces_are_split_copied_and_read_like_one_piece(
         bytes in bytes(),
         lengths in lengths(),
         (from, to) in (0usize..400_000, 0usize..400_000),

@@ -1,4 +1,4 @@
-//! What an actor writes is what a learner reads.
+//! A learner reads what an actor wrote.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -19,13 +19,13 @@ fn layout() -> UnrollLayout {
     })
 }
 
-/// A number that tells field, row and column apart.
+/// A number that identifies field, row and column.
 fn mark(field: Field, t: usize, column: usize) -> f32 {
     (field as usize * 10_000 + t * 100 + column) as f32
 }
 
 #[test]
-fn every_element_lies_at_its_own_place_little_endian() {
+fn every_element_is_at_its_position_little_endian() {
     let layout = layout();
     let mut unroll = UnrollBuffer::new(&layout);
     for field in Field::ALL.into_iter().filter(|field| *field != Field::Clip) {
@@ -42,9 +42,9 @@ fn every_element_lies_at_its_own_place_little_endian() {
     assert_eq!(payload.len(), layout.size());
     for field in Field::ALL {
         let width = layout.width(field);
-        for (place, bytes) in payload[layout.range(field)].chunks(4).enumerate() {
+        for (index, bytes) in payload[layout.range(field)].chunks(4).enumerate() {
             let word = u32::from_le_bytes(bytes.try_into().unwrap());
-            let (t, column) = (place / width, place % width);
+            let (t, column) = (index / width, index % width);
             let expected = if field == Field::Clip { t as u32 + 40 } else { mark(field, t, column).to_bits() };
             assert_eq!(word, expected, "{field}[{t}][{column}]");
         }
@@ -53,7 +53,7 @@ fn every_element_lies_at_its_own_place_little_endian() {
 }
 
 #[test]
-fn a_cleared_buffer_is_a_new_one() {
+fn a_cleared_buffer_equals_a_new_one() {
     let layout = layout();
     let mut unroll = UnrollBuffer::new(&layout);
     unroll.row_mut(Field::Task, 1).fill(3.0);
@@ -67,11 +67,11 @@ fn a_cleared_buffer_is_a_new_one() {
 
 proptest! {
     #[test]
-    fn any_payload_of_the_right_length_survives_the_round_trip(
+    fn any_payload_of_the_right_length_is_unchanged_by_a_round_trip(
         bytes in prop::collection::vec(any::<u8>(), layout().size()),
         offset in 0usize..4,
     ) {
-        // The network aligns nothing.
+        // Received payloads are not aligned.
         let mut shifted = vec![0; offset];
         shifted.extend(&bytes);
         let unroll = UnrollBuffer::from_payload(&layout(), &shifted[offset..]).unwrap();
@@ -80,7 +80,7 @@ proptest! {
     }
 
     #[test]
-    fn no_other_length_is_an_unroll(bytes in prop::collection::vec(any::<u8>(), 0..2000)) {
+    fn every_other_length_is_refused(bytes in prop::collection::vec(any::<u8>(), 0..2000)) {
         prop_assume!(bytes.len() != layout().size());
         let found = bytes.len();
         let refused = UnrollBuffer::from_payload(&layout(), &bytes).err();
@@ -89,7 +89,7 @@ proptest! {
 }
 
 #[test]
-fn images_come_back_as_they_were_written() {
+fn images_are_read_as_they_were_written() {
     let layout = UnrollLayout::new(UnrollShape { image: 8, ..*layout().shape() });
     let mut unroll = UnrollBuffer::new(&layout);
     for t in 0..layout.rows(Field::Image) {

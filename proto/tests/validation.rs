@@ -1,4 +1,4 @@
-//! Whatever comes off the wire is either an unroll that makes sense or is refused by name.
+//! A received unroll is valid, or it is refused with the reason.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -47,7 +47,7 @@ fn header() -> UnrollHeader {
     }
 }
 
-/// An episode ends in row 1, the next begins in row 2.
+/// A valid unroll: an episode ends in row 1, the next one begins in row 2.
 fn unroll() -> UnrollBuffer {
     let mut unroll = UnrollBuffer::new(&layout());
     for t in 0..4 {
@@ -78,7 +78,7 @@ fn payload_refusal(change: impl FnOnce(&mut UnrollBuffer)) -> Option<Invalid> {
 }
 
 #[test]
-fn an_unroll_that_makes_sense_passes() {
+fn a_valid_unroll_is_accepted() {
     assert_eq!(refusal(&header(), &unroll()), None);
 }
 
@@ -88,7 +88,7 @@ fn an_unroll_may_begin_in_the_middle_of_an_episode_or_with_its_first_observation
 }
 
 #[test]
-fn an_unroll_is_of_one_task() {
+fn an_unroll_belongs_to_one_task() {
     let second = |episode: u32| {
         let (mut header, mut unroll) = (header(), unroll());
         (0..5).for_each(|t| unroll.set_clip(t, 3));
@@ -96,8 +96,8 @@ fn an_unroll_is_of_one_task() {
         header.episodes[0].clip = episode;
         refusal(&header, &unroll)
     };
-    assert_eq!(second(3), None, "the second task's one clip");
-    assert!(matches!(second(1), Some(Invalid::Episode { .. })), "an episode of the first task's");
+    assert_eq!(second(3), None, "the only clip of the second task");
+    assert!(matches!(second(1), Some(Invalid::Episode { .. })), "an episode of the first task");
     assert_eq!(payload_refusal(|unroll| unroll.set_clip(4, 3)), Some(Invalid::Clip { clip: 3, row: 4, task: 0 }));
     assert_eq!(payload_refusal(|unroll| unroll.set_clip(0, 3)), Some(Invalid::Clip { clip: 3, row: 0, task: 0 }));
     assert_eq!(payload_refusal(|unroll| unroll.set_clip(4, 4)), Some(Invalid::Clip { clip: 4, row: 4, task: 0 }));
@@ -120,7 +120,7 @@ fn a_wrong_task_in_the_header_is_refused() {
 }
 
 #[test]
-fn padding_up_to_the_end_passes_and_repeats_the_observation_before_it() {
+fn padding_repeats_the_previous_observation_and_is_valid() {
     let mut unroll = unroll();
     unroll.row_mut(Field::Proprioception, 2).fill(0.25);
     unroll.row_mut(Field::Valid, 2)[0] = 0.0;
@@ -148,19 +148,19 @@ fn another_layout_is_refused() {
 }
 
 #[test]
-fn the_future_is_refused_and_the_past_is_not_this_check_s_affair() {
+fn future_epochs_and_versions_are_refused_and_past_ones_are_valid() {
     assert_eq!(header_refusal(|header| header.learner_epoch = 3), Some(Invalid::Epoch { found: 3, newest: 2 }));
     assert_eq!(header_refusal(|header| header.version = 10), Some(Invalid::Version { found: 10, newest: 9 }));
     assert_eq!(header_refusal(|header| header.version = 0), None);
     assert_eq!(
         header_refusal(|header| (header.learner_epoch, header.version) = (1, 1000)),
         None,
-        "another epoch's versions say nothing here"
+        "versions of another epoch are not compared"
     );
 }
 
 #[test]
-fn a_sequence_number_no_actor_can_have_reached_is_refused() {
+fn a_sequence_number_that_no_actor_can_have_reached_is_refused() {
     assert_eq!(header_refusal(|header| header.sequence = MAX_SEQUENCE - 1), None);
     assert_eq!(
         header_refusal(|header| header.sequence = MAX_SEQUENCE),
@@ -169,7 +169,7 @@ fn a_sequence_number_no_actor_can_have_reached_is_refused() {
 }
 
 #[test]
-fn episode_statistics_are_limited_in_number_and_have_to_make_sense() {
+fn episode_statistics_are_limited_in_number_and_checked() {
     let episode = |change: fn(&mut EpisodeStatistics)| header_refusal(|header| change(&mut header.episodes[0]));
     assert_eq!(
         header_refusal(|header| header.episodes = vec![header.episodes[0].clone(); 6]),
@@ -191,7 +191,7 @@ fn episode_statistics_are_limited_in_number_and_have_to_make_sense() {
 }
 
 #[test]
-fn numbers_that_are_not_finite_are_refused_wherever_they_stand() {
+fn numbers_that_are_not_finite_are_refused_in_every_field() {
     for field in Field::ALL.into_iter().filter(|field| !matches!(field, Field::Clip | Field::Image)) {
         for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             let row = layout().rows(field) - 1;
@@ -202,7 +202,7 @@ fn numbers_that_are_not_finite_are_refused_wherever_they_stand() {
 }
 
 #[test]
-fn each_field_keeps_to_its_range() {
+fn numbers_outside_the_range_of_their_field_are_refused() {
     let cases =
         [(Field::Std, 0.0), (Field::Std, -1.0), (Field::Discount, 1.5), (Field::Valid, 0.5), (Field::First, 2.0)];
     for (name, number) in cases {
@@ -216,13 +216,13 @@ fn each_field_keeps_to_its_range() {
 }
 
 #[test]
-fn the_weights_of_a_mixture_add_up_to_one() {
+fn the_weights_of_a_mixture_must_add_up_to_one() {
     let weights = |weights: [f32; 3]| {
         payload_refusal(|unroll| unroll.row_mut(Field::LogWeights, 2).copy_from_slice(&weights.map(f32::ln)))
     };
     assert_eq!(weights([0.2, 0.3, 0.5]), None);
     assert!(matches!(weights([0.2, 0.3, 0.6]), Some(Invalid::Weights { row: 2, .. })));
-    // A weight of zero has no finite logarithm; one that float32 rounds to zero has.
+    // A weight of 0 has no finite logarithm, but a weight that float32 rounds to 0 has one.
     assert_eq!(
         payload_refusal(|unroll| unroll.row_mut(Field::LogWeights, 0).copy_from_slice(&[0.0, -200.0, -1e5])),
         None
@@ -230,13 +230,13 @@ fn the_weights_of_a_mixture_add_up_to_one() {
 }
 
 #[test]
-fn an_episode_begins_exactly_after_a_row_without_a_transition() {
+fn an_episode_must_begin_exactly_after_a_row_without_a_transition() {
     assert_eq!(payload_refusal(|unroll| unroll.row_mut(Field::First, 2)[0] = 0.0), Some(Invalid::Boundary { row: 1 }));
     assert_eq!(payload_refusal(|unroll| unroll.row_mut(Field::First, 4)[0] = 1.0), Some(Invalid::Boundary { row: 3 }));
 }
 
 #[test]
-fn a_clip_the_task_does_not_have_is_refused_even_if_its_bits_were_no_number() {
+fn a_clip_that_the_task_does_not_have_is_refused_also_if_its_bits_are_nan() {
     let refused = |clip| payload_refusal(|unroll| unroll.set_clip(4, clip));
     assert_eq!(refused(4), Some(Invalid::Clip { clip: 4, row: 4, task: 0 }));
     assert_eq!(refused(u32::MAX), Some(Invalid::Clip { clip: u32::MAX, row: 4, task: 0 }));
@@ -244,7 +244,7 @@ fn a_clip_the_task_does_not_have_is_refused_even_if_its_bits_were_no_number() {
 
 proptest! {
     #[test]
-    fn bytes_at_random_never_panic(
+    fn random_bytes_do_not_panic(
         payload in prop::collection::vec(any::<u8>(), 0..600),
         hash in prop::collection::vec(any::<u8>(), 0..40),
         message in prop::collection::vec(any::<u8>(), 0..300),
@@ -260,7 +260,7 @@ proptest! {
     }
 
     #[test]
-    fn one_flipped_bit_passes_only_where_the_number_still_makes_sense(
+    fn an_unroll_with_a_flipped_bit_is_accepted_only_if_the_number_is_valid(
         place in 0..layout().size(),
         bit in 0u8..8,
     ) {
@@ -279,7 +279,7 @@ proptest! {
     }
 
     #[test]
-    fn a_payload_in_pieces_is_judged_like_the_whole(
+    fn a_payload_in_pieces_is_validated_like_one_piece(
         place in 0..layout().size(),
         bit in 0u8..8,
         words in prop::collection::vec((0..layout().size() / 4, prop_oneof![Just(f32::NAN), Just(2.0), Just(0.0)]), 0..3),
@@ -299,7 +299,7 @@ proptest! {
     }
 
     #[test]
-    fn any_length_but_the_layout_s_is_refused(length in 0usize..2000) {
+    fn every_length_except_the_layouts_is_refused(length in 0usize..2000) {
         prop_assume!(length != layout().size());
         let refused = validate(&layout(), &header(), &Bytes::from(vec![0; length]).into(), &EXPECTED).err();
         prop_assert_eq!(refused, Some(Invalid::Length { found: length, expected: layout().size() }));

@@ -1,88 +1,47 @@
-//! Where network tasks and the trainer meet.
+//! The assembly of batches, between service and trainer.
 
 use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use comic_proto::v1::{Behaviour, UnrollHeader};
+use comic_proto::v1::UnrollHeader;
 use comic_proto::{Pieces, UnrollLayout};
 use parking_lot::{Condvar, Mutex, MutexGuard};
 use tokio::sync::Semaphore;
 
-use crate::batch::{Batch, Buffer};
-use crate::ledger::{Accounting, JoinError, Joined, Ledger, Reason, Sighting};
-use crate::snapshot::Snapshot;
-use crate::tasks::AccountingByTask;
+use crate::accounting::{Accounting, AccountingByTask, Reason};
+use crate::batch::{Batch, TakeBack};
+use crate::buffer::Buffer;
+use crate::config::{BatchOrder, Config};
+use crate::ledger::{JoinError, Joined, Ledger, SequenceStatus};
+use crate::phase::Phase;
+use crate::snapshot::LedgerSnapshot;
 
-/// What does not change while a batcher lives.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Config {
-    /// B: unrolls a batch, at least 1.
-    pub unrolls: usize,
-    /// An unroll may be so many published versions old, when it comes and when its batch is handed out.
-    pub max_staleness: u64,
-    /// Batches that may be assembled while one is trained on. With 0 nothing is taken meanwhile, and what waits is as
-    /// fresh as can be; with 1 the next batch is ready when the trainer is.
-    pub ahead: usize,
-    /// In which order unrolls stand in a batch.
-    pub order: BatchOrder,
-}
-
-/// Which slot of a batch an unroll takes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum BatchOrder {
-    /// The next one: first come, first served.
-    Arrival,
-    /// That of its environment's number. A batch has one unroll of each of B environments, and no order of arrival can
-    /// be told from it.
-    Environment,
-}
-
-/// What the trainer wants at this moment.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Phase {
-    /// The learner's epoch.
-    pub epoch: u64,
-    /// The newest published version; versions count publications.
-    pub version: u64,
-    /// Unrolls of versions before this one are superseded: they were made under other conditions.
-    pub oldest: u64,
-    /// Unrolls of the other behaviour are superseded.
-    pub behaviour: Behaviour,
-}
-
-impl Phase {
-    /// The phase in which an epoch of the learner begins: nothing is published yet, and the policy acts.
-    pub fn begin(epoch: u64) -> Self {
-        Self { epoch, version: 0, oldest: 0, behaviour: Behaviour::Policy }
-    }
-}
-
-/// What became of an unroll.
+/// The result of inserting an unroll.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
-    /// It is in a batch.
+    /// The unroll is in a batch.
     Taken,
-    /// Dropped: its parameters are too old.
+    /// Dropped: its parameters were too old.
     Stale,
-    /// Dropped: it is no unroll of this layout, or was refused as invalid.
+    /// Dropped: it does not have this layout, or was refused as invalid.
     Invalid,
-    /// Dropped: of another epoch or phase.
+    /// Dropped: it was made in another epoch or phase.
     Superseded,
-    /// Accounted for before.
+    /// It is a duplicate of an unroll of the accounting.
     Duplicate,
-    /// This actor and incarnation have no account: they have to join first.
+    /// Actor and incarnation have no account; the actor must join first.
     NotJoined,
     /// The batcher is closed; nothing was recorded.
     Closed,
 }
 
-/// What waiting for a batch led to.
+/// The result of waiting for a batch.
 #[derive(Debug)]
 pub enum Next {
     /// A full batch.
     Batch(Batch),
-    /// The time is over.
+    /// The time has elapsed.
     Elapsed,
     /// The batcher is closed.
     Closed,
@@ -91,9 +50,9 @@ pub enum Next {
 struct State {
     ledger: Ledger,
     phase: Phase,
-    /// The batch that is handed out next: it was full once, and unrolls that grew too old in it leave slots.
+    /// The batch that the trainer gets next. It was full; stale unrolls may have left free slots.
     next: Option<Buffer>,
-    /// What is filled when the next one is full.
+    /// The batch that is filled while `next` is full.
     open: Option<Buffer>,
     free: Vec<Buffer>,
     closed: bool,
@@ -102,24 +61,25 @@ struct State {
 struct Inner {
     layout: Arc<UnrollLayout>,
     config: Config,
-    /// Everything that must agree with everything else stands behind this one lock.
+    /// One lock protects all mutable state, so it is always consistent.
     state: Mutex<State>,
-    /// A permit for each slot of the next and the open batch that is neither filled nor promised to somebody: first
-    /// come, first served, and a waiting insert costs no memory but its own.
+    /// One permit for each slot of `next` and `open` that is neither filled nor reserved by an insert. Inserts get
+    /// permits in the order in which they wait. A waiting insert needs only its own memory.
     slots: Semaphore,
     filled: Condvar,
 }
 
-/// Bounded, exactly-once assembly of batches; a handle that can be cloned. See the crate's rules.
+/// Assembles batches in bounded memory, with each unroll in at most one batch. A batcher is a handle that can be
+/// cloned. The documentation of the crate has the rules.
 #[derive(Clone)]
 pub struct Batcher {
     inner: Arc<Inner>,
 }
 
 impl Batcher {
-    /// An empty batcher that carries on these accounting.
+    /// An empty batcher that continues the accounting of `ledger`.
     pub fn new(layout: Arc<UnrollLayout>, config: Config, phase: Phase, ledger: Ledger) -> Self {
-        // An environment's next unroll is of the next batch, which has to wait.
+        // The next unroll of an environment belongs to the next batch, so no batch can be assembled ahead.
         let ahead = if config.order == BatchOrder::Environment { 0 } else { config.ahead };
         let config = Config { unrolls: config.unrolls.max(1), ahead, ..config };
         let mut free: Vec<_> = (0..=config.ahead).map(|_| Buffer::new(&layout, config.unrolls)).collect();
@@ -129,10 +89,10 @@ impl Batcher {
         Self { inner: Arc::new(Inner { layout, config, state, slots, filled: Condvar::new() }) }
     }
 
-    /// Opens an account, or finds the one this incarnation has; see [`Ledger::join`].
+    /// Opens an account, or finds the account of this incarnation. See [`Ledger::join`].
     ///
     /// # Errors
-    /// [`JoinError::Closed`] when it had an account that was closed.
+    /// [`JoinError::Closed`] if its account was closed.
     pub fn join(&self, incarnation: u64, claimed: Option<u64>) -> Result<Joined, JoinError> {
         self.lock().ledger.join(incarnation, claimed)
     }
@@ -142,12 +102,12 @@ impl Batcher {
         self.lock().ledger.catch_up(actor, sequence)
     }
 
-    /// Puts a validated unroll into a batch, waiting for a slot as long as it takes, or says why not.
+    /// Puts a validated unroll into a batch. If no slot is free, it waits, without a time limit.
     ///
-    /// Cancel-safe: until it returns, nothing has happened.
+    /// It is cancel-safe: nothing has happened until it returns.
     pub async fn insert(&self, header: &UnrollHeader, payload: impl Into<Pieces>) -> Outcome {
         let payload = payload.into();
-        // What is refused anyway does not queue for a slot.
+        // An unroll that is refused need not wait for a slot.
         if let Some(outcome) = self.refuse(&mut self.lock(), header, &payload) {
             return outcome;
         }
@@ -159,7 +119,7 @@ impl Batcher {
         let State { ledger, next, open, .. } = &mut *state;
         let unfilled = [next, open].into_iter().flatten().find(|batch| !batch.is_full());
         let Some(batch) = unfilled else { return Outcome::Closed };
-        let place = match self.inner.config.order {
+        let index = match self.inner.config.order {
             BatchOrder::Arrival => batch.first_free(),
             BatchOrder::Environment => header.environment as usize,
         };
@@ -167,14 +127,14 @@ impl Batcher {
             ledger.refuse();
             return Outcome::Invalid;
         }
-        batch.put(&self.inner.layout, place, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
+        batch.put(&self.inner.layout, index, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
         slot.forget();
         self.settle(&mut state);
         Outcome::Taken
     }
 
-    /// Records an unroll that failed validation: dropped as invalid if its header has an account, or else refused
-    /// without one.
+    /// Records an unroll that failed validation. It is dropped as invalid if its header has an account; otherwise it is
+    /// counted as unattributed.
     pub fn refuse_invalid(&self, header: &UnrollHeader) -> Outcome {
         let mut state = self.lock();
         if state.closed {
@@ -186,29 +146,28 @@ impl Batcher {
         drop_unroll(&mut state.ledger, header, None, Reason::Invalid)
     }
 
-    /// Counts a message without so much as a header.
+    /// Counts a message without a header as unattributed.
     pub fn refuse_unattributed(&self) {
         self.lock().ledger.refuse();
     }
 
-    /// Says what is wanted from now on. What waits in the batcher for another epoch or phase is superseded.
+    /// Begins a phase. Waiting unrolls of another epoch or phase are dropped as superseded.
     pub fn set_phase(&self, phase: Phase) {
         let mut state = self.lock();
         let terms = |phase: Phase| (phase.epoch, phase.oldest, phase.behaviour);
-        let over = terms(state.phase) != terms(phase);
+        let has_changed = terms(state.phase) != terms(phase);
         state.phase = phase;
-        if !over {
-            return;
+        if has_changed {
+            self.drop_waiting(&mut state, Reason::Superseded, |_| true);
         }
-        self.drop_waiting(&mut state, Reason::Superseded, |_| true);
     }
 
-    /// What is wanted at this moment.
+    /// The phase at this moment.
     pub fn phase(&self) -> Phase {
         self.lock().phase
     }
 
-    /// The next full batch; blocks the calling thread. `None` once the batcher is closed.
+    /// The next full batch; `None` if the batcher is closed. Blocks the calling thread.
     pub fn next_batch(&self) -> Option<Batch> {
         loop {
             match self.next_batch_within(Duration::MAX) {
@@ -219,10 +178,10 @@ impl Batcher {
         }
     }
 
-    /// The next full batch, if there is one within this time; blocks the calling thread.
-    pub fn next_batch_within(&self, patience: Duration) -> Next {
-        // Patience beyond what the clock can express is no deadline.
-        let deadline = Instant::now().checked_add(patience);
+    /// The next full batch, if there is one within this time. Blocks the calling thread.
+    pub fn next_batch_within(&self, timeout: Duration) -> Next {
+        // A timeout that is too long for the clock is no deadline.
+        let deadline = Instant::now().checked_add(timeout);
         let mut state = self.lock();
         loop {
             if state.closed {
@@ -232,7 +191,7 @@ impl Batcher {
                 state.ledger.hand_out(buffer.tasks());
                 self.settle(&mut state);
                 drop(state);
-                return Next::Batch(Batch::new(self.inner.layout.clone(), buffer, self.clone()));
+                return Next::Batch(Batch::new(self.inner.layout.clone(), buffer, Box::new(self.clone())));
             }
             let left = deadline.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
             if left.is_zero() {
@@ -242,12 +201,12 @@ impl Batcher {
         }
     }
 
-    /// Accounting a batch as trained on and takes its memory back.
+    /// Accounts for a batch as trained on, and reuses its memory.
     pub fn trained(&self, batch: Batch) {
         batch.finish(None);
     }
 
-    /// Accounting a batch as dropped for this reason and takes its memory back.
+    /// Accounts for a batch as dropped for this reason, and reuses its memory.
     pub fn discard(&self, batch: Batch, reason: Reason) {
         batch.finish(Some(reason));
     }
@@ -257,14 +216,14 @@ impl Batcher {
         self.accounting_by_task().all
     }
 
-    /// The accounting at this moment, and each task's.
+    /// The accounting at this moment, in total and of each task.
     pub fn accounting_by_task(&self) -> AccountingByTask {
         let state = self.lock();
         state.ledger.accounting(state.waiting())
     }
 
-    /// Accounting and accounts for a checkpoint.
-    pub fn snapshot(&self) -> Snapshot {
+    /// The ledger for a checkpoint.
+    pub fn snapshot(&self) -> LedgerSnapshot {
         let state = self.lock();
         state.ledger.snapshot(state.waiting())
     }
@@ -274,32 +233,23 @@ impl Batcher {
         &self.inner.layout
     }
 
-    /// Ends all waiting, of inserts and of the trainer, now and for ever.
+    /// Closes the batcher: inserts and the trainer stop waiting, and all later calls return at once.
     pub fn close(&self) {
         self.lock().closed = true;
         self.inner.slots.close();
         self.inner.filled.notify_all();
     }
 
-    /// Whether all waiting has ended.
+    /// Whether the batcher is closed.
     pub fn is_closed(&self) -> bool {
         self.lock().closed
-    }
-
-    /// Takes a buffer back from a [`Batch`] whose unrolls were trained on, or dropped for a reason.
-    pub(crate) fn take_back(&self, mut buffer: Buffer, end: Option<Reason>) {
-        let mut state = self.lock();
-        buffer.tasks().for_each(|task| state.ledger.take_back(task, end));
-        buffer.clear();
-        state.free.push(buffer);
-        self.settle(&mut state);
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
         self.inner.state.lock()
     }
 
-    /// Applies every rule that keeps an unroll out of a batch. `None`, and nothing recorded, if there is none.
+    /// Applies every rule that keeps an unroll out of a batch. Returns `None` and records nothing if no rule applies.
     fn refuse(&self, state: &mut State, header: &UnrollHeader, payload: &Pieces) -> Option<Outcome> {
         if state.closed {
             return Some(Outcome::Closed);
@@ -320,14 +270,14 @@ impl Batcher {
         } else {
             return None;
         };
-        // An invalid header says nothing. The tasks of another epoch may have had other numbers.
+        // The task of an invalid header is unknown. In another epoch the tasks may have had other numbers.
         let has_task = header.learner_epoch == epoch && reason != Reason::Invalid;
         let task = has_task.then_some(header.task);
         Some(drop_unroll(&mut state.ledger, header, task, reason))
     }
 
-    /// Drops unrolls that wait in the batcher. Their slots are free again; those promised to waiting inserts stay
-    /// promised. What is left of the open batch makes the next one full.
+    /// Drops unrolls that wait in the batcher and frees their slots. Reservations of waiting inserts stay. The
+    /// remaining unrolls of the open batch fill the next one.
     fn drop_waiting(&self, state: &mut State, reason: Reason, dropped: impl Fn(&UnrollHeader) -> bool) {
         let (layout, State { ledger, next, open, .. }) = (&self.inner.layout, state);
         let waiting = [&mut *next, &mut *open].into_iter().flatten();
@@ -339,7 +289,7 @@ impl Batcher {
         removed.into_iter().for_each(|task| ledger.end(Some(task), Some(reason)));
     }
 
-    /// The next batch, if it is full without what grew too old while it waited.
+    /// The next batch, if it is full after stale unrolls are dropped.
     fn take_next(&self, state: &mut State) -> Option<Buffer> {
         state.next.as_ref()?.is_full().then_some(())?;
         let version = state.phase.version;
@@ -351,7 +301,7 @@ impl Batcher {
         version.saturating_sub(header.version) > self.inner.config.max_staleness
     }
 
-    /// Whether there can be a slot for an unroll of this environment.
+    /// Whether an unroll of this environment can get a slot.
     fn has_room_for(&self, state: &State, header: &UnrollHeader) -> bool {
         let BatchOrder::Environment = self.inner.config.order else { return true };
         let environment = header.environment as usize;
@@ -360,7 +310,8 @@ impl Batcher {
             && waiting.filter(|batch| !batch.is_full()).all(|batch| batch.is_free(environment))
     }
 
-    /// Moves buffers on: a filled open batch becomes the next one when there is none, and a free buffer the open one.
+    /// Moves buffers: a full open batch becomes the next one if there is none, and a free buffer becomes the open
+    /// batch.
     fn settle(&self, state: &mut State) {
         if state.next.is_none() {
             state.next = state.open.take_if(|open| open.is_full());
@@ -377,31 +328,43 @@ impl Batcher {
     }
 }
 
+impl TakeBack for Batcher {
+    fn take_back(&self, mut buffer: Buffer, dropped: Option<Reason>) {
+        let mut state = self.lock();
+        buffer.tasks().for_each(|task| state.ledger.take_back(task, dropped));
+        buffer.clear();
+        state.free.push(buffer);
+        self.settle(&mut state);
+    }
+}
+
 impl State {
-    /// Tasks of the unrolls that wait for the trainer.
+    /// The tasks of the unrolls that wait for the trainer.
     fn waiting(&self) -> impl Iterator<Item = u32> {
         [&self.next, &self.open].into_iter().flatten().flat_map(Buffer::tasks)
     }
 }
 
+/// Refuses and counts an unroll that its account does not expect; `None` if it is new.
 fn refuse_unaccountable(ledger: &mut Ledger, header: &UnrollHeader) -> Option<Outcome> {
-    match ledger.sight(header.actor, header.incarnation, header.sequence) {
-        Sighting::New => None,
-        Sighting::Duplicate => {
+    match ledger.status(header.actor, header.incarnation, header.sequence) {
+        SequenceStatus::New => None,
+        SequenceStatus::Duplicate => {
             ledger.repeat();
             Some(Outcome::Duplicate)
         }
-        Sighting::Broken => {
+        SequenceStatus::OutOfRange => {
             ledger.refuse();
             Some(Outcome::Invalid)
         }
-        Sighting::Unknown => {
+        SequenceStatus::Unknown => {
             ledger.refuse();
             Some(Outcome::NotJoined)
         }
     }
 }
 
+/// Records an unroll as dropped.
 fn drop_unroll(ledger: &mut Ledger, header: &UnrollHeader, task: Option<u32>, reason: Reason) -> Outcome {
     if !ledger.record(header.actor, header.sequence, task) {
         ledger.refuse();

@@ -1,135 +1,61 @@
-//! Who sent what, and what became of it.
+//! The accounts of the actors, and the sums.
 
 use std::collections::{BTreeMap, HashMap};
 
 use comic_proto::MAX_SEQUENCE;
-use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::tasks::{AccountingByTask, TaskAccounting, Tasks};
+use crate::accounting::{Accounting, AccountingByTask, Reason, TaskAccounting};
+use crate::tasks::Tasks;
 
-/// Sums over every unroll ever produced for this run.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Accounting {
-    /// Unrolls the sequence numbers speak of.
-    pub produced: u64,
-    /// Unrolls trained on.
-    pub trained: u64,
-    /// Unrolls that never will be, by reason.
-    pub dropped: Dropped,
-    /// Unrolls in a batch that is open, full, or being trained on.
-    pub in_flight: u64,
-    /// Messages that repeated an unroll already accounted for; not in the sum.
-    pub duplicates: u64,
-    /// Messages refused without an account to charge; not in the sum.
-    pub unattributed: u64,
-}
-
-impl Accounting {
-    /// Whether `produced = trained + dropped + in flight`.
-    pub fn balance(&self) -> bool {
-        self.dropped.add_to([self.trained, self.in_flight]) == Some(self.produced)
-    }
-}
-
-/// Dropped unrolls by reason.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Dropped {
-    /// Made with parameters older than the experiment allows.
-    pub stale: u64,
-    /// Failed validation.
-    pub invalid: u64,
-    /// Made in another epoch, or for a phase that is over.
-    pub superseded: u64,
-    /// Taken by, or sent to, a life of the learner that ended before it trained on them.
-    pub lost_at_restart: u64,
-}
-
-impl Dropped {
-    /// All reasons together.
-    pub fn total(&self) -> u64 {
-        self.stale + self.invalid + self.superseded + self.lost_at_restart
-    }
-
-    /// These and all reasons together, if a u64 can hold that.
-    pub(crate) fn add_to(&self, others: [u64; 2]) -> Option<u64> {
-        let reasons = [self.stale, self.invalid, self.superseded, self.lost_at_restart];
-        others.into_iter().chain(reasons).try_fold(0u64, u64::checked_add)
-    }
-
-    pub(crate) fn count(&mut self, reason: Reason, unrolls: u64) {
-        *match reason {
-            Reason::Stale => &mut self.stale,
-            Reason::Invalid => &mut self.invalid,
-            Reason::Superseded => &mut self.superseded,
-            Reason::LostAtRestart => &mut self.lost_at_restart,
-        } += unrolls;
-    }
-}
-
-/// Why an unroll is not trained on.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Reason {
-    /// See [`Dropped::stale`].
-    Stale,
-    /// See [`Dropped::invalid`].
-    Invalid,
-    /// See [`Dropped::superseded`].
-    Superseded,
-    /// See [`Dropped::lost_at_restart`].
-    LostAtRestart,
-}
-
-/// What an actor gets by joining.
+/// The account of an actor that joined.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Joined {
-    /// Its index.
+    /// The index of the actor.
     pub actor: u64,
-    /// The first sequence number its account does not speak of.
+    /// The next sequence number: all lower numbers are accounted for.
     pub next_sequence: u64,
 }
 
-/// Why an actor may not join.
+/// The reason why an actor may not join.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum JoinError {
-    /// Its account was closed to make room for others.
+    /// Its account was closed to make room for other accounts.
     #[error(
-        "the account of actor {actor}, incarnation {incarnation:016x}, was closed after a long silence: start the actor again"
+        "the account of actor {actor}, incarnation {incarnation:016x}, was closed because it was inactive for long: start the actor again"
     )]
     Closed {
-        /// The index it had.
+        /// The index of the closed account.
         actor: u64,
-        /// Who asked.
+        /// The incarnation that joins.
         incarnation: u64,
     },
 }
 
-/// One incarnation's account.
+/// The account of one incarnation.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Entry {
     pub(crate) incarnation: u64,
     pub(crate) next_sequence: u64,
-    /// When it was last heard of, on the ledger's own clock.
+    /// Time of its last activity, on the ledger's clock, which counts events.
     pub(crate) heard: u64,
 }
 
-/// What the accounts say about a number.
+/// The status of a sequence number in the accounts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Sighting {
-    /// Not accounted for yet.
+pub(crate) enum SequenceStatus {
+    /// The number is new.
     New,
-    /// Accounted for.
+    /// The number is accounted for.
     Duplicate,
-    /// No number an actor can have reached.
-    Broken,
-    /// Nobody's.
+    /// No actor can have reached the number.
+    OutOfRange,
+    /// Actor and incarnation have no account.
     Unknown,
 }
 
-/// Every actor's account, and the sums. See the crate's rules.
+/// The account of every actor, and the sums. The documentation of the crate has the rules.
 #[derive(Clone, Debug)]
 pub struct Ledger {
     pub(crate) entries: HashMap<u64, Entry>,
@@ -137,10 +63,10 @@ pub struct Ledger {
     pub(crate) next_actor: u64,
     pub(crate) clock: u64,
     capacity: usize,
-    /// In flight is what the trainer holds; what waits for it is counted in the batcher's buffers.
+    /// Here, `in_flight` has only the unrolls at the trainer. The batcher counts the waiting unrolls in its buffers.
     pub(crate) sums: Accounting,
     tasks: Tasks,
-    /// The accounting of tasks that this life does not have, for one that does.
+    /// The accounting of tasks that this learner epoch does not have. A later epoch may have them again.
     pub(crate) others: BTreeMap<String, TaskAccounting>,
 }
 
@@ -151,7 +77,7 @@ impl Default for Ledger {
 }
 
 impl Ledger {
-    /// Accounts that can be open at once: above any number of actors that can be connected, a few MB of memory.
+    /// Greatest number of open accounts. It is above the number of actors that can be connected, and needs a few MB.
     pub const CAPACITY: usize = 65_536;
 
     /// The ledger of a new run.
@@ -159,7 +85,7 @@ impl Ledger {
         Self::with_capacity(Self::CAPACITY)
     }
 
-    /// A ledger with room for this many open accounts, at least one.
+    /// A ledger with this greatest number of open accounts, at least 1.
     pub fn with_capacity(capacity: usize) -> Self {
         Self {
             entries: HashMap::new(),
@@ -173,8 +99,8 @@ impl Ledger {
         }
     }
 
-    /// Keeps the accounting of each of these tasks too, in the order of the indices in the unrolls' headers. A restored
-    /// ledger continues the accounting of tasks of the same name.
+    /// Adds the accounting of each of these tasks. Their order is that of the task indices in the headers of unrolls. A
+    /// restored ledger continues the accounting of tasks with the same name.
     #[must_use]
     pub fn with_tasks(mut self, tasks: impl IntoIterator<Item = String>) -> Self {
         let mut known = std::mem::take(&mut self.others);
@@ -184,10 +110,10 @@ impl Ledger {
         self
     }
 
-    /// Opens an account, or finds the one this incarnation has. `claimed` is the index the actor says it had.
+    /// Opens an account, or finds the account of this incarnation. `claimed` is the index that the actor had before.
     ///
     /// # Errors
-    /// [`JoinError::Closed`] when it had an account that was closed.
+    /// [`JoinError::Closed`] if its account was closed.
     pub fn join(&mut self, incarnation: u64, claimed: Option<u64>) -> Result<Joined, JoinError> {
         self.clock += 1;
         if let Some(actor) = self.actors.get(&incarnation)
@@ -196,9 +122,9 @@ impl Ledger {
             entry.heard = self.clock;
             return Ok(Joined { actor: *actor, next_sequence: entry.next_sequence });
         }
-        // Every index below `next_actor` was given out in this run. One without an entry was closed. One that belongs
-        // to somebody else was given out anew after a restart that did not know the claimant; that one starts afresh,
-        // and so does a claimant of an index this life of the learner has not reached.
+        // Every index below `next_actor` was assigned in this run. An index without an entry was closed. An index of
+        // another incarnation was assigned again after a restart from a checkpoint without this actor; then the actor
+        // gets a new account. An actor with an index that is not assigned yet gets a new account, too.
         if let Some(actor) = claimed.filter(|actor| *actor < self.next_actor && !self.entries.contains_key(actor)) {
             return Err(JoinError::Closed { actor, incarnation });
         }
@@ -212,8 +138,8 @@ impl Ledger {
         Ok(Joined { actor, next_sequence: 0 })
     }
 
-    /// Accounts for every number below `sequence`, all of which were acknowledged to the actor: those that its account does not
-    /// speak of were lost with the life of the learner that did. Says which number comes next.
+    /// Accounts for all numbers below `sequence`, which were acknowledged to the actor. Numbers that the account does
+    /// not have were lost with an earlier learner epoch. Returns the next sequence number; 0 without an account.
     pub fn catch_up(&mut self, actor: u64, sequence: u64) -> u64 {
         let Some(entry) = self.entries.get_mut(&actor) else { return 0 };
         let lost = sequence.min(MAX_SEQUENCE).saturating_sub(entry.next_sequence);
@@ -225,6 +151,7 @@ impl Ledger {
         entry.next_sequence
     }
 
+    /// Closes the account with the oldest activity.
     fn close_least_recent(&mut self) {
         let least = self.entries.iter().min_by_key(|(_, entry)| entry.heard).map(|(actor, _)| *actor);
         if let Some(entry) = least.and_then(|actor| self.entries.remove(&actor)) {
@@ -232,23 +159,25 @@ impl Ledger {
         }
     }
 
-    /// Open accounts.
+    /// Number of open accounts.
     pub fn open_accounts(&self) -> usize {
         self.entries.len()
     }
 
-    pub(crate) fn sight(&self, actor: u64, incarnation: u64, sequence: u64) -> Sighting {
+    /// The status of a sequence number of this actor and incarnation.
+    pub(crate) fn status(&self, actor: u64, incarnation: u64, sequence: u64) -> SequenceStatus {
         match self.entries.get(&actor) {
-            Some(entry) if entry.incarnation != incarnation => Sighting::Unknown,
-            Some(_) if sequence >= MAX_SEQUENCE => Sighting::Broken,
-            Some(entry) if sequence < entry.next_sequence => Sighting::Duplicate,
-            Some(_) => Sighting::New,
-            None => Sighting::Unknown,
+            Some(entry) if entry.incarnation != incarnation => SequenceStatus::Unknown,
+            Some(_) if sequence >= MAX_SEQUENCE => SequenceStatus::OutOfRange,
+            Some(entry) if sequence < entry.next_sequence => SequenceStatus::Duplicate,
+            Some(_) => SequenceStatus::New,
+            None => SequenceStatus::Unknown,
         }
     }
 
-    /// Accounts for a number that [`sight`](Self::sight) called new. False, and nothing changed, if it is not, or if
-    /// the sum of all numbers would leave its range (then no other sum can). `clip` is the unroll's first, if it is known.
+    /// Accounts for a number that is new according to [`status`](Self::status). `task` is the task of the unroll, if it
+    /// is known. Returns false and changes nothing if the number is not new, or if the sum of all numbers would
+    /// overflow; so no other sum can overflow.
     pub(crate) fn record(&mut self, actor: u64, sequence: u64, task: Option<u32>) -> bool {
         let Some(entry) = self.entries.get_mut(&actor) else { return false };
         let Some(skipped) = sequence.checked_sub(entry.next_sequence) else { return false };
@@ -266,17 +195,17 @@ impl Ledger {
         true
     }
 
-    /// Counts a message without an account to charge. A checkpoint may claim any number of them.
+    /// Counts a message without an account. The sum saturates, because a checkpoint may have any number.
     pub(crate) fn refuse(&mut self) {
         self.sums.unattributed = self.sums.unattributed.saturating_add(1);
     }
 
-    /// Counts a message that repeats an unroll.
+    /// Counts a duplicate. The sum saturates, because a checkpoint may have any number.
     pub(crate) fn repeat(&mut self) {
         self.sums.duplicates = self.sums.duplicates.saturating_add(1);
     }
 
-    /// Counts unrolls of these tasks as being with the trainer.
+    /// Counts unrolls of these tasks as being at the trainer.
     pub(crate) fn hand_out(&mut self, tasks: impl Iterator<Item = u32>) {
         for task in tasks {
             self.sums.in_flight += 1;
@@ -284,17 +213,17 @@ impl Ledger {
         }
     }
 
-    /// Accounting one that was handed out as trained on, or as dropped for a reason.
-    pub(crate) fn take_back(&mut self, task: u32, end: Option<Reason>) {
+    /// Accounts for an unroll at the trainer as dropped for this reason, or without a reason as trained on.
+    pub(crate) fn take_back(&mut self, task: u32, dropped: Option<Reason>) {
         self.sums.in_flight -= 1;
         self.tasks.of(task).into_iter().for_each(|accounting| accounting.in_flight -= 1);
-        self.end(Some(task), end);
+        self.end(Some(task), dropped);
     }
 
-    /// Accounting one unroll, of this task, as trained on, or as dropped for a reason.
-    pub(crate) fn end(&mut self, task: Option<u32>, end: Option<Reason>) {
+    /// Accounts for an unroll of this task as dropped for this reason, or without a reason as trained on.
+    pub(crate) fn end(&mut self, task: Option<u32>, dropped: Option<Reason>) {
         let accounting = task.and_then(|task| self.tasks.of(task));
-        match end {
+        match dropped {
             None => {
                 self.sums.trained += 1;
                 accounting.into_iter().for_each(|accounting| accounting.trained += 1);
@@ -306,7 +235,7 @@ impl Ledger {
         }
     }
 
-    /// The accounting, with unrolls of these tasks waiting for the trainer.
+    /// The accounting if unrolls of the tasks `waiting` wait for the trainer.
     pub(crate) fn accounting(&self, waiting: impl Iterator<Item = u32>) -> AccountingByTask {
         let (mut all, mut tasks) = (self.sums, self.tasks.clone());
         for task in waiting {

@@ -1,4 +1,4 @@
-//! Accounting and accounts in a checkpoint.
+//! The ledger in a checkpoint.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -6,64 +6,65 @@ use comic_proto::MAX_SEQUENCE;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::ledger::{Accounting, Entry, Ledger, Reason};
-use crate::tasks::{AccountingByTask, TaskAccounting};
+use crate::accounting::{Accounting, AccountingByTask, Reason, TaskAccounting};
+use crate::ledger::{Entry, Ledger};
 
 /// One open account.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Account {
-    /// The actor's index.
+    /// The index of the actor.
     pub actor: u64,
-    /// The process that has it.
+    /// The actor process.
     pub incarnation: u64,
-    /// The first sequence number not accounted for.
+    /// The next sequence number: all lower numbers are accounted for.
     pub next_sequence: u64,
 }
 
 /// The ledger at one moment, as plain data.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Snapshot {
-    /// The sums, what was in flight included.
+pub struct LedgerSnapshot {
+    /// The sums, with the unrolls in flight.
     pub accounting: Accounting,
-    /// The same of each task, by its name.
+    /// The sums of each task, by its name.
     #[serde(default)]
     pub tasks: BTreeMap<String, TaskAccounting>,
-    /// The index the next new actor gets.
+    /// The index of the next new actor.
     pub next_actor: u64,
-    /// Open accounts, the one heard of least recently first.
+    /// Open accounts, sorted by their last activity, the oldest first.
     pub accounts: Vec<Account>,
 }
 
-/// Why a snapshot cannot be restored.
+/// The reason why a snapshot cannot be restored.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The law does not hold.
-    #[error("accounting of the checkpoint do not balance: {accounting:?}")]
+    /// The accounting does not balance.
+    #[error("the accounting of the checkpoint does not balance: {accounting:?}")]
     Unbalanced {
-        /// As stored.
+        /// The stored sums.
         accounting: Accounting,
     },
-    /// The law does not hold of one task, or the tasks come to more than all.
-    #[error("accounting of {task} in the checkpoint do not balance: {accounting:?}")]
+    /// The accounting of a task does not balance, or the tasks together exceed the total.
+    #[error("the accounting of {task} in the checkpoint does not balance: {accounting:?}")]
     UnbalancedTask {
         /// The task's name.
         task: String,
-        /// As stored.
+        /// The stored sums.
         accounting: TaskAccounting,
     },
-    /// An index or an incarnation stands there twice, or an index that was never given out.
+    /// An index or an incarnation occurs twice, or an index was never assigned.
     #[error("account of actor {actor} in the checkpoint is repeated or out of range")]
     Account {
-        /// The index.
+        /// The index of the actor.
         actor: u64,
     },
 }
 
 impl Ledger {
-    pub(crate) fn snapshot(&self, waiting: impl Iterator<Item = u32>) -> Snapshot {
+    /// The snapshot if unrolls of the tasks `waiting` wait for the trainer.
+    pub(crate) fn snapshot(&self, waiting: impl Iterator<Item = u32>) -> LedgerSnapshot {
         let mut entries: Vec<_> = self.entries.iter().collect();
         entries.sort_by_key(|(_, entry)| entry.heard);
         let accounts = entries
@@ -76,14 +77,14 @@ impl Ledger {
             .collect();
         let AccountingByTask { all: accounting, mut tasks } = self.accounting(waiting);
         tasks.extend(self.others.iter().map(|(task, accounting)| (task.clone(), *accounting)));
-        Snapshot { accounting, tasks, next_actor: self.next_actor, accounts }
+        LedgerSnapshot { accounting, tasks, next_actor: self.next_actor, accounts }
     }
 
-    /// The ledger a new life of the learner starts with: what was in flight at the snapshot is lost at restart.
+    /// The ledger of a new learner epoch. The unrolls that were in flight are lost at restart.
     ///
     /// # Errors
-    /// [`Error`] when the snapshot contradicts itself.
-    pub fn restore(snapshot: &Snapshot) -> Result<Self, Error> {
+    /// [`enum@Error`] if the snapshot is inconsistent.
+    pub fn restore(snapshot: &LedgerSnapshot) -> Result<Self, Error> {
         let mut ledger = Self::new();
         let (mut incarnations, mut in_accounts) = (HashSet::new(), 0u64);
         for (account, heard) in snapshot.accounts.iter().zip(1..) {
@@ -101,7 +102,7 @@ impl Ledger {
             return Err(Error::Account { actor: snapshot.next_actor });
         }
         let mut sums = snapshot.accounting;
-        // Closed accounts are in the sum too, so the open ones can only fall short of it.
+        // The sum has closed accounts, too, so the open accounts are at most the sum.
         if !sums.balance() || in_accounts > sums.produced {
             return Err(Error::Unbalanced { accounting: snapshot.accounting });
         }
@@ -112,12 +113,12 @@ impl Ledger {
         let all = [sums.produced, sums.trained, snapshot.accounting.dropped.total(), snapshot.accounting.in_flight];
         let mut together = [0u64; 4];
         for (task, accounting) in &snapshot.tasks {
-            // Of accounting that balance no sum can leave its range.
-            let sound = accounting.balance() && {
+            // If an accounting balances, none of its sums has overflowed.
+            let is_consistent = accounting.balance() && {
                 together.iter_mut().zip(parts(accounting)).for_each(|(sum, part)| *sum = sum.saturating_add(part));
                 together.iter().zip(all).all(|(sum, all)| *sum <= all)
             };
-            if !sound {
+            if !is_consistent {
                 return Err(Error::UnbalancedTask { task: task.clone(), accounting: *accounting });
             }
             let mut accounting = *accounting;

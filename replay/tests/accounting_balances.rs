@@ -1,5 +1,4 @@
-//! The law: produced = trained + dropped + in flight, whatever happens in whatever order, and nothing is trained on
-//! twice.
+//! For any sequence of events, produced = trained + dropped + in flight, and no unroll is trained on twice.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -8,7 +7,7 @@ mod common;
 use std::collections::{HashMap, HashSet};
 
 use comic_proto::v1::Behaviour;
-use comic_replay::{Batch, Batcher, Ledger, Outcome, Phase, Reason, Snapshot, TaskAccounting};
+use comic_replay::{Batch, Batcher, Ledger, LedgerSnapshot, Outcome, Phase, Reason, TaskAccounting};
 use common::{Actor, CONFIG, PHASE, TASKS, batch_now, insert_now, layout, task_of, with_tasks};
 use proptest::prelude::*;
 
@@ -23,7 +22,7 @@ enum Event {
     Take,
     Train,
     Discard { reason: Reason },
-    LetGo,
+    DropBatch,
     NewVersion,
     SwitchPhase,
     Reconnect { actor: u64 },
@@ -43,7 +42,7 @@ fn event() -> impl Strategy<Value = Event> {
         4 => Just(Event::Take),
         4 => Just(Event::Train),
         1 => reason.prop_map(|reason| Event::Discard { reason }),
-        1 => Just(Event::LetGo),
+        1 => Just(Event::DropBatch),
         4 => Just(Event::NewVersion),
         1 => Just(Event::SwitchPhase),
         1 => (0..ACTORS).prop_map(|actor| Event::Reconnect { actor }),
@@ -53,13 +52,13 @@ fn event() -> impl Strategy<Value = Event> {
     ]
 }
 
-/// What the test knows by itself of a run.
+/// What the test counts on its own.
 #[derive(Clone, Default)]
 struct Known {
-    /// Next sequence number of each incarnation, as the learner should see it.
+    /// Next sequence number of each incarnation, as the learner should have it.
     cursors: HashMap<u64, u64>,
     trained: HashSet<(u64, u64)>,
-    /// Unrolls of each task, and of none, that the batcher took or dropped.
+    /// Unrolls of each task, and of no task, that the batcher accepted or dropped.
     decided: [u64; TASKS.len() + 1],
     refused: u64,
 }
@@ -72,12 +71,12 @@ struct World {
     batcher: Batcher,
     phase: Phase,
     actors: Vec<Actor>,
-    /// What each actor will number its next unroll; unlike the learner, it forgets nothing in a crash.
+    /// The next sequence number of each actor. A crash of the learner does not change it.
     sequences: HashMap<u64, u64>,
     incarnations: u64,
     taken: Vec<Batch>,
     known: Known,
-    checkpoint: (Snapshot, Known),
+    checkpoint: (LedgerSnapshot, Known),
 }
 
 impl World {
@@ -141,7 +140,7 @@ impl World {
             let joined = self.batcher.join(actor.incarnation, Some(actor.actor)).unwrap();
             actor.actor = joined.actor;
             let known = self.known.cursors.get(&actor.incarnation).copied().unwrap_or(0);
-            assert_eq!(joined.next_sequence, known, "the account is the checkpoint's");
+            assert_eq!(joined.next_sequence, known, "the account of the checkpoint");
         }
     }
 
@@ -170,7 +169,7 @@ impl World {
                 let batch = batch_now(&self.batcher);
                 let headers = batch.iter().flat_map(Batch::headers);
                 let mut ages = headers.map(|header| self.phase.version - header.version);
-                assert!(ages.all(|age| age <= CONFIG.max_staleness), "too old when it is handed out");
+                assert!(ages.all(|age| age <= CONFIG.max_staleness), "an unroll of the batch is stale");
                 self.taken.extend(batch);
             }
             Event::Train => self.train(),
@@ -179,7 +178,7 @@ impl World {
                     self.batcher.discard(batch, reason);
                 }
             }
-            Event::LetGo => drop(self.taken.pop()),
+            Event::DropBatch => drop(self.taken.pop()),
             Event::NewVersion => {
                 self.phase.version += 1;
                 self.batcher.set_phase(self.phase);
@@ -207,7 +206,7 @@ impl World {
     fn check(&self) {
         let accounting = self.batcher.accounting();
         assert!(accounting.balance(), "{accounting:?}");
-        assert_eq!(accounting.produced, self.known.cursors.values().sum::<u64>(), "what the sequence numbers say");
+        assert_eq!(accounting.produced, self.known.cursors.values().sum::<u64>(), "sum of the sequence numbers");
         assert_eq!(accounting.trained, self.known.trained.len() as u64);
         assert_eq!(accounting.unattributed, self.known.refused);
         assert!(accounting.in_flight <= 3 * CONFIG.unrolls as u64);
@@ -229,11 +228,11 @@ impl World {
             assert_eq!(own.trained, trained.count() as u64, "{task}");
         }
         let sum = |part: fn(&TaskAccounting) -> u64| accounting.tasks.values().map(part).sum::<u64>();
-        let nobodys = self.known.trained.iter().filter(|(_, sequence)| task_of(*sequence) == TASKS.len()).count();
+        let without_task = self.known.trained.iter().filter(|(_, sequence)| task_of(*sequence) == TASKS.len()).count();
         assert_eq!(
-            sum(|accounting| accounting.trained) + nobodys as u64,
+            sum(|accounting| accounting.trained) + without_task as u64,
             accounting.all.trained,
-            "together they are all"
+            "sum over the tasks"
         );
         assert!(sum(|accounting| accounting.in_flight) <= accounting.all.in_flight);
         assert!(sum(|accounting| accounting.dropped.total()) <= accounting.all.dropped.total());
@@ -243,7 +242,7 @@ impl World {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(500))]
     #[test]
-    fn at_any_moment_of_any_history(events in prop::collection::vec(event(), 1..200)) {
+    fn the_accounting_balances_after_every_event(events in prop::collection::vec(event(), 1..200)) {
         let mut world = World::new();
         for event in events {
             world.happen(event);

@@ -1,4 +1,4 @@
-//! Memory is bounded: who comes when the batches are full waits, and whoever waits can leave.
+//! Memory is bounded: inserts wait if the batches are full, and a waiting insert can be cancelled.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -11,7 +11,7 @@ use comic_replay::{Next, Outcome, Phase};
 use common::{Actor, CONFIG, PHASE, SLOTS, batch_now, batcher, now, payload};
 
 #[test]
-fn nothing_more_is_taken_than_an_open_and_a_full_batch() {
+fn no_more_unrolls_than_an_open_and_a_full_batch_are_accepted() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     for sequence in 0..SLOTS as u64 {
@@ -19,11 +19,11 @@ fn nothing_more_is_taken_than_an_open_and_a_full_batch() {
     }
     assert_eq!(actor.send(&batcher, SLOTS as u64), None);
     assert_eq!(batcher.accounting().in_flight, SLOTS as u64);
-    assert_eq!(batcher.accounting().produced, SLOTS as u64, "waiting left no trace");
+    assert_eq!(batcher.accounting().produced, SLOTS as u64, "a cancelled insert is not recorded");
 }
 
 #[test]
-fn what_is_refused_anyway_does_not_wait() {
+fn an_unroll_that_is_refused_does_not_wait() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     for sequence in 0..SLOTS as u64 {
@@ -36,7 +36,7 @@ fn what_is_refused_anyway_does_not_wait() {
 }
 
 #[test]
-fn waiting_inserts_get_their_slots_in_the_order_they_came() {
+fn waiting_inserts_get_slots_in_the_order_of_arrival() {
     let batcher = batcher();
     let filler = Actor::join(&batcher, 5);
     for sequence in 0..SLOTS as u64 {
@@ -45,7 +45,7 @@ fn waiting_inserts_get_their_slots_in_the_order_they_came() {
     let headers: Vec<_> = (10..14).map(|incarnation| Actor::join(&batcher, incarnation).header(0)).collect();
     let mut waiting: Vec<_> = headers.iter().map(|header| Box::pin(batcher.insert(header, payload(header)))).collect();
     assert!(waiting.iter_mut().all(|insert| now(insert).is_none()));
-    // The second one leaves; nobody is held up by it.
+    // The second insert is cancelled; the others still get their slots.
     drop(waiting.remove(1));
     batcher.trained(batch_now(&batcher).unwrap());
     assert!(waiting.iter_mut().all(|insert| now(insert) == Some(Outcome::Taken)));
@@ -55,7 +55,7 @@ fn waiting_inserts_get_their_slots_in_the_order_they_came() {
 }
 
 #[test]
-fn of_two_copies_that_wait_one_is_taken() {
+fn only_one_of_two_waiting_copies_is_accepted() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     for sequence in 0..SLOTS as u64 {
@@ -71,7 +71,7 @@ fn of_two_copies_that_wait_one_is_taken() {
 }
 
 #[test]
-fn a_change_of_phase_wakes_those_who_wait_for_the_old_one() {
+fn a_change_of_phase_ends_the_waiting_of_inserts_for_the_old_phase() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     for sequence in 0..SLOTS as u64 {
@@ -104,7 +104,7 @@ fn closing_ends_all_waiting_and_records_nothing() {
 }
 
 #[test]
-fn a_trainer_waits_for_a_batch_and_is_woken_by_its_last_unroll_or_by_the_end() {
+fn the_last_unroll_of_a_batch_or_closing_wakes_the_trainer() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     assert!(matches!(batcher.next_batch_within(Duration::from_millis(1)), Next::Elapsed));
@@ -130,7 +130,7 @@ fn a_trainer_waits_for_a_batch_and_is_woken_by_its_last_unroll_or_by_the_end() {
 }
 
 #[test]
-fn many_tasks_and_one_trainer_lose_nothing() {
+fn no_unroll_is_lost_between_many_actors_and_one_trainer() {
     const ACTORS: u64 = 8;
     const EACH: u64 = 300;
     let batcher = batcher();

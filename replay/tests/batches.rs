@@ -1,4 +1,4 @@
-//! A batch holds the unrolls that were put in, field by field, slot by slot.
+//! A batch has the inserted unrolls in the right slots, field by field.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -27,7 +27,7 @@ fn assert_holds(batch: &Batch, expected: &[UnrollHeader]) {
 }
 
 #[test]
-fn fields_are_contiguous_and_in_order_of_arrival_also_when_buffers_are_used_again() {
+fn fields_are_contiguous_and_in_order_of_arrival_also_in_reused_buffers() {
     let batcher = batcher();
     let actors = [5, 6].map(|incarnation| Actor::join(&batcher, incarnation));
     for round in 0..10 {
@@ -46,7 +46,7 @@ fn fields_are_contiguous_and_in_order_of_arrival_also_when_buffers_are_used_agai
 }
 
 #[test]
-fn while_one_batch_is_trained_on_the_next_two_are_assembled() {
+fn two_batches_are_assembled_while_one_is_trained_on() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     for sequence in 0..3 {
@@ -58,7 +58,7 @@ fn while_one_batch_is_trained_on_the_next_two_are_assembled() {
     }
     assert_eq!(actor.send(&batcher, 9), None);
     assert_holds(&first, &[0, 1, 2].map(|sequence| actor.header(sequence)));
-    // A second one before the first is given back: allowed, and memory is still three batches.
+    // The trainer may take a second batch before it returns the first one. Memory is still three batches.
     let second = batch_now(&batcher).unwrap();
     assert_holds(&second, &[3, 4, 5].map(|sequence| actor.header(sequence)));
     assert_eq!(actor.send(&batcher, 9), None);
@@ -69,12 +69,12 @@ fn while_one_batch_is_trained_on_the_next_two_are_assembled() {
 }
 
 #[test]
-fn what_grew_too_old_while_it_waited_is_dropped_and_its_slots_are_filled_again() {
+fn unrolls_that_become_stale_while_they_wait_are_dropped_and_their_slots_are_reused() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     let newest = |late: u64| PHASE.version + late;
     let mut sent = Vec::new();
-    // A full batch of which two are at the limit, and one more unroll behind it that is, too, and one that is not.
+    // A full batch with two unrolls at the age limit. The open batch has one unroll at the limit and one new unroll.
     for (sequence, version) in (0..).zip([newest(0) - 4, newest(0), newest(0) - 4, newest(0) - 4, newest(0)]) {
         let header = UnrollHeader { version, ..actor.header(sequence) };
         assert_eq!(insert_now(&batcher, &header), Some(Outcome::Taken));
@@ -86,7 +86,7 @@ fn what_grew_too_old_while_it_waited_is_dropped_and_its_slots_are_filled_again()
     let late = UnrollHeader { version: newest(1), ..actor.header(5) };
     assert_eq!(insert_now(&batcher, &late), Some(Outcome::Taken));
     assert_holds(&batch_now(&batcher).unwrap(), &[sent[4].clone(), sent[1].clone(), late]);
-    // Every slot is there again.
+    // All slots are free again.
     for sequence in 6..6 + SLOTS as u64 {
         assert_eq!(insert_now(&batcher, &actor.header(sequence)), Some(Outcome::Taken));
     }
@@ -94,7 +94,7 @@ fn what_grew_too_old_while_it_waited_is_dropped_and_its_slots_are_filled_again()
 }
 
 #[test]
-fn a_batch_can_be_assembled_from_a_recording() {
+fn a_batch_can_be_assembled_from_recorded_unrolls() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     let recorded = [actor.header(7), actor.header(3)];
@@ -102,14 +102,14 @@ fn a_batch_can_be_assembled_from_a_recording() {
     let batch = Batch::assemble(layout(), unrolls.clone()).unwrap();
     assert_holds(&batch, &recorded);
     batcher.trained(batch);
-    assert_eq!(batcher.accounting().trained, 0, "it was none of this batcher's");
+    assert_eq!(batcher.accounting().trained, 0, "the batch does not belong to this batcher");
 
     let short = unrolls[0].1.slice(1..);
     let refused = Batch::assemble(layout(), [(recorded[0].clone(), short)]).err();
     assert_eq!(refused, Some(Invalid::Length { found: layout().size() - 1, expected: layout().size() }));
 }
 
-/// A batcher whose slots are the environments'.
+/// A batcher in which each environment has its own slot.
 fn ordered() -> Batcher {
     let config = Config { ahead: 0, max_staleness: 0, order: BatchOrder::Environment, ..CONFIG };
     Batcher::new(layout(), config, PHASE, Ledger::new())
@@ -117,7 +117,7 @@ fn ordered() -> Batcher {
 
 proptest! {
     #[test]
-    fn in_whatever_order_unrolls_come_each_lies_in_its_environments_slot(
+    fn for_every_order_of_arrival_an_unroll_is_in_the_slot_of_its_environment(
         orders in prop::collection::vec(Just([0_u32, 1, 2]).prop_shuffle(), 1..5),
     ) {
         let batcher = ordered();
@@ -139,7 +139,7 @@ proptest! {
 }
 
 #[test]
-fn an_environment_without_a_slot_or_with_a_full_one_is_invalid() {
+fn an_unroll_whose_environment_has_no_free_slot_is_invalid() {
     let batcher = ordered();
     let actor = Actor::join(&batcher, 5);
     let send = |sequence, environment| insert_now(&batcher, &UnrollHeader { environment, ..actor.header(sequence) });

@@ -1,4 +1,4 @@
-//! Each unroll is taken at most once, and every refusal has a reason that is counted.
+//! Each unroll is accepted at most once, and every refusal is counted with its reason.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -10,7 +10,7 @@ use comic_replay::{Dropped, Outcome, Phase, Reason};
 use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, payload};
 
 #[test]
-fn an_unroll_sent_twice_is_taken_once() {
+fn an_unroll_that_is_sent_twice_is_accepted_once() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     assert_eq!(actor.send(&batcher, 0), Some(Outcome::Taken));
@@ -22,7 +22,7 @@ fn an_unroll_sent_twice_is_taken_once() {
 }
 
 #[test]
-fn skipped_sequence_numbers_were_lost_and_do_not_come_back() {
+fn skipped_sequence_numbers_are_lost_and_later_refused() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     assert_eq!(actor.send(&batcher, 4), Some(Outcome::Taken));
@@ -32,7 +32,7 @@ fn skipped_sequence_numbers_were_lost_and_do_not_come_back() {
 }
 
 #[test]
-fn two_incarnations_count_apart() {
+fn two_incarnations_have_separate_accounts() {
     let batcher = batcher();
     let (one, other) = (Actor::join(&batcher, 5), Actor::join(&batcher, 6));
     assert_ne!(one.actor, other.actor);
@@ -42,7 +42,7 @@ fn two_incarnations_count_apart() {
 }
 
 #[test]
-fn nobody_is_charged_for_a_message_without_an_account() {
+fn a_message_without_an_account_changes_no_account() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     let stranger = Actor { actor: 9, ..actor };
@@ -55,17 +55,17 @@ fn nobody_is_charged_for_a_message_without_an_account() {
     batcher.refuse_unattributed();
     let accounting = batcher.accounting();
     assert_eq!((accounting.produced, accounting.unattributed), (0, 6));
-    assert_eq!(actor.send(&batcher, 0), Some(Outcome::Taken), "its account was not spoilt");
+    assert_eq!(actor.send(&batcher, 0), Some(Outcome::Taken), "its account is unchanged");
 }
 
 #[test]
-fn invalid_unrolls_are_dropped_once_and_the_next_one_is_welcome() {
+fn an_invalid_unroll_is_dropped_once_and_the_next_unroll_is_accepted() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     assert_eq!(batcher.refuse_invalid(&actor.header(0)), Outcome::Invalid);
     assert_eq!(batcher.refuse_invalid(&actor.header(0)), Outcome::Duplicate);
     let short = common::now(&mut Box::pin(batcher.insert(&actor.header(1), payload(&actor.header(1)).slice(4..))));
-    assert_eq!(short, Some(Outcome::Invalid), "the batcher itself takes no payload of another size");
+    assert_eq!(short, Some(Outcome::Invalid), "the batcher refuses a payload of another size");
     assert_eq!(actor.send(&batcher, 2), Some(Outcome::Taken));
     assert_eq!(batcher.accounting().dropped, Dropped { invalid: 2, ..Dropped::default() });
 }
@@ -84,7 +84,7 @@ fn staleness_is_counted_in_published_versions() {
     assert_eq!(
         (accounting.dropped.stale, accounting.in_flight),
         (1, 1),
-        "a new version takes nothing away from the open batch"
+        "a new version does not change the open batch"
     );
 }
 
@@ -104,7 +104,7 @@ fn unrolls_of_another_epoch_or_phase_are_superseded() {
 }
 
 #[test]
-fn an_unroll_made_before_the_terms_changed_is_superseded() {
+fn an_unroll_older_than_the_oldest_version_of_the_phase_is_superseded() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     assert_eq!(actor.send(&batcher, 0), Some(Outcome::Taken));
@@ -114,7 +114,7 @@ fn an_unroll_made_before_the_terms_changed_is_superseded() {
 }
 
 #[test]
-fn a_change_of_phase_drops_what_waits_for_the_old_one() {
+fn a_change_of_phase_drops_the_unrolls_of_the_old_phase() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     for sequence in 0..6 {
@@ -134,7 +134,7 @@ fn a_change_of_phase_drops_what_waits_for_the_old_one() {
 }
 
 #[test]
-fn every_batch_ends_in_the_accounting_also_one_that_is_let_go() {
+fn every_batch_is_accounted_for_also_if_it_is_dropped() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     let mut sequences = 0..;

@@ -1,21 +1,23 @@
-//! A checkpoint's accounting and accounts carry on in the next life of the learner.
+//! A learner that restarts continues the accounting and the accounts of its checkpoint.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
 
-use comic_replay::{Accounting, Batcher, Dropped, Error, Joined, Ledger, Outcome, Phase, Snapshot, TaskAccounting};
+use comic_replay::{
+    Accounting, Batcher, Dropped, Error, Joined, Ledger, LedgerSnapshot, Outcome, Phase, TaskAccounting,
+};
 use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, layout, with_tasks};
 
-/// The next life of the learner, from what a checkpoint file would hold.
-fn restarted(snapshot: &Snapshot) -> Batcher {
+/// The batcher of the next learner epoch, restored from the text of a checkpoint.
+fn restarted(snapshot: &LedgerSnapshot) -> Batcher {
     let stored = serde_json::to_string(snapshot).unwrap();
     let ledger = Ledger::restore(&serde_json::from_str(&stored).unwrap()).unwrap();
     Batcher::new(layout(), CONFIG, Phase { epoch: PHASE.epoch + 1, ..PHASE }, with_tasks(ledger))
 }
 
 #[test]
-fn what_was_in_flight_at_the_checkpoint_is_lost_and_never_trained_on_later() {
+fn unrolls_in_flight_at_the_checkpoint_are_lost_and_never_trained_on() {
     let before = batcher();
     let actor = Actor::join(&before, 5);
     for sequence in 0..5 {
@@ -34,7 +36,7 @@ fn what_was_in_flight_at_the_checkpoint_is_lost_and_never_trained_on_later() {
 }
 
 #[test]
-fn every_task_goes_on_with_its_own_accounting_and_a_new_one_begins_with_none() {
+fn every_task_continues_its_own_accounting_and_a_new_task_begins_at_zero() {
     let before = batcher();
     let actor = Actor::join(&before, 5);
     for sequence in 7..12 {
@@ -51,23 +53,23 @@ fn every_task_goes_on_with_its_own_accounting_and_a_new_one_begins_with_none() {
     assert_eq!(after["get-up"], TaskAccounting { produced: 2, dropped: lost, ..TaskAccounting::default() });
     assert_eq!(after["ball-catch"], TaskAccounting::default());
     assert_eq!(after.len(), 2);
-    // A task that one life does not have is known to the next one.
+    // A later epoch continues the accounting of a task that one epoch does not have.
     let back = with_tasks(Ledger::restore(&away.snapshot()).unwrap());
     let tracking = Batcher::new(layout(), CONFIG, PHASE, back).accounting_by_task().tasks["tracking"];
     assert_eq!(tracking, TaskAccounting { produced: 3, trained: 3, ..TaskAccounting::default() });
 }
 
 #[test]
-fn a_snapshot_from_before_tasks_had_accounting_is_restored_without_them() {
+fn a_snapshot_without_the_accounting_of_tasks_is_restored() {
     let before = batcher();
     let mut stored = serde_json::to_value(before.snapshot()).unwrap();
     stored.as_object_mut().unwrap().remove("tasks");
     assert!(Ledger::restore(&serde_json::from_value(stored).unwrap()).is_ok());
 }
 
-/// An actor of incarnation 5 whose unrolls 0 to 2 were taken, the last two after the checkpoint and so gone with the process; the
-/// next life of the learner, and what the actor learnt when it joined that.
-fn back_after_a_crash() -> (Actor, Batcher, Joined) {
+/// An actor with incarnation 5, the batcher of the next learner epoch, and the result of joining it. Unrolls 0 to 2
+/// were accepted before the crash; the last two came after the checkpoint and are lost.
+fn rejoined_after_a_crash() -> (Actor, Batcher, Joined) {
     let before = batcher();
     let actor = Actor::join(&before, 5);
     assert_eq!(actor.send(&before, 0), Some(Outcome::Taken));
@@ -80,12 +82,12 @@ fn back_after_a_crash() -> (Actor, Batcher, Joined) {
 }
 
 #[test]
-fn an_actor_that_reconnects_finds_its_account_and_the_learner_counts_what_it_missed() {
-    let (actor, after, joined) = back_after_a_crash();
+fn a_reconnecting_actor_keeps_its_account_and_skipped_numbers_are_lost() {
+    let (actor, after, joined) = rejoined_after_a_crash();
     assert_eq!((joined.actor, joined.next_sequence), (actor.actor, 1));
     let of_tasks = after.accounting_by_task().tasks;
-    assert_eq!(actor.send(&after, 3), Some(Outcome::Superseded), "resent, but made in the life before");
-    assert_eq!(after.accounting_by_task().tasks, of_tasks, "what that life called a clip is no task's here");
+    assert_eq!(actor.send(&after, 3), Some(Outcome::Superseded), "resent, but made in the epoch before");
+    assert_eq!(after.accounting_by_task().tasks, of_tasks, "an unroll of another epoch counts for no task");
     let mut fresh = actor.header(4);
     fresh.learner_epoch = PHASE.epoch + 1;
     assert_eq!(insert_now(&after, &fresh), Some(Outcome::Taken));
@@ -94,32 +96,32 @@ fn an_actor_that_reconnects_finds_its_account_and_the_learner_counts_what_it_mis
 }
 
 #[test]
-fn an_actor_that_sends_nothing_more_still_says_what_was_lost() {
-    let (actor, after, joined) = back_after_a_crash();
+fn acknowledged_numbers_that_the_checkpoint_does_not_have_are_lost() {
+    let (actor, after, joined) = rejoined_after_a_crash();
     assert_eq!(after.catch_up(joined.actor, 3), 3);
-    assert_eq!(after.catch_up(joined.actor, 2), 3, "an account does not go back");
+    assert_eq!(after.catch_up(joined.actor, 2), 3, "an account never moves back");
     let dropped = Dropped { lost_at_restart: 3, ..Dropped::default() };
     assert_eq!(after.accounting(), Accounting { produced: 3, dropped, ..Accounting::default() });
-    assert_eq!(after.catch_up(99, 3), 0, "nobody's numbers are not counted");
+    assert_eq!(after.catch_up(99, 3), 0, "numbers without an account are not counted");
     assert_eq!(after.accounting().produced, 3);
     assert_eq!(actor.send(&after, 2), Some(Outcome::Duplicate), "it is never trained on again");
 }
 
 #[test]
-fn an_actor_the_checkpoint_does_not_know_starts_afresh() {
+fn an_actor_without_an_account_in_the_checkpoint_gets_a_new_one() {
     let before = batcher();
     let snapshot = before.snapshot();
     let late = Actor::join(&before, 5);
     let after = restarted(&snapshot);
     let newcomer = after.join(6, None).unwrap();
-    assert_eq!(newcomer.actor, late.actor, "that index was given out again");
+    assert_eq!(newcomer.actor, late.actor, "the index is assigned again");
     let joined = after.join(5, Some(late.actor)).unwrap();
     assert_ne!(joined.actor, newcomer.actor);
     assert_eq!(joined.next_sequence, 0);
 }
 
 #[test]
-fn a_snapshot_may_claim_any_number_of_refusals() {
+fn the_number_of_refusals_in_a_snapshot_may_be_the_largest_number() {
     let mut snapshot = batcher().snapshot();
     (snapshot.accounting.duplicates, snapshot.accounting.unattributed) = (u64::MAX, u64::MAX);
     let after = restarted(&snapshot);
@@ -128,12 +130,12 @@ fn a_snapshot_may_claim_any_number_of_refusals() {
 }
 
 #[test]
-fn a_snapshot_that_contradicts_itself_is_refused() {
+fn an_inconsistent_snapshot_is_refused() {
     let before = batcher();
     let actor = Actor::join(&before, 5);
     assert_eq!(actor.send(&before, 0), Some(Outcome::Taken));
     let good = before.snapshot();
-    let refusal = |change: fn(&mut Snapshot)| {
+    let refusal = |change: fn(&mut LedgerSnapshot)| {
         let mut snapshot = good.clone();
         change(&mut snapshot);
         Ledger::restore(&snapshot).err()
@@ -142,20 +144,23 @@ fn a_snapshot_that_contradicts_itself_is_refused() {
     assert!(matches!(refusal(|snapshot| snapshot.accounting.trained += 1), Some(Error::Unbalanced { .. })));
     assert!(matches!(refusal(|snapshot| snapshot.accounting.dropped.stale = u64::MAX), Some(Error::Unbalanced { .. })));
     assert!(matches!(refusal(|snapshot| snapshot.accounts[0].next_sequence = 2), Some(Error::Unbalanced { .. })));
-    let repeated = |snapshot: &mut Snapshot| snapshot.accounts.push(snapshot.accounts[0]);
+    let repeated = |snapshot: &mut LedgerSnapshot| snapshot.accounts.push(snapshot.accounts[0]);
     assert_eq!(refusal(repeated), Some(Error::Account { actor: 0 }));
     assert_eq!(refusal(|snapshot| snapshot.next_actor = 0), Some(Error::Account { actor: 0 }));
     assert_eq!(refusal(|snapshot| snapshot.next_actor = u64::MAX), Some(Error::Account { actor: u64::MAX }));
-    let unbalanced = |snapshot: &mut Snapshot| snapshot.tasks.get_mut("tracking").unwrap().trained += 1;
+    let unbalanced = |snapshot: &mut LedgerSnapshot| snapshot.tasks.get_mut("tracking").unwrap().trained += 1;
     assert!(matches!(refusal(unbalanced), Some(Error::UnbalancedTask { .. })));
-    let too_many = |snapshot: &mut Snapshot| {
+    let too_many = |snapshot: &mut LedgerSnapshot| {
         let own = TaskAccounting { produced: 1, trained: 1, ..TaskAccounting::default() };
         snapshot.tasks.insert("get-up".into(), own);
     };
-    assert!(matches!(refusal(too_many), Some(Error::UnbalancedTask { .. })), "more than all tasks have");
-    let trained = |snapshot: &mut Snapshot| {
+    assert!(matches!(refusal(too_many), Some(Error::UnbalancedTask { .. })), "more than the total");
+    let trained = |snapshot: &mut LedgerSnapshot| {
         let own = snapshot.tasks.get_mut("tracking").unwrap();
         (own.trained, own.in_flight) = (own.in_flight, 0);
     };
-    assert!(matches!(refusal(trained), Some(Error::UnbalancedTask { .. })), "one was trained on, and none of all");
+    assert!(
+        matches!(refusal(trained), Some(Error::UnbalancedTask { .. })),
+        "the task has more trained unrolls than the total"
+    );
 }

@@ -1,4 +1,4 @@
-//! The compiled humanoid, checked without dm_control's arrays at hand.
+//! Facts of the compiled humanoid. `parity/model.rs` compares every array with dm_control's.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
@@ -27,7 +27,7 @@ fn the_2019_body_has_no_filter_and_no_face() {
 fn the_2020_body_weighs_seventy_kilograms() {
     let model = build(WalkerModel::Cmu2020).unwrap();
     let mass: f64 = model.body_mass().iter().sum();
-    // Two massless bodies have the least mass that MuJoCo is asked to give, 1e-5 kg each.
+    // Two massless bodies get the smallest mass that the model allows, 1e-5 kg each.
     assert!((mass - 70.00002).abs() < 1e-9, "{mass}");
 }
 
@@ -41,7 +41,7 @@ fn options_are_dm_controls() {
 }
 
 #[test]
-fn joints_and_servos_are_in_the_order_of_the_clips() {
+fn joints_and_servos_have_the_order_of_the_clips() {
     let model = build(WalkerModel::Cmu2020).unwrap();
     for (index, joint) in JOINTS.iter().enumerate() {
         // Joint 0 is the root's.
@@ -55,7 +55,7 @@ fn joints_and_servos_are_in_the_order_of_the_clips() {
 }
 
 #[test]
-fn a_servo_aims_linearly_from_one_end_of_its_joints_range_to_the_other() {
+fn a_servos_target_is_linear_in_its_action_over_the_joints_range() {
     let model = build(WalkerModel::Cmu2020).unwrap();
     for (servo, joint) in ACTUATOR_JOINTS.into_iter().enumerate() {
         let (gain, bias) = (model.actuator_gainprm()[servo][0], model.actuator_biasprm()[servo]);

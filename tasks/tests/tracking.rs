@@ -1,4 +1,4 @@
-//! How episodes begin, go on and end.
+//! Episodes of tracking: their starts, steps and ends.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
@@ -29,7 +29,7 @@ fn observation(task: &TrackingTask, environment: &TrackingEnvironment) -> (Vec<f
     (proprioception, rest)
 }
 
-/// Actions that no pose asks for, the same ones every time.
+/// Large actions that depend only on the step.
 fn wild(step: usize) -> [f32; 56] {
     std::array::from_fn(|joint| (((step * 56 + joint) * 7919) % 2001) as f32 / 1000.0 - 1.0)
 }
@@ -42,7 +42,7 @@ fn the_default_observation_has_the_papers_sizes() {
 }
 
 #[test]
-fn the_policy_sees_dm_controls_numbers_in_the_configured_order() {
+fn the_observation_is_dm_controls_in_the_configured_order() {
     let mut names: Vec<String> = TRACKING_OBSERVATIONS.map(String::from).to_vec();
     names.reverse();
     let task = task_of(&Tracking { observations: names.clone(), ..lenient() }, &["walk"]);
@@ -69,13 +69,13 @@ fn the_policy_sees_dm_controls_numbers_in_the_configured_order() {
     let expected: (Vec<f32>, Vec<f32>) =
         (proprioception.into_iter().flat_map(numbers).collect(), names.iter().flat_map(|name| numbers(name)).collect());
     assert_eq!(observation(&task, &environment), expected);
-    // The learner computes the same sizes without a simulator.
+    // The learner derives the same sizes without a simulator.
     let spec = TaskSpec::tracking(&Tracking { observations: names, ..lenient() }, task.spec().clips.clone());
     assert_eq!(task.spec(), &spec.unwrap());
 }
 
 #[test]
-fn an_episode_begins_in_the_clips_pose_with_filters_at_zero() {
+fn an_episode_begins_in_the_clips_pose_with_zero_activations() {
     let task = task_of(&Tracking::default(), &["walk"]);
     let mut environment = task.tracking_environment(0);
     environment.reset_to(0, 17).unwrap();
@@ -90,7 +90,7 @@ fn an_episode_begins_in_the_clips_pose_with_filters_at_zero() {
 }
 
 #[test]
-fn presetting_the_actuators_keeps_the_first_step_close() {
+fn preset_actuators_keep_the_first_step_near_the_reference() {
     let config = Tracking { preset_actuators: true, ..Tracking::default() };
     let after_one_servo_step = |config: &Tracking| {
         let mut environment = task_of(config, &["walk"]).tracking_environment(0);
@@ -166,7 +166,7 @@ fn an_episode_is_terminated_beyond_the_threshold_with_discount_zero_and_its_rewa
 }
 
 #[test]
-fn no_step_pays_more_than_the_maximum() {
+fn the_reward_of_a_step_is_below_the_maximum() {
     let mut environment =
         task_of(&Tracking { preset_actuators: true, ..Tracking::default() }, &["stand"]).tracking_environment(0);
     let mut action = [0.0f32; 56];
@@ -200,7 +200,7 @@ fn an_action_of_another_length_diverges() {
 }
 
 #[test]
-fn stepping_on_after_the_end_never_panics() {
+fn steps_after_the_end_do_not_panic() {
     let mut environment = task_of(&Tracking::default(), &["walk"]).tracking_environment(0);
     for step in 0..400 {
         environment.step(&wild(step));
@@ -209,9 +209,9 @@ fn stepping_on_after_the_end_never_panics() {
 }
 
 #[test]
-fn a_seed_decides_an_environments_whole_life() {
+fn a_seed_decides_every_episode_of_an_environment() {
     let task = task_of(&Tracking::default(), &["walk", "run", "jump"]);
-    let life = |seed: u64| {
+    let episodes = |seed: u64| {
         let mut environment = task.tracking_environment(seed);
         let mut seen = Vec::new();
         for step in 0..40 {
@@ -223,18 +223,18 @@ fn a_seed_decides_an_environments_whole_life() {
         }
         seen
     };
-    // The same in another thread, beside others on the same model.
+    // Other threads with environments of the same model give the same episodes.
     let elsewhere = std::thread::scope(|scope| {
-        let threads: Vec<_> = [1, 1, 2].map(|seed| scope.spawn(move || (seed, life(seed)))).into_iter().collect();
+        let threads: Vec<_> = [1, 1, 2].map(|seed| scope.spawn(move || (seed, episodes(seed)))).into_iter().collect();
         threads.into_iter().map(|thread| thread.join().unwrap()).collect::<Vec<_>>()
     });
-    assert_eq!(elsewhere[0].1, life(1));
-    assert_eq!(elsewhere[1].1, life(1));
-    assert_ne!(elsewhere[2].1, life(1));
+    assert_eq!(elsewhere[0].1, episodes(1));
+    assert_eq!(elsewhere[1].1, episodes(1));
+    assert_ne!(elsewhere[2].1, episodes(1));
 }
 
 #[test]
-fn episodes_start_where_the_law_says() {
+fn episodes_start_at_start_frames_with_enough_steps_left() {
     let task = task_of(&Tracking::default(), &["walk", "run"]);
     let mut environment = task.tracking_environment(5);
     for _ in 0..200 {
@@ -246,14 +246,14 @@ fn episodes_start_where_the_law_says() {
 }
 
 #[test]
-fn a_sub_range_is_a_clip_of_its_own() {
+fn a_sub_range_behaves_like_a_clip() {
     let source = ClipSource { start_step: 20, end_step: Some(60), ..ClipSource::whole("builtin:walk") };
     let catalogue = Catalogue::open(&[source]).unwrap();
     let task = Arc::new(TrackingTask::new(&lenient(), &catalogue).unwrap());
     assert_eq!(task.starts()[0].frames, 20..45);
     let mut environment = task.tracking_environment(0);
     environment.reset_to(0, 20).unwrap();
-    // 41 frames, as dm_control slices them: the end is inclusive. The last five are references only.
+    // dm_control's end is inclusive, so these are 41 frames. The last five are only references.
     assert_eq!(environment.episode().steps_left, 35);
     let time = |environment: &TrackingEnvironment| environment.dictionary().pop().unwrap().1[0];
     assert_eq!(time(&environment), 0.0);
@@ -265,7 +265,7 @@ fn a_sub_range_is_a_clip_of_its_own() {
 }
 
 #[test]
-fn starting_always_at_the_clips_start_is_an_option() {
+fn an_option_starts_every_episode_at_the_clips_start() {
     let config = Tracking { always_start_at_clip_start: true, ..Tracking::default() };
     let mut environment = task_of(&config, &["walk", "run"]).tracking_environment(9);
     for _ in 0..50 {
@@ -275,7 +275,7 @@ fn starting_always_at_the_clips_start_is_an_option() {
 }
 
 #[test]
-fn the_supplements_termination_error_adds_what_the_codes_averages() {
+fn the_supplements_termination_error_is_a_sum_and_dm_controls_a_mean() {
     let run = |kind: TerminationError| {
         let config = Tracking { termination_error: kind, ..lenient() };
         let mut environment = task_of(&config, &["walk"]).tracking_environment(0);
@@ -289,7 +289,7 @@ fn the_supplements_termination_error_adds_what_the_codes_averages() {
 }
 
 #[test]
-fn an_unknown_observation_is_refused_with_the_nearest_known_one() {
+fn the_error_of_an_unknown_observation_names_the_nearest() {
     let config = Tracking { observations: vec!["reference_rel_joint".into()], ..Tracking::default() };
     let error = TrackingTask::new(&config, &catalogue(&["walk"])).unwrap_err();
     assert_eq!(
@@ -299,7 +299,7 @@ fn an_unknown_observation_is_refused_with_the_nearest_known_one() {
 }
 
 #[test]
-fn clips_too_short_for_their_look_ahead_are_refused_by_name() {
+fn a_clip_that_is_too_short_for_its_references_is_refused_by_name() {
     let config = Tracking { min_steps: 5000, ..Tracking::default() };
     let error = TrackingTask::new(&config, &catalogue(&["stand"])).unwrap_err();
     assert!(error.to_string().contains("`stand` is too short"), "{error}");

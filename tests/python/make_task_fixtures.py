@@ -2,10 +2,10 @@
 
     python tests/python/make_task_fixtures.py --seed 1 --out tests/fixtures/golden
 
-Needs requirements-tracking.txt and nothing from this repository. Everything drawn comes from the seed. Written are
+Needs requirements-tracking.txt and nothing from this repository. The seed decides everything that is drawn. It writes
 
-* `go_to_target_*.npz`: one target that is never reached; targets so near that each moves after ten rewarded steps.
-* `gaps_rollout.npz`, `walls_rollout.npz`, and beside each the arena it was made in, `*_arena.json`: a list of the
+* `go_to_target_*.npz`: a target that is never reached, and near targets, which move after ten rewarded steps each.
+* `gaps_rollout.npz`, `walls_rollout.npz`, and the arena of each, `*_arena.json`: a list of the
   arena's geoms with name, body, position, half sizes and colour, the ground plane first.
 
 A rollout of N steps holds what those of `make_tracking_fixtures.py` hold for every task (obs_layout, obs, qpos, qvel,
@@ -64,7 +64,7 @@ class Corridor(corridors.RunThroughCorridor):
 def rollout(environment, actions):
     """A rollout over `actions`; returns the arrays of the module's docstring."""
     task, physics = environment.task, lambda: environment.physics
-    # `row` asks the task what it measured, and tracking needs no physics for that.
+    # `row` calls `measurements` without arguments, since tracking needs no physics for it.
     measure = task.measurements
     task.measurements = lambda: measure(physics())
     timestep = environment.reset()
@@ -73,7 +73,7 @@ def rollout(environment, actions):
     rows = [row(environment, timestep)]
     for action in actions:
         timestep = environment.step(action)
-        environment._reset_next_step = False  # go on after a failure: more states to compare
+        environment._reset_next_step = False  # continue after a failure: more states to compare
         rows.append(row(environment, timestep))
     return {
         "obs_layout": np.array(json.dumps(layout)),
@@ -99,19 +99,9 @@ def go_to_target_rollout(target, spawn, rotation, seed, actions):
     return {"spawn": np.array(spawn), "rotation": np.float64(rotation), **rollout(environment, actions)}
 
 
-def corridor_rollout(arena, seed, actions):
-    walker = cmu_humanoid.CMUHumanoidPositionControlledV2020()
-    task = Corridor(
-        walker=walker, arena=arena, walker_spawn_position=(0.5, 0, 0), target_velocity=3.0, **TIMESTEPS
-    )
-    walker.observables.egocentric_camera.enabled = False
-    environment = composer.Environment(
-        task=task, time_limit=45, random_state=seed, strip_singleton_obs_buffer_dim=True
-    )
-    environment.reset()
-    environment._recompile_mjcf_every_episode = False  # this arena it is
-    model = environment.physics.model.ptr
-    geoms = [
+def arena_geoms(model):
+    """The geoms that are not the walker's, the ground plane first."""
+    return [
         {
             "name": model.geom(g).name,
             "body": model.body(model.geom_bodyid[g]).name,
@@ -122,6 +112,42 @@ def corridor_rollout(arena, seed, actions):
         for g in range(model.ngeom)
         if not model.geom(g).name.startswith("walker/")
     ]
+
+
+def corridor_arena(kind, length):
+    """An arena with the supplement's ranges, `length` m long."""
+    if kind == "gaps":
+        return corridor_arenas.GapsCorridor(
+            platform_length=distributions.Uniform(0.3, 2.5),
+            gap_length=distributions.Uniform(0.75, 1.25),
+            corridor_width=10,
+            corridor_length=length,
+        )
+    unit = distributions.Uniform(0.0, 1.0)
+    return corridor_arenas.WallsCorridor(
+        wall_gap=5.0,
+        wall_width=distributions.Uniform(1, 7),
+        wall_height=distributions.Uniform(2.5, 4.0),
+        swap_wall_side=distributions.Bernoulli(0.5),
+        wall_rgba=colors.RgbVariation(unit, unit, unit, 1.0),
+        corridor_width=10,
+        corridor_length=length,
+        include_initial_padding=False,
+    )
+
+
+def corridor_rollout(arena, seed, actions):
+    walker = cmu_humanoid.CMUHumanoidPositionControlledV2020()
+    task = Corridor(
+        walker=walker, arena=arena, walker_spawn_position=(0.5, 0, 0), target_velocity=3.0, **TIMESTEPS
+    )
+    walker.observables.egocentric_camera.enabled = False
+    environment = composer.Environment(
+        task=task, time_limit=45, random_state=seed, strip_singleton_obs_buffer_dim=True
+    )
+    environment.reset()
+    environment._recompile_mjcf_every_episode = False  # keep this arena
+    geoms = arena_geoms(environment.physics.model.ptr)
     return geoms, rollout(environment, actions)
 
 
@@ -137,7 +163,7 @@ def main():
     parser.add_argument("--out", type=pathlib.Path, required=True, help="folder to write into")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    # One stream a rollout: a change to one leaves the others as they are.
+    # Each rollout has its own stream, so a change to one does not change the others.
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(arguments.seed).spawn(4)]
     seeds = [int(stream.integers(2**31)) for stream in streams]
     actions = [stream.uniform(-0.2, 0.2, (STEPS, 56)) for stream in streams]
@@ -152,30 +178,11 @@ def main():
             near_targets, (0.0, 0.0), near.uniform(-3, 3), seeds[1], actions[1]
         ),
     }
-    unit = distributions.Uniform(0.0, 1.0)
-    # The supplement's ranges, in a shorter corridor.
-    made = {
-        "gaps": corridor_arenas.GapsCorridor(
-            platform_length=distributions.Uniform(0.3, 2.5),
-            gap_length=distributions.Uniform(0.75, 1.25),
-            corridor_width=10,
-            corridor_length=20,
-        ),
-        "walls": corridor_arenas.WallsCorridor(
-            wall_gap=5.0,
-            wall_width=distributions.Uniform(1, 7),
-            wall_height=distributions.Uniform(2.5, 4.0),
-            swap_wall_side=distributions.Bernoulli(0.5),
-            wall_rgba=colors.RgbVariation(unit, unit, unit, 1.0),
-            corridor_width=10,
-            corridor_length=20,
-            include_initial_padding=False,
-        ),
-    }
-    for index, (name, arena) in enumerate(made.items(), start=2):
-        geoms, arrays = corridor_rollout(arena, seeds[index], actions[index])
-        (arguments.out / f"{name}_arena.json").write_text(json.dumps(geoms, indent=0))
-        rollouts[f"{name}_rollout"] = arrays
+    # A shorter corridor than dm_control's keeps the files small.
+    for index, kind in enumerate(("gaps", "walls"), start=2):
+        geoms, arrays = corridor_rollout(corridor_arena(kind, 20), seeds[index], actions[index])
+        (arguments.out / f"{kind}_arena.json").write_text(json.dumps(geoms, indent=0))
+        rollouts[f"{kind}_rollout"] = arrays
     for name, arrays in rollouts.items():
         np.savez_compressed(arguments.out / f"{name}.npz", **arrays)
         summary(name, arrays)

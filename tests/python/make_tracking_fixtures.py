@@ -170,7 +170,7 @@ def write_clips(path, clips):
 
 
 class FixedStart(tracking.MultiClipMocapTracking):
-    """dm_control's task, with the one start (clip index, frame) it is told instead of all possible ones."""
+    """dm_control's task with a single start (clip index, frame) instead of all possible ones."""
 
     def __init__(self, start, **arguments):
         self._start = start
@@ -181,12 +181,12 @@ class FixedStart(tracking.MultiClipMocapTracking):
         self._start_probabilities = np.ones(1)
 
     def servo_action(self, frames_ahead, noise):
-        """The action whose position targets are the pose so many frames ahead, plus noise [56]."""
+        """The action whose position targets are the pose `frames_ahead` frames later, plus noise [56]."""
         joints = self._clip_reference_features["joints"][self._time_step + frames_ahead]
         return np.clip(self._walker.cmu_pose_to_actuation(joints) + noise, -1.0, 1.0)
 
     def measurements(self):
-        """What the task keeps to itself after a reset or a step."""
+        """Private values of the task after a reset or a step."""
         return {
             "termination_error": np.float64(self._termination_error),
             "reward_terms": np.array([np.ravel(self.last_reward_channels[c])[0] for c in CHANNELS], np.float64),
@@ -234,7 +234,7 @@ def rollout(walker, path, ids, clip, start, steps, act):
     for _ in range(steps):
         actions.append(act(task))
         timestep = environment.step(actions[-1])
-        environment._reset_next_step = False  # go on after a failure: more states to compare
+        environment._reset_next_step = False  # continue after a failure: more states to compare
         rows.append(row(environment, timestep))
     return {
         "clip": np.int64(clip),

@@ -13,7 +13,7 @@ use super::Subject;
 use super::figure::{Figure, Medians, interleave};
 use super::tape::Recorded;
 
-/// Control steps of a segment: a fifth of a second of computing. A corridor is compiled anew after as many.
+/// Control steps of a segment: a fifth of a second of computing. A corridor is replaced after as many.
 const STEPS: usize = 512;
 /// Resets of a segment.
 const RESETS: usize = 32;

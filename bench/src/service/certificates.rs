@@ -13,7 +13,7 @@ pub(super) struct Certificates {
 }
 
 impl Certificates {
-    /// Makes them with the `comic-learner` that lies beside this program.
+    /// Makes them with the program `comic-learner` in the directory of this one.
     pub(super) fn new() -> Result<Self> {
         let directory = std::env::temp_dir().join(format!("comic-bench-{}", std::process::id()));
         let name = directory.to_str().context("the name of the temporary directory is not UTF-8")?.to_owned();

@@ -24,8 +24,8 @@ pub struct MinibatchSource<'a> {
 }
 
 /// A minibatch of unrolls, batch first, one tensor for each field: float32, but int64 for [`Field::Clip`] and uint8 for
-/// [`Field::Image`]. A field with one number in each row is `[B, rows]`, [`Field::State`] is `[B, S]`, every other field
-/// `[B, rows, width]`.
+/// [`Field::Image`], which is undefined when the task has no camera. A field with one number in each row is `[B, rows]`,
+/// [`Field::State`] is `[B, S]`, every other field `[B, rows, width]`.
 ///
 /// The numbers of a row that holds no transition (its action, distribution, reward, latent) are blanked when the tensors
 /// are made, so no formula can use them. Its observation stays, because a truncated episode is bootstrapped there.
@@ -64,6 +64,7 @@ impl MinibatchTensors {
                     let clips: Vec<i64> = source.clip.iter().map(|clip| i64::from(*clip)).collect();
                     upload(&clips, &size, device)
                 }
+                Field::Image if shape.unroll.image == 0 => Ok(Tensor::new()),
                 Field::Image => upload(source.image, &size, device),
                 _ => upload(source.floats[field], &size, device),
             };
@@ -111,7 +112,7 @@ impl MinibatchTensors {
 
     /// The camera images, `[B, T+1, I]`, uint8; `None` when the task has no camera.
     pub fn image(&self) -> Option<&Tensor> {
-        (self.shape.unroll.image > 0).then(|| &self.fields[Field::Image])
+        Some(&self.fields[Field::Image]).filter(|image| image.defined())
     }
 
     /// The unrolls at `unrolls`, each below B, copied.
@@ -122,7 +123,10 @@ impl MinibatchTensors {
             routing: Routing::blocked(&tasks, self.shape.tasks, self.device()),
             tasks,
             shape: MinibatchShape { unrolls: unrolls.len(), ..self.shape },
-            fields: self.fields.each_ref().map(|_, tensor| tensor.index_select(0, &indices)),
+            fields: self.fields.each_ref().map(|_, tensor| match tensor.defined() {
+                true => tensor.index_select(0, &indices),
+                false => Tensor::new(),
+            }),
             clips: self.clips,
         }
     }

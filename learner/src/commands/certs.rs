@@ -1,4 +1,4 @@
-//! `comic-learner certs`: a certificate authority for development, and certificates of it.
+//! `comic-learner certs`: a certificate authority for development, and its certificates.
 
 use std::fs::{self, OpenOptions};
 use std::io::Write as _;
@@ -14,50 +14,50 @@ use time::{Duration, OffsetDateTime};
 
 use crate::error::{Error, Result};
 
-/// Makes an authority and certificates for a learner and its actors, or, where DIR holds an authority, renews the
-/// certificates by it: a learner and actors that run take them up by themselves.
+/// Makes an authority and certificates for a learner and its actors. If DIR already holds an authority, the certificates are
+/// renewed with it; a running learner and running actors use the new ones without a restart.
 #[derive(Clone, Debug, Args)]
 #[command(
-    after_help = "DIR then holds ca.pem, server.pem and client.pem, each with its -key.pem, readable by their owner alone.\n\
-    The authority's key is kept beside them: this is for development, not for an authority that others rely on."
+    after_help = "DIR then holds ca.pem, server.pem and client.pem, each with its -key.pem, readable only by their owner.\n\
+    The authority's key is in the same directory: use it for development only."
 )]
 pub struct Certs {
-    /// Where they are put.
+    /// Directory of the authority and the certificates.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Names and addresses by which actors reach the learner.
+    /// Names and addresses under which actors reach the learner.
     #[arg(long = "name", value_name = "NAME", num_args = 1.., default_values = ["localhost", "127.0.0.1", "::1"])]
     pub names: Vec<String>,
-    /// Days for which the learner's and the actors' certificates hold, from now on.
+    /// Days for which the certificates of the learner and the actors are valid.
     #[arg(long, default_value_t = 90, value_parser = clap::value_parser!(u16).range(1..=3650))]
     pub days: u16,
-    /// A token for both, too, in DIR/token, unless there is one already.
+    /// Also make a token for both, in DIR/token, unless it exists.
     #[arg(long)]
     pub token: bool,
-    /// Where what the learner needs is put as well, without the authority's key.
+    /// Copy the files that the learner needs to this directory, without the authority's key.
     #[arg(long, value_name = "DIR")]
     pub copy_for_learner: Option<PathBuf>,
-    /// Where what actors need is put as well, with neither the authority's key nor the learner's.
+    /// Copy the files that actors need to this directory, without the keys of the authority and the learner.
     #[arg(long, value_name = "DIR")]
     pub copy_for_actors: Option<PathBuf>,
 }
 
-/// What actors show and trust. Keys come before certificates: whoever looks in between finds two that do not fit, and keeps
-/// what it has.
-const ACTORS: [&str; 4] = ["token", "client-key.pem", "client.pem", "ca.pem"];
-/// What the learner shows, beside what its own health checks do.
-const LEARNER: [&str; 2] = ["server-key.pem", "server.pem"];
+/// Files of actors. Keys come before certificates: a program that reads the files in between finds a key and a certificate
+/// that do not fit, and keeps the ones that it has.
+const ACTOR_FILES: [&str; 4] = ["token", "client-key.pem", "client.pem", "ca.pem"];
+/// Files of the learner; its health checks also need those of actors.
+const LEARNER_FILES: [&str; 2] = ["server-key.pem", "server.pem"];
 
-/// Days for which an authority holds.
+/// Days for which an authority is valid.
 const AUTHORITY_DAYS: i64 = 3650;
-/// Clocks may differ by so much.
+/// The difference that clocks may have.
 const SKEW: Duration = Duration::minutes(5);
 
 impl Certs {
     /// Writes the files and names them on stdout.
     ///
     /// # Errors
-    /// A name that is none, an authority that cannot be used, a directory that cannot be written.
+    /// An invalid name, an authority that cannot be used, a directory that cannot be written.
     pub fn run(&self) -> Result<()> {
         fs::create_dir_all(&self.out).map_err(Error::file("make", &self.out))?;
         let now = OffsetDateTime::now_utc();
@@ -66,8 +66,9 @@ impl Certs {
         let server = ("server", self.names.clone(), ExtendedKeyUsagePurpose::ServerAuth);
         let client = ("client", vec!["comic-actor".to_owned()], ExtendedKeyUsagePurpose::ClientAuth);
         for (name, subjects, usage) in [server, client] {
-            let mut params = CertificateParams::new(subjects)
-                .map_err(|error| Error::configuration(format!("--name is no host name and no address: {error}")))?;
+            let mut params = CertificateParams::new(subjects).map_err(|error| {
+                Error::configuration(format!("--name is neither a host name nor an address: {error}"))
+            })?;
             params.distinguished_name.push(DnType::CommonName, format!("CoMic {name}"));
             params.extended_key_usages = vec![usage];
             params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
@@ -80,11 +81,11 @@ impl Certs {
             let token: String = hex::encode(rand::rng().random::<[u8; 32]>());
             put(&self.out, "token", 0o600, &format!("{token}\n"))?;
         }
-        if let Some(place) = &self.copy_for_learner {
-            LEARNER.iter().chain(&ACTORS).try_for_each(|file| self.copy(file, place))?;
+        if let Some(directory) = &self.copy_for_learner {
+            LEARNER_FILES.iter().chain(&ACTOR_FILES).try_for_each(|file| self.copy(file, directory))?;
         }
-        if let Some(place) = &self.copy_for_actors {
-            ACTORS.iter().try_for_each(|file| self.copy(file, place))?;
+        if let Some(directory) = &self.copy_for_actors {
+            ACTOR_FILES.iter().try_for_each(|file| self.copy(file, directory))?;
         }
         Ok(())
     }
@@ -95,7 +96,7 @@ impl Certs {
             return Ok(());
         }
         let text = fs::read_to_string(&from).map_err(Error::file("read", &from))?;
-        // What is the same is left alone: an actor may read it just now.
+        // A file with the same contents is not written, because an actor may be reading it.
         if fs::read_to_string(place.join(file)).is_ok_and(|there| there == text) {
             return Ok(());
         }
@@ -111,7 +112,10 @@ impl Certs {
             let read = |path: &Path| {
                 let text = fs::read_to_string(path);
                 text.map_err(|error| {
-                    Error::configuration(format!("half an authority: cannot read {}: {error}", path.display()))
+                    Error::configuration(format!(
+                        "the authority is incomplete: cannot read {}: {error}",
+                        path.display()
+                    ))
                 })
             };
             let (certificate, key) = (read(&certificate)?, read(&key)?);
@@ -132,21 +136,22 @@ impl Certs {
     }
 
     fn write(&self, name: &str, certificate: &str, key: &KeyPair) -> Result<()> {
-        // The key first: a learner that looks in between finds two that do not fit, and keeps what it has.
+        // The key first, as in `ACTOR_FILES`.
         put(&self.out, &format!("{name}-key.pem"), 0o600, &key.serialize_pem())?;
         put(&self.out, &format!("{name}.pem"), 0o644, certificate)?;
-        // Nobody has to read it.
+        // An error is not important: stdout may be closed.
         let _ = writeln!(std::io::stdout(), "{}", self.out.join(format!("{name}.pem")).display());
         Ok(())
     }
 }
 
+/// Writes a file with this mode.
 fn put(directory: &Path, file: &str, mode: u32, text: &str) -> Result<()> {
     let path = directory.join(file);
     let mut open = OpenOptions::new();
     let file = open.create(true).write(true).truncate(true).mode(mode).open(&path);
     let mut file = file.map_err(Error::file("write", &path))?;
-    // A file that was there keeps its own mode.
+    // An existing file would keep its own mode.
     let written = file.set_permissions(fs::Permissions::from_mode(mode)).and_then(|()| file.write_all(text.as_bytes()));
     written.map_err(Error::file("write", &path))
 }
@@ -162,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn each_side_gets_what_it_needs_and_nobody_the_authoritys_key() {
+    fn each_side_gets_the_files_that_it_needs_and_no_side_the_authoritys_key() {
         let directory = tempfile::tempdir().unwrap();
         let place = |name: &str| directory.path().join(name);
         let apart = Certs {
@@ -183,36 +188,39 @@ mod tests {
         assert_eq!(fs::metadata(place("actors").join("client-key.pem")).unwrap().permissions().mode() & 0o777, 0o600);
     }
 
-    /// An actor may read them just now.
+    /// Because an actor may be reading them.
     #[test]
-    fn copies_of_what_did_not_change_are_left_alone() {
+    fn unchanged_copies_are_not_written() {
         let directory = tempfile::tempdir().unwrap();
         let place = directory.path().join("actors");
         let apart = Certs { copy_for_actors: Some(place.clone()), ..certs(&directory.path().join("authority")) };
         apart.run().unwrap();
         let long_ago = std::time::SystemTime::UNIX_EPOCH;
         let written = |name: &str| fs::metadata(place.join(name)).unwrap().modified().unwrap() != long_ago;
-        for name in ACTORS {
+        for name in ACTOR_FILES {
             fs::File::options().write(true).open(place.join(name)).unwrap().set_modified(long_ago).unwrap();
         }
         apart.run().unwrap();
-        assert_eq!(ACTORS.map(written), ACTORS.map(|name| name.starts_with("client")), "{ACTORS:?}");
+        assert_eq!(ACTOR_FILES.map(written), ACTOR_FILES.map(|name| name.starts_with("client")), "{ACTOR_FILES:?}");
     }
 
     #[test]
-    fn what_is_made_can_be_served_and_the_keys_are_their_owners() {
+    fn the_certificates_can_be_served_and_only_the_owner_can_read_the_keys() {
         let directory = tempfile::tempdir().unwrap();
         certs(directory.path()).run().unwrap();
         let file = |name: &str| directory.path().join(name);
         Tls::new(&file("server.pem"), &file("server-key.pem"), Some(&file("ca.pem"))).unwrap();
-        assert!(Tls::new(&file("server.pem"), &file("client-key.pem"), None).is_err(), "another's key");
+        assert!(
+            Tls::new(&file("server.pem"), &file("client-key.pem"), None).is_err(),
+            "the key of another certificate"
+        );
         for key in ["ca-key.pem", "server-key.pem", "client-key.pem", "token"] {
             assert_eq!(fs::metadata(file(key)).unwrap().permissions().mode() & 0o777, 0o600, "{key}");
         }
     }
 
     #[test]
-    fn a_second_time_the_certificates_are_renewed_by_the_same_authority() {
+    fn a_second_run_renews_the_certificates_with_the_same_authority() {
         let directory = tempfile::tempdir().unwrap();
         let read = |name: &str| fs::read_to_string(directory.path().join(name)).unwrap();
         certs(directory.path()).run().unwrap();

@@ -1,4 +1,4 @@
-//! `comic-learner export`: a checkpoint's policy, or a part of it, as a file that others read.
+//! `comic-learner export`: writes a checkpoint's policy, or a part of it, to a file for other programs.
 
 use std::path::Path;
 
@@ -9,25 +9,25 @@ use crate::checkpoint::progress::Progress;
 use crate::checkpoint::{self, Snapshot};
 use crate::error::{Error, Result};
 
-/// What the file's extension says it is.
+/// The format of a file, which its extension names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Form {
+enum Format {
     Safetensors,
     TorchScript,
 }
 
-/// Writes `part` of the newest checkpoint that `path` names to `out`. It is the online policy's, which evaluations take too.
+/// Writes `part` of the newest checkpoint at `path` to `out`. It is a part of the online policy, as in evaluations.
 ///
 /// # Errors
-/// No checkpoint, no such part in it, another extension than `.safetensors` and `.pt`, or a disk that refuses.
+/// No checkpoint, no such part in it, an extension other than `.safetensors` and `.pt`, or a disk that fails.
 pub fn run(path: &Path, part: Part, out: &Path) -> Result<()> {
-    let form = form(out)?;
+    let format = format_of(out)?;
     let (place, snapshot) = checkpoint::find(path)?;
     let exported =
-        take(&place, part, &snapshot).map_err(Error::within(format!("cannot export {}", place.display())))?;
-    let written = match form {
-        Form::Safetensors => std::fs::write(out, &exported.bytes).map_err(Error::file("write", out)),
-        Form::TorchScript => {
+        read(&place, part, &snapshot).map_err(Error::within(format!("cannot export {}", place.display())))?;
+    let written = match format {
+        Format::Safetensors => std::fs::write(out, &exported.bytes).map_err(Error::file("write", out)),
+        Format::TorchScript => {
             exported.save_script(out).map_err(Error::within(format!("cannot write {}", out.display())))
         }
     };
@@ -36,24 +36,25 @@ pub fn run(path: &Path, part: Part, out: &Path) -> Result<()> {
     Ok(())
 }
 
-fn form(out: &Path) -> Result<Form> {
+fn format_of(out: &Path) -> Result<Format> {
     match out.extension().and_then(|extension| extension.to_str()) {
-        Some("safetensors") => Ok(Form::Safetensors),
-        Some("pt") => Ok(Form::TorchScript),
+        Some("safetensors") => Ok(Format::Safetensors),
+        Some("pt") => Ok(Format::TorchScript),
         _ => {
             Err(Error::configuration(format!("--out {}: name it .safetensors, or .pt for TorchScript", out.display())))
         }
     }
 }
 
-fn take(place: &Path, part: Part, snapshot: &Snapshot) -> Result<Exported> {
+/// Makes the file's contents of a snapshot.
+fn read(place: &Path, part: Part, snapshot: &Snapshot) -> Result<Exported> {
     let experiment = Experiment::from_toml("experiment.toml of the checkpoint", snapshot.text("experiment.toml")?)?;
     let progress: Progress =
         serde_json::from_slice(snapshot.part("progress.json")?).map_err(Error::json("the checkpoint's progress"))?;
     let name = |path: Option<&Path>| {
         path.and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
     };
-    // RUN/checkpoints/NAME, wherever it was named from.
+    // RUN/checkpoints/NAME, whatever the working directory is.
     let place = std::path::absolute(place).map_err(Error::file("find", place))?;
     let source = Source {
         program: concat!(env!("CARGO_PKG_NAME"), " ", env!("CARGO_PKG_VERSION")).into(),

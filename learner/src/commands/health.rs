@@ -1,4 +1,4 @@
-//! `comic-learner health`: does a learner serve?
+//! `comic-learner health`: asks whether a learner serves.
 
 use std::io::Write as _;
 use std::process::ExitCode;
@@ -12,14 +12,14 @@ use tonic_health::pb::health_client::HealthClient;
 
 use crate::error::{Error, Result};
 
-/// Asks a learner by the gRPC health protocol; where it wants client certificates, one has to be shown, and a token
-/// never. Exits with 0 if it serves, and with 1 whatever else is the case.
+/// Asks a learner by the gRPC health protocol. No token is needed, but a certificate if the learner requires them. Exits with
+/// 0 if it serves, and with 1 in all other cases.
 #[derive(Clone, Debug, Args)]
 pub struct Health {
     /// The learner's address.
     #[arg(long, value_name = "URL", env = "COMIC_LEARNER", default_value = "http://127.0.0.1:7070")]
     pub learner: String,
-    /// Seconds within which it has to answer.
+    /// Seconds within which it must answer.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=600))]
     pub timeout: u64,
     /// How to reach it.
@@ -28,11 +28,11 @@ pub struct Health {
 }
 
 impl Health {
-    /// Asks and says.
+    /// Asks, and prints the answer.
     pub fn run(&self) -> ExitCode {
         match self.ask() {
             Ok(()) => {
-                // Nobody has to read it.
+                // An error is not important: stdout may be closed.
                 let _ = writeln!(std::io::stdout(), "serving");
                 ExitCode::SUCCESS
             }

@@ -9,11 +9,11 @@ use crate::document::DocumentArguments;
 use crate::error::{Error, Result};
 use crate::vmpo::VmpoLearner;
 
-/// The paper's own, whose low levels are of similar size.
+/// The paper's presets.
 const PRESETS: [&str; 6] =
     ["tracking-mlp", "tracking-lstm", "tracking-mixture", "tracking-product", "joint-get-up", "joint-ball"];
 
-/// Trained parameters by what they are part of: `encoder`, `low level`, `value`, each over all tasks.
+/// The numbers of trained parameters of the parts `encoder`, `low level` and `value`, each summed over all tasks.
 ///
 /// # Errors
 /// When the experiment's networks cannot be built.
@@ -33,7 +33,7 @@ pub fn count(experiment: &Experiment) -> Result<BTreeMap<&'static str, usize>> {
     Ok(counts)
 }
 
-/// The table of an experiment, or of the presets where none is named, as Markdown.
+/// The table of the named experiment, or of the paper's presets, as Markdown.
 ///
 /// # Errors
 /// When there is no such experiment, or its networks cannot be built.
@@ -64,12 +64,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_are_read_by_thousands() {
+    fn digits_are_grouped_by_thousands() {
         assert_eq!([7, 1_000, 1_234_567].map(thousands), ["7", "1,000", "1,234,567"]);
     }
 
     #[test]
-    fn the_mlps_counts_are_those_of_its_layers() {
+    fn the_counts_of_the_mlp_follow_from_its_layers() {
         let experiment = comic_experiment::resolve("tracking-mlp", &[]).unwrap();
         let counts = count(&experiment).unwrap();
         let layer = |input: usize, output: usize| (input + 1) * output;

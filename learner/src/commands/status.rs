@@ -1,4 +1,4 @@
-//! `comic-learner status`: the state of a running learner, for a person or a script.
+//! `comic-learner status`: the state of a running learner, as text or JSON.
 
 use std::fmt::{self, Write as _};
 use std::io::{IsTerminal as _, Write as _};
@@ -13,10 +13,10 @@ use tonic::Code;
 
 use crate::error::{Error, Result};
 
-/// How often `--watch` asks.
-const EVERY: Duration = Duration::from_secs(2);
-/// A learner that does not answer in this time is not there.
-const PATIENCE: Duration = Duration::from_secs(10);
+/// The interval of `--watch`.
+const INTERVAL: Duration = Duration::from_secs(2);
+/// The time within which a learner must answer.
+const TIME_LIMIT: Duration = Duration::from_secs(10);
 
 /// Prints run, speed, queue, ages, accounting and actors of a running learner.
 #[derive(Clone, Debug, Args)]
@@ -27,7 +27,7 @@ pub struct Status {
     /// One JSON object on one line.
     #[arg(long)]
     pub json: bool,
-    /// Again every two seconds, on the same screen; a learner that is away is waited for.
+    /// Repeat every two seconds on the same screen, also while the learner does not answer.
     #[arg(long)]
     pub watch: bool,
     /// How to reach it.
@@ -36,10 +36,10 @@ pub struct Status {
 }
 
 impl Status {
-    /// Asks and prints.
+    /// Asks, and prints the answer.
     ///
     /// # Errors
-    /// A learner that does not answer; [`Error::Configuration`] if it refuses the token or one side the other's certificate.
+    /// A learner that does not answer; [`Error::Configuration`] if the token or a certificate is not accepted.
     pub fn run(&self) -> Result<()> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
         let runtime = runtime.map_err(Error::system("cannot start tokio"))?;
@@ -54,7 +54,7 @@ impl Status {
                     Err(error) => self.show(&format!("{}\n", chain(&error)))?,
                 }
                 tokio::select! {
-                    () = tokio::time::sleep(EVERY) => {}
+                    () = tokio::time::sleep(INTERVAL) => {}
                     _ = tokio::signal::ctrl_c() => return Ok(()),
                 }
             }
@@ -64,27 +64,27 @@ impl Status {
     async fn ask(&self) -> Result<v1::Status> {
         let (endpoint, bearer) = (self.access.endpoint(&self.learner)?, self.access.bearer()?);
         let call = async {
-            let channel = endpoint.connect().await.map_err(|error| self.judge(&error, false))?;
+            let channel = endpoint.connect().await.map_err(|error| self.classify(&error, false))?;
             let mut client = LearnerClient::with_interceptor(channel, bearer);
             let answer = client.get_status(StatusRequest {}).await;
-            answer.map_err(|status| self.judge(&status, status.code() == Code::Unauthenticated))
+            answer.map_err(|status| self.classify(&status, status.code() == Code::Unauthenticated))
         };
-        let answer = tokio::time::timeout(PATIENCE, call).await;
-        let late = |_| Error::NoAnswer(format!("{} does not answer within {PATIENCE:?}", self.learner));
+        let answer = tokio::time::timeout(TIME_LIMIT, call).await;
+        let late = |_| Error::NoAnswer(format!("{} does not answer within {TIME_LIMIT:?}", self.learner));
         Ok(answer.map_err(late)??.into_inner())
     }
 
-    /// What is refused now will be refused again.
-    fn judge(&self, error: &(dyn std::error::Error + 'static), refused: bool) -> Error {
-        let said = format!("{}: {}", self.learner, chain(error));
-        if refused || distrusted(error) { Error::Configuration(said) } else { Error::NoAnswer(said) }
+    /// An error of a call. A `refused` token and a certificate that is not trusted are wrong configurations.
+    fn classify(&self, error: &(dyn std::error::Error + 'static), refused: bool) -> Error {
+        let message = format!("{}: {}", self.learner, chain(error));
+        if refused || distrusted(error) { Error::Configuration(message) } else { Error::NoAnswer(message) }
     }
 
     fn render(&self, status: &v1::Status) -> String {
         if self.json { format!("{}\n", to_json(status)) } else { Text(status).to_string() }
     }
 
-    /// On a terminal the screen is used again; elsewhere one state follows the other.
+    /// Prints a state. On a terminal it replaces the one before.
     fn show(&self, text: &str) -> Result<()> {
         let clear = if std::io::stdout().is_terminal() && !self.json { "\x1b[H\x1b[2J" } else { "" };
         print(&format!("{clear}{text}"))
@@ -130,7 +130,7 @@ fn to_json(status: &v1::Status) -> Value {
     })
 }
 
-/// For a person.
+/// The state as text.
 struct Text<'a>(&'a v1::Status);
 
 impl fmt::Display for Text<'_> {
@@ -141,15 +141,15 @@ impl fmt::Display for Text<'_> {
         let rate = |name: &str| metrics[name].as_f64().unwrap_or_default();
         let seconds = status.uptime_seconds as u64;
         let (hours, minutes, seconds) = (seconds / 3600, seconds / 60 % 60, seconds % 60);
-        writeln!(f, "run       {} ({}), up {hours}:{minutes:02}:{seconds:02}", status.run, status.experiment)?;
-        writeln!(f, "          learner epoch {}, version {}", status.learner_epoch, whole("version"))?;
+        writeln!(f, "run         {} ({}), up {hours}:{minutes:02}:{seconds:02}", status.run, status.experiment)?;
+        writeln!(f, "            learner epoch {}, version {}", status.learner_epoch, whole("version"))?;
         let (updates, steps) = (rate("updates_per_second"), rate("steps_per_second"));
-        writeln!(f, "training  {updates:.2} updates/s, {} environment steps/s", grouped(steps.round() as u64))?;
-        writeln!(f, "          {} updates, {} environment steps", whole("updates"), whole("environment_steps"))?;
+        writeln!(f, "training    {updates:.2} updates/s, {} environment steps/s", grouped(steps.round() as u64))?;
+        writeln!(f, "            {} updates, {} environment steps", whole("updates"), whole("environment_steps"))?;
         let queue = status.queue.unwrap_or_default();
-        writeln!(f, "queue     {} of {} unrolls, {} more wait", queue.unrolls, queue.capacity, queue.waiting)?;
+        writeln!(f, "queue       {} of {} unrolls, {} waiting", queue.unrolls, queue.capacity, queue.waiting)?;
         let ages = status.ages.unwrap_or_default();
-        writeln!(f, "ages      median {}, p99 {}, at most {} versions", ages.median, ages.p99, ages.max)?;
+        writeln!(f, "ages        median {}, p99 {}, at most {} versions", ages.median, ages.p99, ages.max)?;
         let v1::Accounting { produced, trained, in_flight, duplicates, unattributed, .. } =
             status.accounting.unwrap_or_default();
         let accounting = status.accounting.unwrap_or_default();
@@ -161,25 +161,25 @@ impl fmt::Display for Text<'_> {
         ];
         let sum = grouped(dropped.iter().map(|(_, count)| count).sum());
         let (produced, trained) = (grouped(produced), grouped(trained));
-        writeln!(f, "accounting     produced {produced} = trained {trained} + dropped {sum} + in flight {in_flight}")?;
+        writeln!(f, "accounting  produced {produced} = trained {trained} + dropped {sum} + in flight {in_flight}")?;
         let reasons: Vec<_> = dropped.iter().map(|(reason, count)| format!("{reason} {}", grouped(*count))).collect();
-        writeln!(f, "          dropped: {}", reasons.join(", "))?;
-        writeln!(f, "          beside them: duplicates {duplicates}, unattributed {unattributed}")?;
+        writeln!(f, "            dropped: {}", reasons.join(", "))?;
+        writeln!(f, "            beside them: duplicates {duplicates}, unattributed {unattributed}")?;
         for (name, task) in metrics["tasks"].as_object().into_iter().flatten() {
             let [produced, trained, in_flight] =
                 ["produced", "trained", "in_flight"].map(|part| count(&task["accounting"][part]));
             let dropped =
                 task["accounting"]["dropped"].as_object().into_iter().flatten().map(|(_, part)| count(part)).sum();
             let [produced, trained, dropped, in_flight] = [produced, trained, dropped, in_flight].map(grouped);
-            let assignments = format!("trained {trained} + dropped {dropped} + in flight {in_flight}");
-            writeln!(f, "          {name}: produced {produced} = {assignments}")?;
+            let sum = format!("trained {trained} + dropped {dropped} + in flight {in_flight}");
+            writeln!(f, "            {name}: produced {produced} = {sum}")?;
         }
         let actors = status.actors.unwrap_or_default();
-        writeln!(f, "actors    {} alive, {} slow, {} lost", actors.alive, actors.slow, actors.lost)
+        writeln!(f, "actors      {} alive, {} slow, {} lost", actors.alive, actors.slow, actors.lost)
     }
 }
 
-/// What is not there is none.
+/// A count; 0 if it is absent.
 fn count(number: &Value) -> u64 {
     number.as_u64().unwrap_or_default()
 }
@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn a_learner_that_has_nothing_to_tell_yet_is_shown() {
+    fn the_state_of_a_learner_without_metrics_is_shown() {
         let text = Text(&v1::Status::default()).to_string();
         assert!(text.contains("0.00 updates/s") && text.contains("0 alive"), "{text}");
         assert_eq!(to_json(&v1::Status::default())["accounting"]["trained"], 0);

@@ -1,11 +1,11 @@
-// Copies to a card on a stream of their own: tch knows neither streams nor memory that a card can read by itself.
+// Copies to a GPU on a separate stream: tch has neither streams nor pinned memory, which a GPU can read by itself.
 //
-// The calling thread's kernels run on the current stream. What is copied there waits for every kernel before it; on a stream
-// beside it a batch comes while the update before is still computed. Three things make that safe, all of them PyTorch's:
-// - the pinned memory is libtorch's, which does not give it out again before the copy was seen to end;
-// - the current stream waits for the copy before whatever it is given from now on;
-// - the copy's memory is told of the current stream, so that it is not given out again before that is done with it.
-// Only what libtorch has for every kind of device is called, so that this takes no header of NVIDIA's.
+// The calling thread's kernels run on the current stream, where a copy would wait for every kernel before it. On a separate
+// stream a batch is copied while the update before it is still computed. PyTorch makes that safe in three ways:
+// - libtorch owns the pinned memory, and does not reuse it before the copy has ended;
+// - the current stream waits for the copy before any later work;
+// - the copy's memory is recorded on the current stream, so it is not reused before that stream has finished with it.
+// Only functions that libtorch has for every kind of device are called, so this needs no header of NVIDIA's.
 
 #include <ATen/ATen.h>
 #include <c10/core/Event.h>
@@ -18,7 +18,7 @@
 
 namespace {
 
-// One of each thread that copies: its copies come one after another.
+// One for each thread that copies, so that its copies run one after another.
 c10::Stream copies(c10::Device device) {
   thread_local std::optional<c10::Stream> stream;
   if (!stream || stream->device() != device) {
@@ -36,7 +36,7 @@ at::Tensor* refuse(const char* why, char* message, size_t room) {
 
 }  // namespace
 
-// A tensor on a card with this size and these bytes, which is the caller's; none, and why not, when the card refuses.
+// A tensor on a GPU with this size and these bytes, owned by the caller. If the GPU refuses, null and the reason in `message`.
 extern "C" at::Tensor* comic_upload(const void* bytes, const int64_t* size, size_t dimensions, int8_t kind, int64_t card,
                                     char* message, size_t room) {
   try {

@@ -1,9 +1,8 @@
-// XLA's place in libtorch's table of devices, for callers that do not know it by name.
+// Registers XLA in libtorch's table of devices, for callers that have no name for it.
 //
-// tch numbers devices as CPU, CUDA, MPS and Vulkan, and tells a tensor on any other device to be on MPS. MPS is Apple's,
-// and no libtorch for Linux has it, so here the name is free: a new tensor asked for on MPS is made on XLA, and one on XLA
-// says that it is on MPS. Every other operation is dispatched by the tensors it gets, so these two factories are all there
-// is to it.
+// tch numbers devices as CPU, CUDA, MPS and Vulkan, and reports a tensor on any other device as MPS. MPS belongs to Apple,
+// and no libtorch for Linux has it, so the name is free here. A new tensor on MPS is made on XLA, and a tensor on XLA reports
+// MPS. Every other operation is dispatched by its tensors, so these two factories are enough.
 
 #include <ATen/ATen.h>
 #include <c10/core/impl/DeviceGuardImplInterface.h>
@@ -13,13 +12,13 @@
 
 namespace {
 
-// As the learner left it, before the first tensor.
+// Set by the learner before the first tensor.
 int index() {
   const char* text = std::getenv("COMIC_XLA_INDEX");
   return text == nullptr ? 0 : std::atoi(text);
 }
 
-// Which of several: torch_xla's own choice is one of each thread, and this one is the process's.
+// The device's number for the whole process: torch_xla itself has one for each thread.
 at::Device xla() {
   static const at::Device device{at::kXLA, static_cast<c10::DeviceIndex>(index())};
   return device;

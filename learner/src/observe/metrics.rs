@@ -7,7 +7,7 @@ use std::ops::AddAssign;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use comic_experiment::TaskSpec;
+use comic_experiment::{TaskPart, TaskSpec};
 use comic_proto::Field;
 use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
 use comic_replay::{AccountingByTask, Batch};
@@ -258,9 +258,27 @@ impl Metrics {
     /// Writes the line, starts a new window, and returns the line for the status. If the disk refuses, the error is logged,
     /// and training continues.
     pub fn write(&mut self, position: Position, accounting: AccountingByTask, losses: Map<String, Value>) -> String {
-        let seconds = self.since.elapsed().as_secs_f64().max(1e-9);
-        let window = std::mem::take(&mut self.window);
+        let line = self.line(position, &accounting, losses);
+        self.window = Window::default();
         self.since = Instant::now();
+        self.accounting = accounting;
+        if let Some(Err(error)) = self.events.as_mut().map(|events| events.write(&line)) {
+            tracing::error!("TensorBoard's file lacks a line: {error}");
+        }
+        let line = line.to_string();
+        // A line that a full disk cut off is not continued.
+        let start = if self.torn { "\n" } else { "" };
+        let written = self.file.write_all(format!("{start}{line}\n").as_bytes());
+        self.torn = written.is_err();
+        if let Err(error) = written {
+            tracing::error!("metrics.jsonl lacks a line: {error}");
+        }
+        line
+    }
+
+    fn line(&self, position: Position, accounting: &AccountingByTask, losses: Map<String, Value>) -> Value {
+        let window = &self.window;
+        let seconds = self.elapsed().max(1e-9);
         let environment_steps: u64 = window.tasks.iter().map(|task| task.rows.environment_steps).sum();
         let named = self.spec.reward_terms.iter().zip(&window.returns);
         let terms: Map<String, Value> =
@@ -283,39 +301,26 @@ impl Metrics {
             line[name] = value;
         }
         if self.spec.tasks.len() > 1 {
-            line["tasks"] = self
-                .spec
-                .tasks
-                .iter()
-                .enumerate()
-                .map(|(index, task)| {
-                    // Without an update since the last line, the accounting may have changed all the same.
-                    let window = window.tasks.get(index).cloned().unwrap_or_default();
-                    let mut entries: Map<String, Value> =
-                        window.episodes.entries().map(|(name, value)| (name.to_string(), value)).into_iter().collect();
-                    entries.insert("unrolls".into(), json!(window.unrolls));
-                    let Rows { rows, environment_steps, padding } = window.rows;
-                    entries.insert("environment_steps".into(), json!(environment_steps));
-                    entries.insert("padding_share".into(), per(padding as f64, rows));
-                    entries.insert("accounting".into(), json!(accounting.tasks.get(&task.name)));
-                    (task.name.clone(), Value::Object(entries))
-                })
-                .collect::<Map<String, Value>>()
-                .into();
-        }
-        self.accounting = accounting;
-        if let Some(Err(error)) = self.events.as_mut().map(|events| events.write(&line)) {
-            tracing::error!("TensorBoard's file lacks a line: {error}");
-        }
-        let line = line.to_string();
-        // A line that a full disk cut off is not continued.
-        let start = if self.torn { "\n" } else { "" };
-        let written = self.file.write_all(format!("{start}{line}\n").as_bytes());
-        self.torn = written.is_err();
-        if let Err(error) = written {
-            tracing::error!("metrics.jsonl lacks a line: {error}");
+            line["tasks"] = self.by_task(accounting).into();
         }
         line
+    }
+
+    /// The entries of each task, by its name.
+    fn by_task(&self, accounting: &AccountingByTask) -> Map<String, Value> {
+        let entries = |(index, task): (usize, &TaskPart)| {
+            // Without an update since the last line, the accounting may have changed all the same.
+            let window = self.window.tasks.get(index).cloned().unwrap_or_default();
+            let mut entries: Map<String, Value> =
+                window.episodes.entries().map(|(name, value)| (name.to_string(), value)).into_iter().collect();
+            let Rows { rows, environment_steps, padding } = window.rows;
+            entries.insert("unrolls".into(), json!(window.unrolls));
+            entries.insert("environment_steps".into(), json!(environment_steps));
+            entries.insert("padding_share".into(), per(padding as f64, rows));
+            entries.insert("accounting".into(), json!(accounting.tasks.get(&task.name)));
+            (task.name.clone(), Value::Object(entries))
+        };
+        self.spec.tasks.iter().enumerate().map(entries).collect()
     }
 }
 

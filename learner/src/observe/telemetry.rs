@@ -1,124 +1,22 @@
-//! Every counter, gauge and histogram that `/metrics` shows, each with its name and what it means.
+//! Every counter, gauge and histogram that `/metrics` shows, each with its name and meaning.
 //!
 //! One registration gives the metric, its help text and its line of `docs/metrics.md` (`comic-learner metrics` prints
-//! that page). Counters begin at 0 when the process starts, except those of the accounting, which go on with the run.
+//! that page). Counters begin at 0 when the process starts, except those of the accounting, which continue over the whole run.
 
 use std::fmt::Write as _;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use comic_experiment::TaskName;
 use comic_replay::AccountingByTask;
 use parking_lot::Mutex;
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
-use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
-use prometheus_client::registry::{Metric, Registry};
 
 use crate::error::{Error, Result};
+use crate::observe::catalogue::{Catalogue, Description, Labelled, TASKS};
 use crate::observe::metrics::Rows;
-
-/// One label and its value.
-type Label = [(&'static str, &'static str); 1];
-
-/// What is known about a metric.
-#[derive(Debug)]
-struct Description {
-    name: &'static str,
-    kind: &'static str,
-    label: Option<&'static str>,
-    values: &'static [&'static str],
-    help: &'static str,
-}
-
-#[derive(Debug, Default)]
-struct Catalogue {
-    registry: Registry,
-    descriptions: Vec<Description>,
-}
-
-impl Catalogue {
-    fn add<M: Metric + Clone>(&mut self, kind: &'static str, name: &'static str, help: &'static str, metric: M) -> M {
-        self.registry.register(name, help, metric.clone());
-        self.descriptions.push(Description { name, kind, label: None, values: &[], help });
-        metric
-    }
-
-    fn counter(&mut self, name: &'static str, help: &'static str) -> Counter {
-        self.add("counter", name, help, Counter::default())
-    }
-
-    fn gauge(&mut self, name: &'static str, help: &'static str) -> Gauge {
-        self.add("gauge", name, help, Gauge::default())
-    }
-
-    fn histogram(
-        &mut self,
-        name: &'static str,
-        help: &'static str,
-        buckets: impl IntoIterator<Item = f64>,
-    ) -> Histogram {
-        self.add("histogram", name, help, Histogram::new(buckets))
-    }
-
-    /// One metric for each value of a label; all of them are there from the beginning.
-    fn labelled<M: Metric + Clone + Default>(
-        &mut self,
-        kind: &'static str,
-        (name, label): (&'static str, &'static str),
-        values: &'static [&'static str],
-        help: &'static str,
-    ) -> Labelled<M>
-    where
-        Family<Label, M>: Metric,
-    {
-        let family = Family::<Label, M>::default();
-        for value in values {
-            drop(family.get_or_create(&[(label, *value)]));
-        }
-        self.registry.register(name, help, family.clone());
-        self.descriptions.push(Description { name, kind, label: Some(label), values, help });
-        Labelled { family, label }
-    }
-
-    /// One metric for each task that there is, learnt or not.
-    fn of_tasks<M: Metric + Clone + Default>(
-        &mut self,
-        kind: &'static str,
-        name: &'static str,
-        help: &'static str,
-    ) -> Labelled<M>
-    where
-        Family<Label, M>: Metric,
-    {
-        self.labelled(kind, (name, "task"), &TASKS, help)
-    }
-}
-
-/// Every task's name.
-static TASKS: [&str; TaskName::ALL.len()] = {
-    let (mut names, mut at) = ([""; TaskName::ALL.len()], 0);
-    while at < names.len() {
-        names[at] = TaskName::ALL[at].name();
-        at += 1;
-    }
-    names
-};
-
-/// A metric with one label.
-#[derive(Clone, Debug)]
-pub(crate) struct Labelled<M> {
-    family: Family<Label, M>,
-    label: &'static str,
-}
-
-impl<M: Clone + Default> Labelled<M> {
-    pub(crate) fn of(&self, value: &'static str) -> M {
-        self.family.get_or_create_owned(&[(self.label, value)])
-    }
-}
 
 /// How many versions old the unrolls of the newest update were.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -157,7 +55,7 @@ pub struct Telemetry {
     sampled: Sampled,
 }
 
-/// What is counted elsewhere and read when somebody asks.
+/// Metrics that are counted elsewhere and read for each request.
 #[derive(Debug)]
 struct Sampled {
     produced: Counter,
@@ -188,20 +86,20 @@ struct SampledTasks {
 impl Sampled {
     fn new(catalogue: &mut Catalogue) -> Self {
         Self {
-            produced: catalogue.counter("comic_unrolls_produced", "Unrolls that the actors made, by their sequence numbers, over the run's whole life"),
-            trained: catalogue.counter("comic_unrolls_trained", "Unrolls trained on, over the run's whole life"),
+            produced: catalogue.counter("comic_unrolls_produced", "Unrolls that the actors made, by their sequence numbers, over the whole run"),
+            trained: catalogue.counter("comic_unrolls_trained", "Unrolls trained on, over the whole run"),
             dropped: catalogue.labelled(
                 "counter",
                 ("comic_unrolls_dropped", "reason"),
                 &["stale", "invalid", "superseded", "lost_at_restart"],
-                "Unrolls that will never be trained on, over the run's whole life",
+                "Unrolls that will never be trained on, over the whole run",
             ),
-            duplicates: catalogue.counter("comic_unrolls_duplicate", "Messages that repeated an unroll already accounted for, over the run's whole life"),
-            unattributed: catalogue.counter("comic_unrolls_unattributed", "Messages refused without an account to charge, over the run's whole life"),
+            duplicates: catalogue.counter("comic_unrolls_duplicate", "Messages that repeated an unroll already accounted for, over the whole run"),
+            unattributed: catalogue.counter("comic_unrolls_unattributed", "Messages refused that belong to no account, over the whole run"),
             in_flight: catalogue.gauge("comic_unrolls_in_flight", "Unrolls in a batch that is open, full, or being trained on"),
             capacity: catalogue.gauge("comic_unrolls_capacity", "Unrolls that the batches have room for"),
-            waiting: catalogue.gauge("comic_unrolls_waiting", "Unrolls that wait for a place in a batch: above 0, the learner is slower than its actors"),
-            ingest: catalogue.gauge("comic_ingest_bytes", "Room that messages have which were read and are not in a batch: at most --max-ingest-bytes"),
+            waiting: catalogue.gauge("comic_unrolls_waiting", "Unrolls that wait for a place in a batch. Above 0, the learner is slower than its actors"),
+            ingest: catalogue.gauge("comic_ingest_bytes", "Bytes of messages that were read and are not in a batch yet, at most --max-ingest-bytes"),
             actors: catalogue.labelled(
                 "gauge",
                 ("comic_actors", "state"),
@@ -209,19 +107,19 @@ impl Sampled {
                 "Actors: connected; connected and silent for a minute while the learner waits; gone within the last ten minutes",
             ),
             version: catalogue.gauge("comic_parameters_version", "Newest published version of the parameters"),
-            epoch: catalogue.gauge("comic_learner_epoch", "Which life of the learner this is; grows by one at every start of the run"),
+            epoch: catalogue.gauge("comic_learner_epoch", "How often the learner was started for this run"),
             memory: catalogue.gauge("process_resident_memory_bytes", "Resident memory of the learner process in bytes"),
             tasks: SampledTasks {
-                produced: catalogue.of_tasks("counter", "comic_task_unrolls_produced", "Unrolls of the task that were decided about, over the run's whole life"),
-                trained: catalogue.of_tasks("counter", "comic_task_unrolls_trained", "Unrolls of the task trained on, over the run's whole life"),
-                dropped: catalogue.of_tasks("counter", "comic_task_unrolls_dropped", "Unrolls of the task that will never be trained on, over the run's whole life; those of no known task are in comic_unrolls_dropped alone"),
+                produced: catalogue.of_tasks("counter", "comic_task_unrolls_produced", "Unrolls of the task that were accepted or dropped, over the whole run"),
+                trained: catalogue.of_tasks("counter", "comic_task_unrolls_trained", "Unrolls of the task trained on, over the whole run"),
+                dropped: catalogue.of_tasks("counter", "comic_task_unrolls_dropped", "Unrolls of the task that will never be trained on, over the whole run; unrolls without a known task are only in comic_unrolls_dropped"),
                 in_flight: catalogue.of_tasks("gauge", "comic_task_unrolls_in_flight", "Unrolls of the task in a batch that is open, full, or being trained on"),
             },
         }
     }
 }
 
-/// What [`Telemetry::page`] cannot know by itself.
+/// The values that [`Telemetry::page`] gets from other modules.
 #[derive(Debug)]
 pub(crate) struct Sample {
     pub(crate) accounting: AccountingByTask,
@@ -241,7 +139,7 @@ impl Default for Telemetry {
             updates: all.counter("comic_updates", "Batches that V-MPO trained on"),
             updates_skipped: all.counter(
                 "comic_updates_skipped",
-                "Gradient steps that changed nothing, since a loss or gradient was not finite",
+                "Gradient steps that changed nothing, because a loss or gradient was not finite",
             ),
             restores: all.counter(
                 "comic_restores",
@@ -249,7 +147,7 @@ impl Default for Telemetry {
             ),
             compilations: all.counter(
                 "comic_compilations",
-                "Programs that XLA compiled; it grows no more once every shape was seen. 0 on other devices",
+                "Programs that XLA compiled. It stops growing when every shape was seen, and is 0 on other devices",
             ),
             update_seconds: all.histogram(
                 "comic_update_seconds",
@@ -268,36 +166,36 @@ impl Default for Telemetry {
             ),
             unrolls_late: all.counter(
                 "comic_unrolls_late",
-                "Unrolls that were given up since they were not whole ten seconds after they began and others waited for their room",
+                "Unrolls that were given up because they were not complete ten seconds after they began and others waited for their room",
             ),
             environment_steps: all.counter("comic_environment_steps", "Environment steps trained on"),
             task_steps: all.of_tasks("counter", "comic_task_environment_steps", "Environment steps of the task trained on"),
             task_rows: all.of_tasks("counter", "comic_task_rows", "Rows of the task's unrolls that were trained on"),
-            task_padding: all.of_tasks("counter", "comic_task_padding_rows", "Those of them that are padding, since the next episode was of another task"),
+            task_padding: all.of_tasks("counter", "comic_task_padding_rows", "Rows of these unrolls that are padding, because the next episode belongs to another task"),
             episodes_diverged: all.counter(
                 "comic_episodes_diverged",
-                "Episodes trained on that ended since the simulation diverged; see comic-actor --dump-diverged",
+                "Episodes trained on that ended because the simulation diverged; see comic-actor --dump-diverged",
             ),
             evaluations: all.counter("comic_evaluations", "Evaluations that actors reported"),
             checkpoints: all.labelled(
                 "counter",
                 ("comic_checkpoints", "result"),
                 &["written", "failed"],
-                "Checkpoints by what became of them: one that fails is tried again with the next, training goes on",
+                "Checkpoints by result. After a failure training continues, and the next checkpoint is tried",
             ),
             joins: all.labelled(
                 "counter",
                 ("comic_joins", "result"),
                 &["joined", "full", "draining", "refused"],
-                "Attempts to join, reconnections included: taken, refused since --max-actors are there or since the learner \
-                 goes down, refused for good",
+                "Attempts to join, reconnections included: accepted, refused because --max-actors are present or because the \
+                 learner is going down, refused for good",
             ),
             connections: all.gauge("comic_connections", "Connections that are open"),
             connections_refused: all.labelled(
                 "counter",
                 ("comic_connections_refused", "reason"),
                 &["per_address", "in_all", "tls"],
-                "Connections closed at once: --max-connections-per-address, those in all, or no agreement on TLS",
+                "Connections closed at once: beyond --max-connections-per-address, beyond the limit on all connections, or without agreement on TLS",
             ),
             requests: all.gauge("comic_requests", "Calls in flight, streams included"),
             requests_refused: all.labelled(
@@ -310,7 +208,7 @@ impl Default for Telemetry {
                 "counter",
                 ("comic_quarantined", "result"),
                 &["kept", "full", "busy", "failed"],
-                "Invalid unrolls by what became of them with --quarantine: on disk, beyond --quarantine-bytes, too many at once, not written",
+                "Invalid unrolls with --quarantine, by result: on disk, beyond --quarantine-bytes, too many at once, not written",
             ),
             sampled: Sampled::new(all),
             catalogue,
@@ -320,19 +218,19 @@ impl Default for Telemetry {
 }
 
 impl Telemetry {
-    /// Counts an update that took so long on unrolls of these ages.
-    pub fn count_update(&self, took: Duration, mut ages: Vec<u64>) {
+    /// Counts an update that took `duration` on unrolls of these ages.
+    pub fn count_update(&self, duration: Duration, mut ages: Vec<u64>) {
         self.updates.inc();
-        self.update_seconds.observe(took.as_secs_f64());
+        self.update_seconds.observe(duration.as_secs_f64());
         for age in &ages {
             self.unroll_age.observe(*age as f64);
         }
         ages.sort_unstable();
-        let at = |share: usize| ages.get(ages.len().saturating_sub(1) * share / 100).copied().unwrap_or_default();
+        let at = |percent: usize| ages.get(ages.len().saturating_sub(1) * percent / 100).copied().unwrap_or_default();
         *self.ages.lock() = Ages { median: at(50), p99: at(99), max: at(100) };
     }
 
-    /// Counts what was trained on of a task.
+    /// Counts the rows of a task that were trained on.
     pub(crate) fn count_rows(&self, task: &str, counted: Rows) {
         self.environment_steps.inc_by(counted.environment_steps);
         if let Some(task) = TASKS.iter().find(|name| **name == task) {
@@ -342,17 +240,17 @@ impl Telemetry {
         }
     }
 
-    /// So many in all.
+    /// Sets the number of compiled programs.
     pub(crate) fn count_compilations(&self, compiled: u64) {
         self.compilations.inc_by(compiled.saturating_sub(self.compilations.get()));
     }
 
-    /// Of the newest update.
+    /// The ages of the newest update's unrolls.
     pub(crate) fn ages(&self) -> Ages {
         *self.ages.lock()
     }
 
-    /// The page that Prometheus reads, in the OpenMetrics text format.
+    /// The page for Prometheus, in the OpenMetrics text format.
     pub(crate) fn page(&self, sample: &Sample) -> String {
         let Sampled { produced, trained, dropped, duplicates, unattributed, in_flight, .. } = &self.sampled;
         let accounting = sample.accounting.all;
@@ -407,7 +305,7 @@ impl Telemetry {
         self.catalogue.descriptions.iter().flat_map(expand).collect()
     }
 
-    /// The reference page, Markdown.
+    /// The reference page, in Markdown.
     pub fn reference(&self) -> String {
         let mut page = String::from(REFERENCE);
         for Description { name, kind, label, values, help } in &self.catalogue.descriptions {
@@ -422,15 +320,15 @@ impl Telemetry {
 const REFERENCE: &str = "\
 # Metrics
 
-What `comic-learner --metrics-port PORT` shows at `/metrics`, in the OpenMetrics text format. This page is made by
+The metrics that `comic-learner --metrics-port PORT` shows at `/metrics`, in the OpenMetrics text format. This page is the output of
 `comic-learner metrics > docs/metrics.md`, and a test compares the two. Counters begin at 0 when the process starts, unless
-they speak of the run's whole life. A histogram `NAME` is `NAME_bucket`, `NAME_sum` and `NAME_count`.
+their meaning says \"over the whole run\". A histogram `NAME` is `NAME_bucket`, `NAME_sum` and `NAME_count`.
 
 | name | kind | label | meaning |
 | --- | --- | --- | --- |
 ";
 
-/// Of this process, as Linux tells it; 0 where it does not.
+/// The resident memory of this process as Linux reports it; 0 on other systems.
 fn resident_bytes() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));

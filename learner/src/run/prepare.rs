@@ -14,7 +14,7 @@ use crate::options::Options;
 use crate::publish::Publisher;
 use crate::security::Security;
 use crate::service::{self, Service};
-use crate::train::trainer::Setup;
+use crate::train::setup::Setup;
 
 /// The trainer's setup and the service. Begins the learner epoch.
 pub(super) fn prepare(

@@ -128,71 +128,38 @@ impl Service {
     /// the experiment or the publisher, when the experiment cannot be written as TOML, or when the quarantine cannot start.
     pub fn new(setup: Setup) -> Result<Self> {
         let message_limit = setup.message_limit()?;
-        let Setup { run, id, security, limits, experiment, spec, assets, batcher, publisher, quarantine } = setup;
-        let telemetry = Arc::<Telemetry>::default();
-        let shutdown = Shutdown::new(publisher.clone());
-        let roster = Arc::new(Roster::new(limits.max_actors));
-        let assignments = experiment.unroll.lockstep.then(|| Arc::new(Assignments::new(experiment.unroll.batch)));
-        let room = Room::new(limits.max_ingest_bytes, telemetry.unrolls_late.clone());
+        let common = Common::new(&setup);
+        let Setup { run, id, security, limits, experiment, spec, assets, quarantine, .. } = setup;
+        let Common { publisher, roster, room, shutdown, telemetry, .. } = common.clone();
+        let terms = JoinTerms::new(id, &experiment, &spec, assets.iter().map(description).collect())?;
         let quarantine = Quarantine::start(&quarantine, &telemetry)?;
+        let quarantines = quarantine.is_some();
         let evaluations = Evaluations::default();
-        let buffers = experiment.unroll.ahead as u64 + 1;
-        let status = Arc::new(StatusBoard {
-            run,
-            experiment: experiment.name.clone(),
-            started: Instant::now(),
-            capacity: buffers * experiment.unroll.batch as u64,
-            metrics: Mutex::new(String::from("{}")),
-            batcher: batcher.clone(),
-            publisher: publisher.clone(),
-            roster: roster.clone(),
-            room: room.clone(),
-            telemetry: telemetry.clone(),
-            shutdown: shutdown.clone(),
-        });
+        let status = Arc::new(common.status(run, &experiment));
         let gate = Gate {
             tls: security.tls.map(Arc::new),
             tokens: security.tokens.map(Arc::new),
             message_limit,
-            window: limits.max_unread_bytes.unwrap_or_else(|| window(batcher.layout())),
+            window: limits.max_unread_bytes.unwrap_or_else(|| window(common.batcher.layout())),
             limits,
             telemetry: telemetry.clone(),
         };
-        let trainer = TrainerHandle {
-            run: id,
-            telemetry: telemetry.clone(),
+        let calls = Calls {
+            join: common.join(terms),
+            assets: Assets::new(assets, shutdown.clone()),
             evaluations: evaluations.clone(),
             status: status.clone(),
-            ingest: gate.ingest_limits(quarantine.is_some()),
-        };
-        let join = Join {
-            terms: JoinTerms::new(id, &experiment, &spec, assets.iter().map(description).collect())?,
-            batcher: batcher.clone(),
-            roster: roster.clone(),
-            assignments: assignments.clone(),
-            shutdown: shutdown.clone(),
             telemetry: telemetry.clone(),
-            epoch: publisher.epoch(),
         };
-        let assets = Assets::new(assets, shutdown.clone());
-        let intake = Intake {
-            batcher,
-            publisher: publisher.clone(),
-            clips: spec.tasks.iter().map(|task| task.clips).collect(),
-            roster: roster.clone(),
-            assignments,
-            quarantine,
-            shutdown: shutdown.clone(),
-            telemetry: telemetry.clone(),
-            log_limiter: LogLimiter::default(),
-        };
+        let intake = common.intake(&spec, quarantine);
+        let ingest = gate.ingest_limits(quarantines);
         Ok(Self {
             gate: Arc::new(gate),
-            calls: Arc::new(Calls { join, assets, evaluations, status, telemetry }),
+            calls: Arc::new(calls),
             unrolls: Arc::new(Unrolls { intake, message_limit, room, shutdown: shutdown.clone() }),
             parameters: Arc::new(Parameters { publisher, roster, shutdown: shutdown.clone() }),
             shutdown,
-            trainer,
+            trainer: TrainerHandle { run: id, telemetry, evaluations, status, ingest },
         })
     }
 
@@ -214,6 +181,65 @@ impl Service {
     /// From now on no actor can join, and the health service says that the learner does not serve.
     pub fn drain(&self) {
         self.shutdown.drain();
+    }
+}
+
+/// What several parts share.
+#[derive(Clone)]
+struct Common {
+    batcher: Batcher,
+    publisher: Publisher,
+    roster: Arc<Roster>,
+    /// Only in lockstep.
+    assignments: Option<Arc<Assignments>>,
+    room: Room,
+    shutdown: Shutdown,
+    telemetry: Arc<Telemetry>,
+}
+
+impl Common {
+    fn new(setup: &Setup) -> Self {
+        let Setup { limits, experiment, batcher, publisher, .. } = setup;
+        let telemetry = Arc::<Telemetry>::default();
+        let lockstep = experiment.unroll.lockstep;
+        Self {
+            batcher: batcher.clone(),
+            publisher: publisher.clone(),
+            roster: Arc::new(Roster::new(limits.max_actors)),
+            assignments: lockstep.then(|| Arc::new(Assignments::new(experiment.unroll.batch))),
+            room: Room::new(limits.max_ingest_bytes, telemetry.unrolls_late.clone()),
+            shutdown: Shutdown::new(publisher.clone()),
+            telemetry,
+        }
+    }
+
+    fn status(&self, run: PathBuf, experiment: &Experiment) -> StatusBoard {
+        let Self { batcher, publisher, roster, room, shutdown, telemetry, .. } = self.clone();
+        StatusBoard {
+            run,
+            experiment: experiment.name.clone(),
+            started: Instant::now(),
+            capacity: (experiment.unroll.ahead as u64 + 1) * experiment.unroll.batch as u64,
+            metrics: Mutex::new(String::from("{}")),
+            batcher,
+            publisher,
+            roster,
+            room,
+            telemetry,
+            shutdown,
+        }
+    }
+
+    fn join(&self, terms: JoinTerms) -> Join {
+        let Self { batcher, publisher, roster, assignments, shutdown, telemetry, .. } = self.clone();
+        Join { terms, batcher, roster, assignments, shutdown, telemetry, epoch: publisher.epoch() }
+    }
+
+    fn intake(&self, spec: &TaskSpec, quarantine: Option<Quarantine>) -> Intake {
+        let Self { batcher, publisher, roster, assignments, shutdown, telemetry, .. } = self.clone();
+        let clips = spec.tasks.iter().map(|task| task.clips).collect();
+        let log_limiter = LogLimiter::default();
+        Intake { batcher, publisher, clips, roster, assignments, quarantine, shutdown, telemetry, log_limiter }
     }
 }
 

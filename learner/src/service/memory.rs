@@ -62,7 +62,7 @@ pub struct Bounds {
     pub frames: u64,
     /// Versions of the parameters that are held for readers.
     pub parameters: u64,
-    /// Answers that are being sent: see [`ANSWER`].
+    /// Answers that their peers have not read yet.
     pub answers: u64,
     /// Refused messages that wait for the disk.
     pub quarantine: u64,

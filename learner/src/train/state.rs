@@ -70,7 +70,7 @@ impl State {
         &self,
         experiment: &Experiment,
         spec: &TaskSpec,
-        accounting: &comic_replay::Snapshot,
+        accounting: &comic_replay::LedgerSnapshot,
     ) -> Result<Snapshot> {
         let mut learned = self.algorithm.state();
         learned.extend(self.statistics.state());

@@ -1,6 +1,5 @@
 //! The trainer: one OS thread that owns the device. Batches in, parameters out.
 
-use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use comic_experiment::{Experiment, TaskSpec};
@@ -12,13 +11,13 @@ use crate::algorithm::minibatch::MinibatchTensors;
 use crate::checkpoint::{Name, Snapshot, incompatible};
 use crate::device::Backend;
 use crate::error::{Error, Result};
-use crate::publish::Publisher;
 use crate::service::TrainerHandle;
 use crate::service::memory::{Bounds, Sizes};
 use crate::train::budget::BudgetClock;
 use crate::train::checkpoints::Checkpoints;
 use crate::train::minibatches::{draw, to_device};
 use crate::train::reports::Reports;
+use crate::train::setup::{Ending, Setup};
 use crate::train::skipped_steps::{REMEDIES, Recovery, SkippedSteps};
 use crate::train::state::State;
 use crate::train::versions::Versions;
@@ -28,40 +27,6 @@ use crate::train::warm_start::WarmStart;
 const PATIENCE: Duration = Duration::from_millis(500);
 /// Steps of the warm start between two reports.
 const REPORTED_STEPS: u64 = 50;
-
-/// The parts of a trainer.
-#[derive(Debug)]
-pub struct Setup {
-    /// The resolved experiment.
-    pub experiment: Experiment,
-    /// The task's sizes and names.
-    pub spec: TaskSpec,
-    /// The action at which the policy's mean starts, `[A]`.
-    pub pose: Vec<f32>,
-    /// The device.
-    pub backend: Backend,
-    /// The run's directory.
-    pub run: PathBuf,
-    /// The learner epoch.
-    pub epoch: u64,
-    /// A checkpoint to resume from.
-    pub resume: Option<Snapshot>,
-    /// The source of batches.
-    pub batcher: Batcher,
-    /// Where parameters are published.
-    pub publisher: Publisher,
-    /// The service, which shows the newest metrics and collects evaluations.
-    pub service: TrainerHandle,
-}
-
-/// Why training ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Ending {
-    /// The experiment's budget is used up.
-    Budget,
-    /// The batcher was closed, because the learner was asked to stop.
-    Stopped,
-}
 
 /// Learns from batches until the budget is used up or the batcher is closed.
 #[derive(Debug)]

@@ -1,7 +1,7 @@
 //! Networks, multipliers and optimiser, stepped together.
 
 use comic_experiment::{Experiment, Prior, TaskSpec};
-use comic_networks::{Acting, ActionDistribution, NormaliserStatistics, Policy, RecurrentState, Value, to_safetensors};
+use comic_networks::{ActionDistribution, NormaliserStatistics, Policy, RecurrentState, Value, to_safetensors};
 use comic_proto::{Field, UnrollShape};
 use tch::{Device, Kind, Tensor, nn};
 
@@ -11,14 +11,15 @@ use crate::algorithm::error::Error;
 use crate::algorithm::losses::Losses;
 use crate::algorithm::minibatch::MinibatchTensors;
 use crate::algorithm::shape::MinibatchShape;
-use crate::vmpo::improvement::{Evidence, Improvement, KlLimits, masked_mean, policy_improvement};
+use crate::vmpo::improvement::{Evidence, KlLimits, masked_mean, policy_improvement};
 use crate::vmpo::multipliers::Multipliers;
+use crate::vmpo::report::{Descent, Pass, Terms, report};
 use crate::vmpo::returns::returns;
 use crate::vmpo::stores::{named, trainable};
 
 /// The online networks, the multipliers and Adam.
 ///
-/// Nothing here is random after construction: the latent's noise comes with the unrolls. So state and minibatches decide
+/// Nothing is random after construction, because the latent's noise comes with the unrolls. So state and minibatches decide
 /// every later parameter, bit for bit on a CPU with the same number of threads.
 #[derive(Debug)]
 pub struct VmpoLearner {
@@ -32,35 +33,6 @@ pub struct VmpoLearner {
     adam: Adam,
     networks_group: usize,
     multipliers_group: usize,
-}
-
-/// One forward pass over a minibatch; N = B·T rows.
-struct Pass {
-    acting: Acting,
-    /// As stored, over N rows.
-    behaviour: ActionDistribution,
-    /// V(s_t), `[N, R]`, with gradient.
-    values: Tensor,
-    /// G_t, `[N, R]`.
-    targets: Tensor,
-    /// Steps that are learnt from, `[N]`.
-    valid: Tensor,
-    /// The steps that each E-step ranks, `[N]` booleans; together all of them.
-    groups: Vec<Tensor>,
-    /// Fraction of the rows that are transitions.
-    valid_share: Tensor,
-    /// ½ mean (V − G)², summed over the reward terms.
-    value_loss: Tensor,
-    /// Mean KL to the prior, nats a step.
-    latent_kl: Tensor,
-}
-
-/// The result of applying gradients.
-struct Descent {
-    /// Global norm of the networks' gradients before clipping.
-    norm: Tensor,
-    /// Whether the step was taken, a boolean scalar.
-    finite: Tensor,
 }
 
 impl VmpoLearner {
@@ -233,16 +205,16 @@ impl VmpoLearner {
         valid
     }
 
-    /// Clips where asked to, and steps networks and multipliers if every number is finite.
+    /// Clips the gradients if the experiment says so, and steps networks and multipliers if every number is finite.
     fn descend(&mut self, total: &Tensor, mut gradients: Vec<Tensor>, multipliers: Option<&[Tensor]>) -> Descent {
-        // A parameter that a loss does not reach has no gradient at all.
+        // A parameter that the loss does not depend on has no gradient tensor.
         for (gradient, parameter) in gradients.iter_mut().zip(self.adam.parameters(self.networks_group)) {
             if !gradient.defined() {
                 *gradient = parameter.detach().zeros_like();
             }
         }
         let norm = adam::global_norm(&gradients);
-        // Of the squares, since Adam keeps squares: where their sum is finite, each of them is.
+        // Of the squares, because Adam keeps squares: if their sum is finite, each of them is.
         let mut sum = total.detach() + norm.square();
         if let Some(multipliers) = multipliers {
             sum = &sum + adam::global_norm(multipliers).square();
@@ -258,60 +230,6 @@ impl VmpoLearner {
             self.multipliers.project();
         }
         Descent { norm, finite }
-    }
-
-    /// The report of a V-MPO step (`improvement`) or of a regression step (`regression`).
-    fn report(
-        &self,
-        total: &Tensor,
-        pass: &Pass,
-        improvement: Option<&Improvement>,
-        regression: Option<&Tensor>,
-        descent: &Descent,
-    ) -> Losses {
-        tch::no_grad(|| {
-            let zero = Tensor::zeros([1], (Kind::Float, self.device()));
-            let of = |entry: fn(&Improvement) -> &Tensor| improvement.map_or(&zero, entry);
-            let temperatures = self.multipliers.temperatures();
-            let [alpha_mean, alpha_std] = [self.multipliers.alpha_mean(), self.multipliers.alpha_std()];
-            let alpha_discrete = self.multipliers.alpha_discrete();
-            let kl_weights = improvement.and_then(|improvement| improvement.kl_weights.as_ref());
-            let std = pass.acting.action.std().mean_dim(-1i64, false, Kind::Float);
-            let named = [
-                // The loss that was differentiated.
-                ("total_loss", total),
-                // L_π, L_η and L_α.
-                ("policy_loss", of(|improvement| &improvement.policy)),
-                ("temperature_loss", of(|improvement| &improvement.temperature)),
-                ("alpha_loss", of(|improvement| &improvement.alpha)),
-                // ½ (V − G)², mean over valid steps, summed over reward terms.
-                ("value_loss", &pass.value_loss),
-                // 0 in a V-MPO step.
-                ("regression_loss", regression.unwrap_or(&zero)),
-                // KL of the latent to its prior, nats a step.
-                ("latent_kl", &pass.latent_kl),
-                // Mean KL_μ and KL_Σ to the behaviour policy, and that of a mixture's weights (0 for one Gaussian), nats a
-                // step.
-                ("kl_mean", of(|improvement| &improvement.kl_mean)),
-                ("kl_std", of(|improvement| &improvement.kl_std)),
-                ("kl_weights", kl_weights.unwrap_or(&zero)),
-                // η after the step; the mean if there are several.
-                ("temperature", &temperatures.mean(Kind::Float)),
-                // α_μ, α_Σ and α_discrete (0 for one Gaussian) after the step.
-                ("alpha_mean", &alpha_mean),
-                ("alpha_std", &alpha_std),
-                ("alpha_discrete", alpha_discrete.as_ref().unwrap_or(&zero)),
-                // Mean standard deviation of the policy over valid steps and action dimensions.
-                ("policy_std", &masked_mean(&std, &pass.valid)),
-                // Global norm of the networks' gradients, before any clipping.
-                ("gradient_norm", &descent.norm),
-                // 1 − Var(G − V) / Var(G), of the return summed over reward terms.
-                ("variance_explained", &variance_explained(pass)),
-                // Fraction of the rows that are transitions, and in a warm start are demonstrated.
-                ("valid_share", &pass.valid_share),
-            ];
-            Losses::pack(named, &temperatures, &descent.finite)
-        })
     }
 }
 
@@ -346,7 +264,12 @@ impl Algorithm for VmpoLearner {
         let mut gradients = Tensor::f_run_backward(&[&total], &inputs, false, false)?;
         let multipliers = gradients.split_off(networks.len());
         let descent = self.descend(&total, gradients, Some(&multipliers));
-        Ok(self.report(&total, &pass, Some(&improvement), None, &descent))
+        Ok(report(
+            &pass,
+            &descent,
+            Terms { total: &total, improvement: Some(&improvement), regression: None },
+            &self.multipliers,
+        ))
     }
 
     /// Mean over valid steps of Σ ½ ((μ_θ − μ_stored) / initial_std)², with β times the latent's KL; the value function as
@@ -364,7 +287,12 @@ impl Algorithm for VmpoLearner {
         let sizes = [shape.unrolls, shape.unroll.length, shape.unroll.latent].map(|size| size as i64);
         // NaN must not stay in the demonstrations.
         let latents = pass.acting.latent.detach().reshape(sizes).nan_to_num(0.0, 0.0, 0.0);
-        let losses = self.report(&total, &pass, None, Some(&regression), &descent);
+        let losses = report(
+            &pass,
+            &descent,
+            Terms { total: &total, improvement: None, regression: Some(&regression) },
+            &self.multipliers,
+        );
         Ok((losses, latents))
     }
 
@@ -399,18 +327,6 @@ impl Algorithm for VmpoLearner {
     fn load_state(&mut self, state: &[(String, Tensor)]) -> Result<(), Error> {
         Ok(adam::restore(self.entries(), state)?)
     }
-}
-
-/// 1 − Var(G − V) / Var(G) over the valid steps, of the return summed over its terms.
-fn variance_explained(pass: &Pass) -> Tensor {
-    let variance = |terms: &Tensor| {
-        let total = terms.sum_dim_intlist(-1i64, false, Kind::Float);
-        let mean = masked_mean(&total, &pass.valid);
-        masked_mean(&(total - mean).square(), &pass.valid)
-    };
-    let unexplained = variance(&(&pass.targets - &pass.values));
-    // The floor keeps a batch whose returns are all the same finite.
-    1.0 - unexplained / variance(&pass.targets).clamp_min(1e-12)
 }
 
 /// `[B, T, D]` as rows `[B·T, D]`.

@@ -6,7 +6,7 @@ use tch::{Device, Tensor};
 /// Multipliers are projected to at least this after each step (V).
 pub const MULTIPLIER_FLOOR: f64 = 1e-8;
 
-/// The ηs, α_μ, α_Σ and, for a mixture, α_discrete: positive numbers that are learned as they are, one parameter.
+/// The ηs, α_μ, α_Σ and, for a mixture, α_discrete: positive numbers, learned directly as one parameter.
 #[derive(Debug)]
 pub struct Multipliers {
     parameter: Tensor,

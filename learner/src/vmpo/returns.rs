@@ -2,12 +2,12 @@
 
 use tch::Tensor;
 
-/// One target a step and reward term, without gradient: `[B, T, R]`.
+/// One target for each step and reward term, without gradient: `[B, T, R]`.
 ///
 /// G_t = r_t + γ d_t [(1 − λ) V(s_{t+1}) + λ G_{t+1}] where row t is a transition, G_t = V(s_t) where it is not, and
-/// G_T = V(s_T). With λ = 1 this is the paper's n-step return to the unroll's end. A row that is no transition holds an
-/// episode's last observation, so a truncated episode is bootstrapped there, a terminated one has d = 0 before it,
-/// and nothing passes from one episode to another.
+/// G_T = V(s_T). With λ = 1 this is the paper's n-step return to the unroll's end. A row without a transition holds an
+/// episode's last observation. A truncated episode is bootstrapped there; a terminated one has d = 0 before it. So no
+/// reward of one episode enters the target of another.
 ///
 /// - `reward`: `[B, T, R]`.
 /// - `discount`: `[B, T]`, 0 where the episode terminated.

@@ -1,4 +1,4 @@
-//! Assets: announced at Join, fetched by hash, verified by whoever fetches them.
+//! Assets: `Join` announces them, actors fetch them by hash and verify them.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -56,7 +56,7 @@ async fn an_unknown_hash_is_not_found() {
 }
 
 #[tokio::test]
-async fn an_asset_that_shrank_or_vanished_after_the_start_is_an_error_and_no_short_file() {
+async fn an_asset_that_shrank_or_vanished_after_the_start_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let (shrunk, gone) = (asset(folder.path(), "shrunk.h5", 600_000), asset(folder.path(), "gone.h5", 10));
     let world = World::start_with(8, vec![shrunk.clone(), gone.clone()]).await;

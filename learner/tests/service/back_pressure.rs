@@ -1,4 +1,4 @@
-//! When the batches are full the learner stops reading: the actor stalls, its other calls do not, and nothing is lost.
+//! When the batches are full the learner stops reading: the actor's unrolls wait, its other calls do not, and nothing is lost.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -13,14 +13,14 @@ use comic_replay::Next;
 use futures::{StreamExt as _, stream};
 use tonic::transport::Endpoint;
 
-/// Slots without a trainer: the open batch and the full one.
+/// Places in batches when there is no trainer: those of the open batch and of the full one.
 const SLOTS: usize = 2 * BATCH;
 const UNROLLS: usize = 200;
-/// Numbers of proprioception that make an unroll of 100 KB.
+/// Elements of proprioception that make an unroll of 100 KB.
 const PROPRIOCEPTION: usize = 5000;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_actor_stalls_while_the_batches_are_full_and_goes_on_afterwards() {
+async fn an_actor_waits_while_the_batches_are_full_and_continues_afterwards() {
     let world = World::start_with(PROPRIOCEPTION, Vec::new()).await;
     let mut actor = world.actor(70).await;
     let unrolls: Vec<_> = (0..UNROLLS as u64).map(|sequence| actor.unroll(sequence)).collect();
@@ -36,12 +36,12 @@ async fn an_actor_stalls_while_the_batches_are_full_and_goes_on_afterwards() {
         assert_eq!((ack.sequence, ack.verdict()), (sequence, Verdict::Taken));
     }
 
-    // The unread stream holds up no other call on its connection.
+    // The unread stream does not delay other calls on its connection.
     for _ in 0..300 {
         let accounting = actor.accounting().await;
         assert_eq!((accounting.produced, accounting.in_flight), (SLOTS as u64, SLOTS as u64));
     }
-    // Beyond what has been taken: the stream's window, one unroll decoded, and the client's own send buffer of 1 MiB.
+    // Besides the taken unrolls: the stream's window, one decoded unroll, and the client's own send buffer of 1 MiB.
     let under_way = (256 * 1024 + 1024 * 1024) / size + 3;
     let made_now = made.load(Ordering::SeqCst);
     assert!(made_now <= SLOTS + under_way, "{made_now} unrolls of {size} bytes left the actor");
@@ -60,13 +60,13 @@ async fn an_actor_stalls_while_the_batches_are_full_and_goes_on_afterwards() {
         assert_eq!((ack.sequence, ack.verdict()), (sequence, Verdict::Taken));
     }
     trainer.await.unwrap();
-    assert!(acks.message().await.unwrap().is_none(), "the stream ends with the actor's");
+    assert!(acks.message().await.unwrap().is_none(), "the stream ends when the actor ends its own");
     let accounting = actor.accounting().await;
     assert_eq!((accounting.produced, accounting.trained, accounting.in_flight), (UNROLLS as u64, UNROLLS as u64, 0));
 }
 
 #[tokio::test]
-async fn an_actor_that_dies_while_it_waits_leaves_no_trace_and_its_slot_to_others() {
+async fn an_actor_that_dies_while_it_waits_takes_no_place_in_a_batch() {
     let world = World::start().await;
     let mut dying = world.actor(70).await;
     let mut unrolls = dying.stream().await;
@@ -86,13 +86,13 @@ async fn an_actor_that_dies_while_it_waits_leaves_no_trace_and_its_slot_to_other
     let ack = within(Duration::from_secs(10), unrolls.acks.message()).await.unwrap().unwrap();
     assert_eq!(ack.verdict(), Verdict::Taken);
     let accounting = living.accounting().await;
-    // The dead actor's last unroll may or may not have come through before the end of its connection was noticed.
+    // The dead actor's last unroll may have arrived before the learner noticed the end of its connection.
     assert_eq!(accounting.produced, accounting.trained + accounting.in_flight);
     assert!((SLOTS as u64 + 1..=SLOTS as u64 + 2).contains(&accounting.produced));
 }
 
 #[tokio::test]
-async fn an_actor_that_takes_no_acknowledgements_holds_no_place_that_others_could_fill() {
+async fn an_actor_that_reads_no_acknowledgements_takes_no_place_in_a_batch() {
     let world = World::start().await;
     let silent = world.actor(70).await;
     // One byte is less than an acknowledgement.

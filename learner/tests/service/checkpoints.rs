@@ -1,10 +1,9 @@
-//! Checkpoints are whole or not there, and a damaged one costs no more than itself.
+//! A checkpoint is whole or absent, and a damaged one does not affect the others.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
 use crate::support::RUN;
 use comic_learner::checkpoint::{Evaluated, Judgement, Name, Snapshot, Store, find, read};
-use comic_learner::error::Error;
 use comic_proto::chain;
 use proptest::prelude::*;
 
@@ -15,7 +14,7 @@ fn snapshot(content: &str) -> Snapshot {
 }
 
 #[test]
-fn the_newest_is_found_again() {
+fn the_newest_checkpoint_is_found() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 3).unwrap();
     assert!(store.newest().unwrap().is_none());
@@ -25,7 +24,7 @@ fn the_newest_is_found_again() {
 }
 
 #[test]
-fn a_damaged_one_is_skipped() {
+fn a_damaged_checkpoint_is_skipped() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 3).unwrap();
     store.write(Name::Updates(1), &snapshot("one")).unwrap();
@@ -39,9 +38,9 @@ fn a_damaged_one_is_skipped() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
 
-    /// In the manifest, in its parts, anywhere.
+    /// In the manifest and in the parts, at any place.
     #[test]
-    fn whatever_is_cut_off_or_flipped_costs_no_more_than_one_checkpoint(
+    fn a_cut_or_flipped_byte_costs_one_checkpoint_at_most(
         file in prop::sample::select(vec!["MANIFEST.json", "part", "other"]), place: prop::sample::Index, bit in 0..8u8,
         cut: bool,
     ) {
@@ -64,22 +63,22 @@ proptest! {
 }
 
 #[test]
-fn what_cannot_be_read_is_no_damage_and_stays_where_it_is() {
+fn an_unreadable_checkpoint_is_not_damaged_and_stays_in_place() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 3).unwrap();
     store.write(Name::Updates(1), &snapshot("one")).unwrap();
     let newest = store.write(Name::Updates(2), &snapshot("two")).unwrap();
-    // The system refuses to open a link that leads to itself, whoever asks.
+    // The system refuses to open a link to itself, for every user.
     std::fs::remove_file(newest.join("part")).unwrap();
     std::os::unix::fs::symlink("part", newest.join("part")).unwrap();
-    let refused = Error::from(store.newest().unwrap_err());
+    let refused = store.newest().unwrap_err();
     assert_eq!(refused.exit_code(), 1, "{refused}");
     assert!(chain(&refused).contains("cannot read"), "{}", chain(&refused));
     assert!(newest.is_dir());
 }
 
 #[test]
-fn whoever_only_reads_passes_over_a_damaged_one_and_leaves_it_there() {
+fn a_reader_skips_a_damaged_checkpoint_and_leaves_it_in_place() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 3).unwrap();
     let older = store.write(Name::Updates(1), &snapshot("one")).unwrap();
@@ -95,13 +94,13 @@ fn whoever_only_reads_passes_over_a_damaged_one_and_leaves_it_there() {
 }
 
 #[test]
-fn a_run_with_nothing_but_damaged_ones_does_not_begin_anew() {
+fn a_run_with_only_damaged_checkpoints_does_not_begin_again() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 3).unwrap();
     let only = store.write(Name::Updates(1), &snapshot("one")).unwrap();
     std::fs::write(only.join("part"), "øne").unwrap();
     for start in 1..=2 {
-        let refused = Error::from(Store::open(run.path(), 3).unwrap().newest().unwrap_err());
+        let refused = Store::open(run.path(), 3).unwrap().newest().unwrap_err();
         assert_eq!(refused.exit_code(), 2, "a restart cannot help: {refused}");
         assert!(refused.to_string().contains("--run"), "start {start}: {refused}");
     }
@@ -109,7 +108,7 @@ fn a_run_with_nothing_but_damaged_ones_does_not_begin_anew() {
 }
 
 #[test]
-fn other_peoples_files_beside_them_do_no_harm() {
+fn unrelated_files_are_ignored() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 1).unwrap();
     std::fs::write(run.path().join("checkpoints/checkpoint-best.tar"), "mine").unwrap();
@@ -121,7 +120,7 @@ fn other_peoples_files_beside_them_do_no_harm() {
 }
 
 #[test]
-fn one_of_the_same_number_is_replaced() {
+fn a_checkpoint_with_the_same_number_is_replaced() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 1).unwrap();
     store.write(Name::Updates(1), &snapshot("one")).unwrap();
@@ -139,11 +138,11 @@ fn two_learners_cannot_share_a_run() {
 }
 
 #[test]
-fn one_that_was_not_finished_is_not_there() {
+fn an_unfinished_checkpoint_is_ignored() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 3).unwrap();
     store.write(Name::Updates(1), &snapshot("one")).unwrap();
-    // As a crash leaves it: the parts, and neither manifest nor final name.
+    // What a crash leaves: the parts, without manifest and final name.
     let unfinished = run.path().join("checkpoints/.checkpoint-0000000002");
     std::fs::create_dir(&unfinished).unwrap();
     std::fs::write(unfinished.join("part"), "two").unwrap();
@@ -153,7 +152,7 @@ fn one_that_was_not_finished_is_not_there() {
 }
 
 #[test]
-fn one_that_cannot_be_written_leaves_nothing_behind_and_the_former_in_its_place() {
+fn a_failed_write_leaves_the_former_checkpoint_and_nothing_else() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 1).unwrap();
     store.write(Name::Updates(1), &snapshot("one")).unwrap();
@@ -168,7 +167,7 @@ fn one_that_cannot_be_written_leaves_nothing_behind_and_the_former_in_its_place(
 }
 
 #[test]
-fn the_oldest_beyond_the_number_kept_are_forgotten_and_the_named_ones_stay() {
+fn the_oldest_numbered_checkpoints_are_removed_and_the_named_ones_stay() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 2).unwrap();
     store.write(Name::Initial, &snapshot("initial")).unwrap();
@@ -181,7 +180,7 @@ fn the_oldest_beyond_the_number_kept_are_forgotten_and_the_named_ones_stay() {
 }
 
 #[test]
-fn a_manifest_that_points_elsewhere_is_refused() {
+fn a_manifest_with_a_path_outside_the_checkpoint_is_refused() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 2).unwrap();
     let path = store.write(Name::Updates(1), &snapshot("one")).unwrap();
@@ -190,21 +189,21 @@ fn a_manifest_that_points_elsewhere_is_refused() {
 }
 
 #[test]
-fn every_life_has_a_larger_epoch_than_the_one_before() {
+fn every_restart_has_a_larger_epoch() {
     let run = tempfile::tempdir().unwrap();
     let epochs: Vec<u64> = (0..3).map(|_| Store::open(run.path(), 1).unwrap().begin_epoch().unwrap()).collect();
     assert_eq!(epochs, [1, 2, 3]);
 }
 
 #[test]
-fn a_run_has_one_number_for_all_its_lives_and_every_other_run_another() {
+fn a_run_keeps_its_number_and_every_other_run_has_another() {
     let (run, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let number = |directory: &tempfile::TempDir| Store::open(directory.path(), 1).unwrap().run();
     let drawn = number(&run).unwrap();
     assert_eq!(number(&run).unwrap(), drawn);
     assert_ne!(number(&other).unwrap(), drawn);
     std::fs::write(run.path().join("checkpoints/run"), "the best").unwrap();
-    let damaged = Error::from(number(&run).unwrap_err());
+    let damaged = number(&run).unwrap_err();
     assert!(damaged.exit_code() == 2 && damaged.to_string().contains("checkpoints/run is damaged"), "{damaged}");
 }
 
@@ -213,11 +212,11 @@ fn a_damaged_epoch_is_an_error_that_names_the_file() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 1).unwrap();
     std::fs::write(run.path().join("checkpoints/epoch"), "many").unwrap();
-    let damaged = Error::from(store.begin_epoch().unwrap_err());
+    let damaged = store.begin_epoch().unwrap_err();
     assert!(damaged.exit_code() == 2 && damaged.to_string().contains("checkpoints/epoch is damaged"), "{damaged}");
 }
 
-/// A run with these checkpoints, all of one life.
+/// A run with these checkpoints, all of one epoch.
 fn evaluated_run(updates: &[u64]) -> (tempfile::TempDir, Store) {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 2).unwrap();
@@ -237,7 +236,7 @@ fn judge(store: &Store, updates: u64, normalised_reward: f64) -> Judgement {
 }
 
 #[test]
-fn the_best_is_kept_besides_the_newest_until_another_is_better() {
+fn the_best_checkpoint_is_kept_besides_the_newest_until_another_is_better() {
     let (run, store) = evaluated_run(&[10, 20]);
     assert_eq!(judge(&store, 10, 0.3), Judgement::Best(Name::Updates(10)));
     assert_eq!(judge(&store, 20, 0.2), Judgement::NotBetter);
@@ -255,10 +254,10 @@ fn the_best_is_kept_besides_the_newest_until_another_is_better() {
 }
 
 #[test]
-fn which_one_is_the_best_survives_a_restart_in_the_middle_of_noting_it() {
+fn the_record_of_the_best_survives_a_crash_while_it_is_written() {
     let (run, store) = evaluated_run(&[10, 20]);
     judge(&store, 10, 0.3);
-    // As a crash leaves it: the record is written, and the link is not, or half.
+    // What a crash leaves: the record is written, the link is missing or unfinished.
     let best = run.path().join("checkpoints/best");
     std::fs::remove_file(&best).unwrap();
     std::os::unix::fs::symlink("checkpoint-0000000020", run.path().join("checkpoints/.best")).unwrap();
@@ -272,7 +271,7 @@ fn which_one_is_the_best_survives_a_restart_in_the_middle_of_noting_it() {
 }
 
 #[test]
-fn an_evaluation_of_a_checkpoint_that_is_gone_or_of_another_life_or_run_changes_nothing() {
+fn an_evaluation_of_a_removed_checkpoint_or_of_another_epoch_or_run_changes_nothing() {
     let (run, store) = evaluated_run(&[10, 20, 30]);
     assert_eq!(judge(&store, 10, 0.9), Judgement::Gone);
     for (run, epoch) in [(None, 2), (Some(RUN), 2), (Some(RUN + 1), 3)] {
@@ -280,13 +279,13 @@ fn an_evaluation_of_a_checkpoint_that_is_gone_or_of_another_life_or_run_changes_
         assert_eq!(store.judge(evaluated).unwrap(), Judgement::Gone, "{evaluated:?}");
     }
     assert!(!run.path().join("checkpoints/best.json").exists());
-    // Of an actor that does not know of runs.
+    // A report without the run's number.
     let evaluated = Evaluated { run: None, epoch: 3, updates: 30, normalised_reward: 0.9 };
     assert_eq!(store.judge(evaluated).unwrap(), Judgement::Best(Name::Updates(30)));
 }
 
 #[test]
-fn of_several_with_the_same_version_the_one_that_was_evaluated_is_meant() {
+fn the_number_of_updates_tells_checkpoints_of_the_same_version_apart() {
     let (_run, store) = evaluated_run(&[11, 12]);
     assert_eq!(judge(&store, 11, 0.1), Judgement::Best(Name::Updates(11)));
 }

@@ -1,4 +1,4 @@
-//! An unroll is what its bytes say, however HTTP/2 cuts them; bytes that say nothing end their stream and nothing else.
+//! An unroll does not depend on how HTTP/2 cuts its bytes into frames. Bytes that are no unroll end only their own stream.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -15,7 +15,7 @@ use tonic_prost::prost::Message as _;
 
 use crate::support::{World, within};
 
-/// The acknowledgements of what these frames carry, and the status after them.
+/// Sends these frames, and returns the acknowledgements and the final status.
 async fn send(world: &World, frames: Vec<Bytes>) -> (Vec<UnrollAck>, Code) {
     let answer = within(Duration::from_secs(10), async {
         world.send_frames(stream::iter(frames)).await.into_body().collect().await.unwrap()
@@ -31,15 +31,15 @@ async fn send(world: &World, frames: Vec<Bytes>) -> (Vec<UnrollAck>, Code) {
     (acks, Status::from_header_map(&status).expect("a status").code())
 }
 
-/// Frames of so many bytes, and the rest in one: h2 ends a connection on which thousands of bytes come in frames of one each
-/// and wait to be read.
+/// Cuts bytes into frames of so many bytes, and the rest into one: h2 ends a connection on which thousands of unread frames
+/// have one byte each.
 fn cut(bytes: &[u8], length: usize) -> Vec<Bytes> {
     let (begin, rest) = bytes.split_at(bytes.len().min(length.saturating_mul(250)));
     begin.chunks(length).chain([rest]).filter(|frame| !frame.is_empty()).map(Bytes::copy_from_slice).collect()
 }
 
 #[tokio::test]
-async fn unrolls_are_taken_whatever_frames_they_come_in() {
+async fn unrolls_are_taken_from_frames_of_any_size() {
     for length in [1, 3, 100, usize::MAX] {
         let world = World::start().await;
         let actor = world.actor(70).await;
@@ -54,7 +54,7 @@ async fn unrolls_are_taken_whatever_frames_they_come_in() {
 }
 
 #[tokio::test]
-async fn a_message_without_its_end_is_no_unroll() {
+async fn a_message_without_its_end_is_refused() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let (first, second) = (frame(&actor.unroll(0)), frame(&actor.unroll(1)));
@@ -67,7 +67,7 @@ async fn a_message_without_its_end_is_no_unroll() {
 }
 
 #[tokio::test]
-async fn what_is_compressed_or_no_message_at_all_is_refused_by_a_status() {
+async fn compressed_and_malformed_messages_are_refused_with_a_status() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut compressed = frame(&actor.unroll(0)).to_vec();

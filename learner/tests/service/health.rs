@@ -1,4 +1,4 @@
-//! Standard gRPC tools find their way: health checks and reflection.
+//! Standard gRPC tools work: health checks and reflection.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -17,7 +17,7 @@ fn request(service: &str) -> HealthCheckRequest {
 }
 
 #[tokio::test]
-async fn the_learner_serves_until_it_goes_down() {
+async fn the_learner_reports_that_it_serves_until_it_goes_down() {
     let mut world = World::start().await;
     let mut health = HealthClient::new(world.channel().await);
     for service in ["", "comic.v1.Learner"] {

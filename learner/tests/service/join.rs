@@ -1,4 +1,4 @@
-//! An actor that joins is told everything it needs.
+//! `Join` tells an actor everything that it needs, or refuses it with a reason.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -25,7 +25,7 @@ async fn the_reply_holds_experiment_task_layout_and_epoch() {
 }
 
 #[tokio::test]
-async fn a_new_process_gets_a_new_index_and_seed_and_one_that_reconnects_its_own() {
+async fn a_new_process_gets_a_new_index_and_seed_and_a_reconnecting_one_keeps_its_own() {
     let world = World::start().await;
     let (one, mut other) = (world.actor(70).await, world.actor(71).await);
     assert_ne!(one.reply.actor, other.reply.actor);
@@ -52,7 +52,7 @@ async fn another_protocol_is_refused_with_the_remedy() {
 }
 
 #[tokio::test]
-async fn what_an_earlier_life_acknowledged_is_counted_as_lost_as_soon_as_its_actor_is_back() {
+async fn unrolls_that_an_earlier_epoch_acknowledged_count_as_lost_when_their_actor_joins_again() {
     let world = World::start().await;
     let mut client = world.client().await;
     let reply = client.join(JoinRequest { acknowledged: 7, ..joining(70) }).await.unwrap().into_inner();
@@ -61,13 +61,13 @@ async fn what_an_earlier_life_acknowledged_is_counted_as_lost_as_soon_as_its_act
     assert_eq!(again.next_sequence, 7, "no number is lost twice");
     let accounting = world.batcher.accounting();
     assert_eq!((accounting.produced, accounting.dropped.lost_at_restart), (7, 7));
-    let boast = client.join(JoinRequest { acknowledged: u64::MAX, ..joining(70) }).await.unwrap_err();
-    assert_eq!(boast.code(), Code::InvalidArgument);
+    let impossible = client.join(JoinRequest { acknowledged: u64::MAX, ..joining(70) }).await.unwrap_err();
+    assert_eq!(impossible.code(), Code::InvalidArgument);
     assert_eq!(world.batcher.accounting(), accounting);
 }
 
 #[tokio::test]
-async fn who_was_of_another_run_is_sent_away_and_charged_with_nothing() {
+async fn an_actor_of_another_run_is_refused_without_counting_its_unrolls() {
     let world = World::start().await;
     let mut client = world.client().await;
     assert_eq!(client.join(joining(70)).await.unwrap().into_inner().run, RUN);
@@ -80,10 +80,10 @@ async fn who_was_of_another_run_is_sent_away_and_charged_with_nothing() {
 }
 
 #[tokio::test]
-async fn parameters_are_for_those_who_have_joined() {
+async fn parameters_are_for_actors_that_have_joined() {
     let world = World::start().await;
-    let stranger = WatchRequest { incarnation: 71, ..WatchRequest::default() };
-    let refused = world.client().await.watch_parameters(stranger).await.unwrap_err();
+    let unknown = WatchRequest { incarnation: 71, ..WatchRequest::default() };
+    let refused = world.client().await.watch_parameters(unknown).await.unwrap_err();
     assert_eq!(refused.code(), Code::FailedPrecondition, "{refused}");
     world.publisher.publish(1, Behaviour::Policy, &parameters(1, 10));
     let mut watch = world.actor(70).await.watch().await;
@@ -100,7 +100,7 @@ async fn a_newer_process_of_a_name_takes_the_older_ones_place() {
     let refused = unrolls.send(older.unroll(0)).await.unwrap_err();
     assert_eq!(refused.code(), Code::Aborted);
     let refused = older.client.join(named(71)).await.unwrap_err();
-    assert_eq!(refused.code(), Code::Aborted, "it ends: {refused}");
+    assert_eq!(refused.code(), Code::Aborted, "the older process ends: {refused}");
     assert!(refused.message().contains("newer process"), "{refused}");
     let watch = WatchRequest { incarnation: 71, ..WatchRequest::default() };
     let refused = older.client.watch_parameters(watch).await.unwrap_err();
@@ -108,42 +108,42 @@ async fn a_newer_process_of_a_name_takes_the_older_ones_place() {
     let mut unrolls = newer.stream().await;
     assert_eq!(unrolls.verdict(newer.unroll(0)).await, Verdict::Taken);
     let accounting = newer.accounting().await;
-    assert_eq!((accounting.produced, accounting.in_flight), (1, 1), "what was refused had no number");
+    assert_eq!((accounting.produced, accounting.in_flight), (1, 1), "the refused unroll is not counted");
     let long = JoinRequest { name: "x".repeat(254), ..joining(73) };
     assert_eq!(newer.client.join(long).await.unwrap_err().code(), Code::InvalidArgument);
 }
 
 #[tokio::test]
-async fn in_lockstep_actors_share_the_environments_and_one_seed_and_one_too_many_stands_by() {
+async fn in_lockstep_actors_divide_the_environments_share_a_seed_and_further_actors_stand_by() {
     let world = World::in_lockstep(8).await;
     let mut client = world.client().await;
     let asking = |incarnation, threads, environments| JoinRequest { threads, environments, ..joining(incarnation) };
     let mut seeds = std::collections::HashSet::new();
-    for (request, share) in [
+    for (request, assigned) in [
         (asking(70, Some(2), Some(2)), (0, 4)),
         (asking(71, Some(1), Some(3)), (4, 3)),
-        // What the experiment says, 16, and there is one left.
+        // The experiment's number is 16, but one environment is left.
         (asking(72, None, None), (7, 1)),
         (asking(71, Some(1), Some(3)), (4, 3)),
     ] {
         let reply = client.join(request).await.unwrap().into_inner();
-        assert_eq!(reply.environments, Some(Environments { first: share.0, count: share.1 }));
+        assert_eq!(reply.environments, Some(Environments { first: assigned.0, count: assigned.1 }));
         seeds.insert(reply.seed);
     }
     assert_eq!(seeds.len(), 1);
     let refused = client.join(joining(73)).await.unwrap_err();
     assert_eq!(refused.code(), Code::ResourceExhausted, "an actor tries again: {refused}");
-    assert_eq!(world.batcher.snapshot().accounts.len(), 3, "no account was opened for the one that stands by");
+    assert_eq!(world.batcher.snapshot().accounts.len(), 3, "no account was opened for the actor that stands by");
     let actors = client.get_status(StatusRequest {}).await.unwrap().into_inner().actors.unwrap();
-    assert_eq!(actors.alive, 3, "nor is it one of those who are there");
+    assert_eq!(actors.alive, 3, "an actor that stands by does not count as alive");
 }
 
 #[tokio::test]
-async fn in_lockstep_an_actor_of_an_earlier_life_has_to_start_again() {
+async fn in_lockstep_an_actor_of_an_earlier_epoch_must_start_again() {
     let world = World::in_lockstep(8).await;
     let refused = world.client().await.join(JoinRequest { actor: Some(0), ..joining(70) }).await.unwrap_err();
     assert_eq!(refused.code(), Code::FailedPrecondition);
-    assert!(refused.message().contains("begun anew"), "{}", refused.message());
+    assert!(refused.message().contains("began anew"), "{}", refused.message());
 }
 
 #[tokio::test]

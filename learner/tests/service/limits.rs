@@ -1,4 +1,4 @@
-//! Each limit refuses what is beyond it, says so, and leaves those inside undisturbed.
+//! Each limit refuses further peers with a reason, and does not disturb the others.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -32,7 +32,7 @@ async fn connections_from_one_address() {
     assert!(within(LIMIT, third).await.is_err());
     first.get_status(StatusRequest {}).await.unwrap();
     drop(second);
-    // The place is free when the server has seen the connection's end.
+    // The place is free when the server has noticed the end of the connection.
     let again = async {
         loop {
             if let Ok(mut client) = LearnerClient::connect(world.address.clone()).await
@@ -46,16 +46,16 @@ async fn connections_from_one_address() {
     within(LIMIT, again).await;
 }
 
-/// It would keep a place that somebody else wants.
+/// A silent connection would keep a place that others need.
 #[tokio::test]
-async fn silence_from_the_beginning() {
+async fn connections_that_stay_silent() {
     let world = World::start().await;
     let address = world.address.trim_start_matches("http://");
     let falls_silent_after = async |word: &[u8]| {
         let mut silent = TcpStream::connect(address).await.unwrap();
         silent.write_all(word).await.unwrap();
         let mut said = Vec::new();
-        // The learner's first words, and then the end.
+        // The learner sends its settings and then closes.
         let ended = within(3 * LIMIT, silent.read_to_end(&mut said)).await;
         assert!(ended.is_ok() || ended.is_err_and(|error| error.kind() == ErrorKind::ConnectionReset));
     };
@@ -63,15 +63,15 @@ async fn silence_from_the_beginning() {
 }
 
 #[tokio::test]
-async fn actors_in_all() {
+async fn actors() {
     let world = World::limited(ConnectionLimits { max_actors: 1, ..ConnectionLimits::default() }).await;
     let mut first = world.actor(70).await;
     let mut client = world.client().await;
     let refused = client.join(joining(71)).await.unwrap_err();
     assert_eq!(refused.code(), Code::ResourceExhausted, "an actor tries again");
     assert!(refused.message().contains("--max-actors"), "{refused}");
-    first.client.join(joining(70)).await.expect("one that is there comes back");
-    assert_eq!(world.batcher.snapshot().accounts.len(), 1, "no account was opened for the one that was refused");
+    first.client.join(joining(70)).await.expect("a present actor may join again");
+    assert_eq!(world.batcher.snapshot().accounts.len(), 1, "no account was opened for the refused actor");
 }
 
 #[tokio::test]
@@ -83,7 +83,7 @@ async fn calls_in_flight() {
     let refused = client.get_status(StatusRequest {}).await.unwrap_err();
     assert_eq!(refused.code(), Code::ResourceExhausted);
     drop(streams);
-    // The places are free when the server has seen the streams' end.
+    // The places are free when the server has noticed the end of the streams.
     within(LIMIT, async { while client.get_status(StatusRequest {}).await.is_err() {} }).await;
 }
 
@@ -104,7 +104,7 @@ async fn bytes_of_a_message() {
 }
 
 #[tokio::test]
-async fn a_limit_through_which_no_unroll_fits_is_a_wrong_configuration() {
+async fn a_limit_that_is_too_small_for_an_unroll_is_a_wrong_configuration() {
     let world = World::start().await;
     for (limits, option) in [
         (ConnectionLimits { max_message_bytes: Some(10), ..ConnectionLimits::default() }, "--max-message-bytes"),

@@ -1,6 +1,6 @@
-//! The learner as actors and operators see it, a real server on a real socket; and its checkpoint directory.
+//! The learner as actors and operators see it, with a real server on a real socket; and its checkpoint directory.
 //!
-//! One binary, since linking one takes longer than all of its tests.
+//! All of this is one binary, because linking a binary takes longer than these tests.
 
 mod assets;
 mod back_pressure;

@@ -1,4 +1,4 @@
-//! What Prometheus and a kubelet see, and that the documentation and the dashboard speak of the same.
+//! The pages for Prometheus and a kubelet. The documentation and the dashboard name the same metrics.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -35,7 +35,7 @@ fn value(page: &str, name: &str) -> f64 {
 }
 
 #[tokio::test]
-async fn what_happens_is_counted() {
+async fn the_metrics_count_what_happens() {
     let world = World::start().await;
     let address = observed(&world).await;
     let mut actor = world.actor(70).await;
@@ -67,7 +67,7 @@ async fn what_happens_is_counted() {
 }
 
 #[tokio::test]
-async fn probes_say_whether_it_lives_and_whether_it_takes_actors() {
+async fn probes_say_whether_the_learner_lives_and_whether_it_accepts_actors() {
     let mut world = World::start().await;
     let address = observed(&world).await;
     assert_eq!(get(&address, "GET /healthz").await, (200, "ok\n".into()));
@@ -81,7 +81,7 @@ async fn probes_say_whether_it_lives_and_whether_it_takes_actors() {
 }
 
 #[tokio::test]
-async fn a_peer_that_says_nothing_keeps_nobody_from_the_metrics() {
+async fn a_silent_peer_does_not_block_the_metrics() {
     let world = World::start().await;
     let address = observed(&world).await;
     let _silent = TcpStream::connect(&address).await.unwrap();
@@ -94,7 +94,7 @@ fn repository(path: &str) -> String {
 }
 
 #[test]
-fn the_reference_is_what_the_code_says() {
+fn the_reference_agrees_with_the_code() {
     let reference = Telemetry::default().reference();
     assert!(
         repository("docs/metrics.md") == reference,

@@ -1,4 +1,4 @@
-//! Parameters: always the newest version, in pieces, and the versions in between are skipped.
+//! Parameters: readers get the newest version in pieces, and skip the versions in between.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -29,7 +29,7 @@ async fn version(stream: &mut Streaming<ParametersChunk>) -> (u64, Vec<u8>) {
 }
 
 #[tokio::test]
-async fn each_version_arrives_whole_and_an_actor_that_comes_late_gets_the_newest() {
+async fn each_version_arrives_whole_and_a_late_reader_gets_the_newest() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut early = actor.watch().await;
@@ -46,7 +46,7 @@ async fn a_slow_reader_skips_the_versions_in_between() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut slow = actor.watch().await;
-    // Far more than windows and buffers hold, so the reader is still in the first one when the others come.
+    // Far more than windows and buffers hold, so the reader still reads the first version when the others are published.
     world.publisher.publish(1, Behaviour::Policy, &parameters(1, 16 * MEGABYTE));
     let begun = slow.message().await.unwrap().unwrap();
     assert_eq!((begun.version, begun.offset), (1, 0));
@@ -58,17 +58,21 @@ async fn a_slow_reader_skips_the_versions_in_between() {
         pieces.push(within(Duration::from_secs(10), slow.message()).await.unwrap().unwrap());
     }
     let last = pieces.pop().unwrap();
-    assert_eq!(pieces.iter().map(|piece| piece.data.len()).sum::<usize>(), 16 * MEGABYTE, "what was begun is finished");
+    assert_eq!(
+        pieces.iter().map(|piece| piece.data.len()).sum::<usize>(),
+        16 * MEGABYTE,
+        "the reader finishes the version that it began"
+    );
     assert_eq!(last.version, 4);
 }
 
-/// Of so many versions at once, without patience for those who stall.
+/// A publisher that holds so many versions, and replaces those of stalled readers at once.
 fn impatient(versions: usize) -> Publisher {
     Publisher::holding(EPOCH, Holding { versions, idle: Duration::ZERO, longest: Duration::MAX })
 }
 
 #[tokio::test]
-async fn who_reads_on_finishes_what_it_began_however_many_versions_come() {
+async fn a_slow_reader_finishes_its_version_while_many_others_are_published() {
     let publisher = Publisher::new(EPOCH);
     publisher.publish(1, Behaviour::Policy, &parameters(1, MEGABYTE));
     let pieces = publisher.newest().unwrap().frames().len() as u64;
@@ -76,17 +80,17 @@ async fn who_reads_on_finishes_what_it_began_however_many_versions_come() {
     for number in 2..=pieces {
         assert_eq!(slow.next().await.unwrap().version, 1);
         publisher.publish(number, Behaviour::Policy, &parameters(number, MEGABYTE));
-        // Others begin each of them, and some never end.
+        // Other readers begin each version, and some never finish.
         let mut other = publisher.subscribe();
         other.next().await.unwrap();
         std::mem::forget(other);
     }
-    assert_eq!(slow.next().await.unwrap().version, 1, "the last of its pieces");
+    assert_eq!(slow.next().await.unwrap().version, 1, "the last piece of its version");
     assert!(slow.next().await.unwrap().version > 1);
 }
 
 #[tokio::test]
-async fn a_reader_that_stalled_starts_over_with_the_newest_when_its_place_was_needed() {
+async fn a_stalled_reader_starts_again_with_the_newest_version_after_its_own_was_replaced() {
     let publisher = impatient(1);
     publisher.publish(1, Behaviour::Policy, &parameters(1, MEGABYTE));
     let mut stalled = publisher.subscribe();
@@ -100,7 +104,7 @@ async fn a_reader_that_stalled_starts_over_with_the_newest_when_its_place_was_ne
 }
 
 #[tokio::test]
-async fn without_room_a_reader_begins_the_newest_that_others_read_and_else_waits_for_a_place() {
+async fn when_no_version_can_be_added_a_reader_begins_the_newest_held_one_or_waits() {
     let patient = Holding { versions: 1, idle: Duration::from_secs(3600), longest: Duration::from_secs(3600) };
     let publisher = Publisher::holding(EPOCH, patient);
     publisher.publish(1, Behaviour::Policy, &parameters(1, MEGABYTE));
@@ -115,14 +119,14 @@ async fn without_room_a_reader_begins_the_newest_that_others_read_and_else_waits
     }
     {
         let mut waiting = pin!(second.next());
-        assert!(futures::poll!(&mut waiting).is_pending(), "version 1 is all that is held, and it has had that");
+        assert!(futures::poll!(&mut waiting).is_pending(), "only version 1 is held, and the reader has read it");
         drop(first);
         assert_eq!(within(Duration::from_secs(10), waiting).await.unwrap().version, 3);
     }
 }
 
 #[tokio::test]
-async fn versions_in_memory_are_bounded_whoever_stalls() {
+async fn the_versions_in_memory_are_bounded_while_readers_stall() {
     let publisher = impatient(4);
     let mut stalled = Vec::new();
     for number in 1..100 {
@@ -133,11 +137,11 @@ async fn versions_in_memory_are_bounded_whoever_stalls() {
         assert!(publisher.held() <= 4);
     }
     drop(stalled);
-    assert_eq!(publisher.held(), 0, "what nobody reads is not held");
+    assert_eq!(publisher.held(), 0, "a version without readers is not held");
 }
 
 #[tokio::test]
-async fn readers_share_what_was_encoded_once() {
+async fn readers_share_one_encoded_copy() {
     let publisher = Publisher::new(EPOCH);
     publisher.publish(1, Behaviour::Policy, &parameters(1, MEGABYTE));
     let pieces = [publisher.subscribe().next().await.unwrap(), publisher.subscribe().next().await.unwrap()];
@@ -145,7 +149,7 @@ async fn readers_share_what_was_encoded_once() {
 }
 
 #[tokio::test]
-async fn a_piece_on_its_way_keeps_no_other_alive() {
+async fn a_piece_that_is_being_sent_keeps_no_other_piece_in_memory() {
     let publisher = Publisher::new(EPOCH);
     publisher.publish(1, Behaviour::Policy, &parameters(1, MEGABYTE));
     let mut stalled = publisher.subscribe();
@@ -153,19 +157,19 @@ async fn a_piece_on_its_way_keeps_no_other_alive() {
     drop(next);
     publisher.publish(2, Behaviour::Policy, &parameters(2, 1));
     drop(stalled);
-    assert!(held.is_unique(), "its memory is no other piece's");
+    assert!(held.is_unique(), "the piece shares its memory with no other");
 }
 
 #[tokio::test]
-async fn the_end_of_the_run_is_told_and_ends_the_stream() {
+async fn the_end_of_the_run_is_sent_and_ends_the_stream() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut stream = actor.watch().await;
     world.publisher.publish(1, Behaviour::Demonstration, &parameters(1, 10));
     assert_eq!(stream.message().await.unwrap().unwrap().behaviour(), Behaviour::Demonstration);
     world.publisher.end_run();
-    let farewell = within(Duration::from_secs(10), stream.message()).await.unwrap().unwrap();
-    assert_eq!((farewell.run_over, farewell.total), (true, 0));
+    let last = within(Duration::from_secs(10), stream.message()).await.unwrap().unwrap();
+    assert_eq!((last.run_over, last.total), (true, 0));
     assert!(within(Duration::from_secs(10), stream.message()).await.unwrap().is_none());
 }
 

@@ -1,4 +1,4 @@
-//! Messages are read as there is room for them, and nobody keeps room that he does not use.
+//! A message is read when there is room for it, and no stream keeps room that it does not use.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -19,8 +19,8 @@ use crate::support::{Actor, BATCH, World, within};
 const MESSAGE: usize = 64 * 1024;
 const LIMIT: Duration = Duration::from_secs(30);
 
-/// A learner that has room for one message.
-async fn cramped() -> World {
+/// A learner with room for one message.
+async fn with_little_room() -> World {
     World::limited(ConnectionLimits {
         max_message_bytes: Some(MESSAGE),
         max_ingest_bytes: MESSAGE,
@@ -29,7 +29,7 @@ async fn cramped() -> World {
     .await
 }
 
-/// A stream that falls silent after these bytes; what it ends with.
+/// Sends these bytes and then nothing. Returns the status with which the stream ends.
 async fn silent_after(world: &World, bytes: Bytes) -> JoinHandle<Code> {
     let response = world.send_frames(stream::iter([bytes]).chain(stream::pending())).await;
     tokio::spawn(async move {
@@ -50,8 +50,8 @@ async fn status(actor: &mut Actor) -> Queue {
 }
 
 #[tokio::test]
-async fn half_a_message_keeps_its_room_for_ten_seconds_and_not_longer() {
-    let world = cramped().await;
+async fn half_a_message_loses_its_room_after_ten_seconds() {
+    let world = with_little_room().await;
     let half = {
         let stalled = world.actor(70).await;
         let whole = frame(&stalled.unroll(0));
@@ -67,21 +67,25 @@ async fn half_a_message_keeps_its_room_for_ten_seconds_and_not_longer() {
     let mut other = world.actor(71).await;
     let mut unrolls = other.stream().await;
     unrolls.sender.send(other.unroll(0)).await.unwrap();
-    // As many calls as it takes for the other to be read, if it is going to be.
+    // Enough calls for the learner to read the other unroll, if it were going to.
     for _ in 0..300 {
-        assert_eq!(other.accounting().await.produced, 0, "there is no room for it");
+        assert_eq!(other.accounting().await.produced, 0, "there is no room for the other unroll");
     }
     assert_eq!(within(LIMIT, stalled).await.unwrap(), Code::DeadlineExceeded);
     let ack = within(LIMIT, unrolls.acks.message()).await.unwrap().unwrap();
     assert_eq!(ack.verdict(), Verdict::Taken);
     let accounting = other.accounting().await;
-    assert_eq!((accounting.produced, accounting.unattributed), (1, 0), "it is that actor's to send again");
+    assert_eq!(
+        (accounting.produced, accounting.unattributed),
+        (1, 0),
+        "the late message is not counted: its actor sends it again"
+    );
     assert_eq!(read(&world, "comic_unrolls_late_total"), 1);
 }
 
 #[tokio::test]
-async fn a_stream_without_a_word_keeps_no_room() {
-    let world = cramped().await;
+async fn a_silent_stream_keeps_no_room() {
+    let world = with_little_room().await;
     let _silent = [world.actor(70).await.stream().await, world.actor(71).await.stream().await];
     let mut other = world.actor(72).await;
     let mut unrolls = other.stream().await;
@@ -89,8 +93,8 @@ async fn a_stream_without_a_word_keeps_no_room() {
 }
 
 #[tokio::test]
-async fn what_waits_for_a_batch_keeps_others_unread_and_all_have_their_turn() {
-    let world = cramped().await;
+async fn an_unroll_that_waits_for_a_batch_keeps_others_unread_until_all_are_taken_in_turn() {
+    let world = with_little_room().await;
     let mut filling = world.actor(70).await;
     let mut unrolls = filling.stream().await;
     for sequence in 0..2 * BATCH as u64 {
@@ -105,9 +109,9 @@ async fn what_waits_for_a_batch_keeps_others_unread_and_all_have_their_turn() {
     }
     let waits = async { while status(&mut filling).await.waiting == 0 {} };
     within(LIMIT, waits).await;
-    // As many calls as it takes for the others to be read, if they are going to be.
+    // Enough calls for the learner to read the other unrolls, if it were going to.
     for _ in 0..300 {
-        assert_eq!(status(&mut filling).await.waiting, 1, "there is room for one");
+        assert_eq!(status(&mut filling).await.waiting, 1, "there is room for one message");
     }
     for _ in 0..3 {
         let batch = world.batcher.clone();

@@ -1,4 +1,4 @@
-//! The learner can be asked how it is, and told how good it is.
+//! The status of the learner, and the evaluations that actors report.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -8,7 +8,7 @@ use comic_proto::v1::{EvaluationReport, StatusRequest};
 use tonic::Code;
 
 #[tokio::test]
-async fn the_newest_metrics_are_what_is_answered() {
+async fn the_status_holds_the_newest_metrics() {
     let world = World::start().await;
     let mut client = world.client().await;
     let status = client.get_status(StatusRequest {}).await.unwrap().into_inner();

@@ -1,4 +1,4 @@
-//! TLS: both sides check whom they talk to, and renewed certificates count without a restart.
+//! TLS: both sides check certificates, and renewed certificates take effect without a restart.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -25,14 +25,14 @@ fn certificates(directory: &Path) {
     certs.run().unwrap();
 }
 
-/// A learner that asks for certificates if `mutual`.
+/// A learner that requires client certificates if `mutual`.
 async fn world(directory: &Path, mutual: bool) -> World {
     let ca = directory.join("ca.pem");
     let tls = Tls::new(&directory.join("server.pem"), &directory.join("server-key.pem"), mutual.then_some(&ca));
     World::secured(Security { tls: Some(tls.unwrap()), tokens: None }).await
 }
 
-/// A client that trusts one directory's authority, and shows another's certificate.
+/// Access of a client that trusts the authority of one directory and shows the certificate of another.
 fn access(trusted: &Path, shown: Option<&Path>) -> Access {
     Access {
         ca: Some(trusted.join("ca.pem")),
@@ -42,8 +42,8 @@ fn access(trusted: &Path, shown: Option<&Path>) -> Access {
     }
 }
 
-/// Whether a call gets through; if not, it is for want of trust.
-async fn gets_through(world: &World, access: &Access) -> bool {
+/// Whether a call succeeds. If it fails, a certificate was not accepted.
+async fn succeeds(world: &World, access: &Access) -> bool {
     let mut client = match world.client_with(access).await {
         Ok(client) => client,
         Err(error) => {
@@ -61,31 +61,31 @@ async fn gets_through(world: &World, access: &Access) -> bool {
 }
 
 #[tokio::test]
-async fn a_client_talks_to_whom_it_trusts() {
+async fn a_client_accepts_only_a_learner_that_it_trusts() {
     let (own, foreign) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     certificates(own.path());
     certificates(foreign.path());
     let world = world(own.path(), false).await;
-    assert!(gets_through(&world, &access(own.path(), None)).await);
-    assert!(!gets_through(&world, &access(foreign.path(), None)).await);
+    assert!(succeeds(&world, &access(own.path(), None)).await);
+    assert!(!succeeds(&world, &access(foreign.path(), None)).await);
 }
 
 #[tokio::test]
-async fn a_learner_that_asks_for_certificates_takes_those_of_its_authority_alone() {
+async fn a_learner_that_requires_certificates_accepts_only_those_of_its_authority() {
     let (own, foreign) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     certificates(own.path());
     certificates(foreign.path());
     let world = world(own.path(), true).await;
-    assert!(gets_through(&world, &access(own.path(), Some(own.path()))).await);
-    // Often enough to see a reset that overtakes the alert, were the connection not closed with care.
+    assert!(succeeds(&world, &access(own.path(), Some(own.path()))).await);
+    // Often enough to see a reset that overtakes the alert, if the connection were closed too early.
     for _ in 0..20 {
-        assert!(!gets_through(&world, &access(own.path(), None)).await);
-        assert!(!gets_through(&world, &access(own.path(), Some(foreign.path()))).await);
+        assert!(!succeeds(&world, &access(own.path(), None)).await);
+        assert!(!succeeds(&world, &access(own.path(), Some(foreign.path()))).await);
     }
 }
 
 #[tokio::test]
-async fn who_does_not_speak_tls_gets_nowhere_and_delays_nobody() {
+async fn a_peer_without_tls_is_refused_and_delays_no_other() {
     let own = tempfile::tempdir().unwrap();
     certificates(own.path());
     let world = world(own.path(), false).await;
@@ -96,12 +96,12 @@ async fn who_does_not_speak_tls_gets_nowhere_and_delays_nobody() {
         Err(_) => false,
     };
     assert!(!answered);
-    assert!(gets_through(&world, &access(own.path(), None)).await);
+    assert!(succeeds(&world, &access(own.path(), None)).await);
 }
 
-/// It would keep a place that somebody else wants.
+/// A silent connection would keep a place that others need.
 #[tokio::test]
-async fn who_agrees_on_tls_and_says_nothing_more_is_let_go() {
+async fn a_peer_that_is_silent_after_the_tls_handshake_is_disconnected() {
     let own = tempfile::tempdir().unwrap();
     certificates(own.path());
     let world = world(own.path(), false).await;
@@ -115,20 +115,20 @@ async fn who_agrees_on_tls_and_says_nothing_more_is_let_go() {
     let connector = TlsConnector::from(Arc::new(trusting));
     let mut silent = connector.connect("localhost".try_into().unwrap(), stream).await.unwrap();
     let ended = within(Duration::from_secs(30), silent.read_to_end(&mut Vec::new())).await;
-    // Whether the learner says goodbye or just goes.
+    // The learner may close TLS in order or just the socket.
     let gone = |error: std::io::Error| matches!(error.kind(), ErrorKind::ConnectionReset | ErrorKind::UnexpectedEof);
     assert!(ended.is_ok() || ended.is_err_and(gone));
 }
 
 #[tokio::test]
-async fn renewed_certificates_are_shown_without_a_restart() {
+async fn renewed_certificates_are_used_without_a_restart() {
     let (old, new) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     certificates(old.path());
     certificates(new.path());
     let world = world(old.path(), false).await;
-    assert!(!gets_through(&world, &access(new.path(), None)).await);
+    assert!(!succeeds(&world, &access(new.path(), None)).await);
     std::fs::copy(new.path().join("server-key.pem"), old.path().join("server-key.pem")).unwrap();
-    assert!(gets_through(&world, &access(old.path(), None)).await, "half a renewal changes nothing");
+    assert!(succeeds(&world, &access(old.path(), None)).await, "half a renewal changes nothing");
     std::fs::copy(new.path().join("server.pem"), old.path().join("server.pem")).unwrap();
-    assert!(gets_through(&world, &access(new.path(), None)).await);
+    assert!(succeeds(&world, &access(new.path(), None)).await);
 }

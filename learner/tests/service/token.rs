@@ -1,4 +1,4 @@
-//! Where the learner wants a token, no call gets through without one that it accepts.
+//! If the learner requires a token, it refuses every call without an accepted one.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -23,7 +23,7 @@ fn access(directory: &Path, token: &str) -> Access {
 }
 
 #[tokio::test]
-async fn every_call_is_refused_without_a_token_and_with_another() {
+async fn every_call_is_refused_without_a_token_and_with_a_wrong_one() {
     let directory = tempfile::tempdir().unwrap();
     let accepted = directory.path().join("accepted");
     std::fs::write(&accepted, "open-sesame").unwrap();
@@ -46,7 +46,7 @@ async fn every_call_is_refused_without_a_token_and_with_another() {
 }
 
 #[tokio::test]
-async fn a_renewed_token_counts_without_a_restart() {
+async fn a_renewed_token_takes_effect_without_a_restart() {
     let directory = tempfile::tempdir().unwrap();
     let accepted = directory.path().join("accepted");
     std::fs::write(&accepted, "first").unwrap();
@@ -63,7 +63,7 @@ async fn a_renewed_token_counts_without_a_restart() {
 }
 
 #[tokio::test]
-async fn the_health_check_needs_none() {
+async fn the_health_check_needs_no_token() {
     let directory = tempfile::tempdir().unwrap();
     let accepted = directory.path().join("accepted");
     std::fs::write(&accepted, "open-sesame").unwrap();
@@ -71,5 +71,5 @@ async fn the_health_check_needs_none() {
     let mut health = HealthClient::new(world.channel().await);
     let request = || HealthCheckRequest { service: "comic.v1.Learner".into() };
     health.check(request()).await.unwrap();
-    assert_eq!(health.watch(request()).await.unwrap_err().code(), Code::Unauthenticated, "a stream takes a place");
+    assert_eq!(health.watch(request()).await.unwrap_err().code(), Code::Unauthenticated, "a stream would take a place");
 }

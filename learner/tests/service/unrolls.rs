@@ -1,4 +1,4 @@
-//! Every unroll is answered: taken, or refused with a reason that is counted.
+//! Every unroll is answered: it is taken, or refused with a reason that is counted.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
@@ -13,7 +13,7 @@ use comic_replay::{Next, Phase};
 use tonic::Code;
 
 #[tokio::test]
-async fn an_unroll_is_taken_acknowledged_and_handed_to_the_trainer() {
+async fn an_unroll_is_taken_acknowledged_and_given_to_the_trainer() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;
@@ -31,7 +31,7 @@ async fn an_unroll_is_taken_acknowledged_and_handed_to_the_trainer() {
 }
 
 #[tokio::test]
-async fn an_invalid_unroll_is_refused_by_name_and_the_next_one_is_welcome() {
+async fn an_invalid_unroll_is_refused_with_the_field_and_the_next_one_is_taken() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;
@@ -54,7 +54,7 @@ async fn an_invalid_unroll_is_refused_by_name_and_the_next_one_is_welcome() {
 }
 
 #[tokio::test]
-async fn an_invalid_unroll_goes_to_the_quarantine_and_no_other_one_does() {
+async fn only_invalid_unrolls_go_to_the_quarantine() {
     let directory = tempfile::tempdir().unwrap();
     let quarantine =
         QuarantineArguments { quarantine: Some(directory.path().to_path_buf()), quarantine_bytes: 1 << 20 };
@@ -77,7 +77,7 @@ async fn an_invalid_unroll_goes_to_the_quarantine_and_no_other_one_does() {
 }
 
 #[tokio::test]
-async fn an_unroll_without_a_header_is_refused_and_nobody_is_charged() {
+async fn an_unroll_without_a_header_is_refused_and_counts_for_no_actor() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;
@@ -88,7 +88,7 @@ async fn an_unroll_without_a_header_is_refused_and_nobody_is_charged() {
 }
 
 #[tokio::test]
-async fn what_is_sent_again_after_a_reconnect_is_taken_once() {
+async fn an_unroll_that_is_sent_again_after_a_reconnect_is_taken_once() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut first = actor.stream().await;
@@ -102,7 +102,7 @@ async fn what_is_sent_again_after_a_reconnect_is_taken_once() {
 }
 
 #[tokio::test]
-async fn old_unrolls_are_refused_as_stale_and_those_of_another_life_or_phase_as_superseded() {
+async fn old_unrolls_are_stale_and_those_of_another_epoch_or_phase_superseded() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;
@@ -125,7 +125,7 @@ async fn old_unrolls_are_refused_as_stale_and_those_of_another_life_or_phase_as_
 }
 
 #[tokio::test]
-async fn an_actor_that_has_not_joined_is_told_to() {
+async fn an_actor_that_has_not_joined_is_told_to_join() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;
@@ -136,7 +136,7 @@ async fn an_actor_that_has_not_joined_is_told_to() {
 }
 
 #[tokio::test]
-async fn a_message_beyond_the_layout_s_size_ends_the_stream_before_it_is_read() {
+async fn a_message_that_is_too_large_ends_the_stream_before_it_is_read() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;

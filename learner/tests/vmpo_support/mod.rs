@@ -40,7 +40,7 @@ pub(crate) fn spec() -> TaskSpec {
     }
 }
 
-/// The same with a second task, whose clip is `lie` and whose observation is the last two entries.
+/// The same with a second task. Its clip is `lie`, and its observation is the last two entries.
 pub(crate) fn joint_spec() -> TaskSpec {
     let mut spec = spec();
     spec.reward_terms = vec!["reward".into()];
@@ -77,7 +77,7 @@ pub(crate) fn every_low_level() -> Vec<Experiment> {
         .to_vec()
 }
 
-/// libtorch's generator is the process's: tests that seed it take turns.
+/// The whole process shares libtorch's generator, so tests that seed it take turns.
 static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
 pub(crate) fn learner(experiment: &Experiment, seed: i64) -> VmpoLearner {
@@ -90,13 +90,13 @@ pub(crate) fn learner_of(spec: &TaskSpec, experiment: &Experiment, seed: i64) ->
 
 pub(crate) fn learner_on(device: Device, spec: &TaskSpec, experiment: &Experiment, seed: i64) -> VmpoLearner {
     let _guard = GENERATOR.lock().unwrap();
-    // Tests run side by side, on networks too small to share among threads.
+    // Tests run in parallel, and the networks are too small for several threads.
     tch::set_num_threads(1);
     tch::manual_seed(seed);
     VmpoLearner::new(spec, experiment, &[0.1, -0.2, 0.3], device).unwrap()
 }
 
-/// Unrolls as the wire has them; every field may be changed by a test.
+/// Unrolls as they come over the wire; a test may change every field.
 #[derive(Clone)]
 pub(crate) struct Unrolls {
     pub(crate) count: usize,
@@ -127,7 +127,7 @@ impl Numbers {
     }
 
     pub(crate) fn next(&mut self) -> f32 {
-        // Knuth's MMIX generator; the high bits are the good ones.
+        // Knuth's MMIX generator, of which the high bits are used.
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 40) as f32 / (1u64 << 23) as f32 - 1.0
     }
@@ -163,8 +163,8 @@ impl Unrolls {
         }
     }
 
-    /// Recorded unrolls of an experiment's sizes, of one task or of [`joint_spec`]'s two, `seed` deciding the mix, and every
-    /// fourth of one task alone: some end an episode, by a fall or a clip's end, and some are padding from a row on.
+    /// Generated unrolls of an experiment's sizes, of one task or of [`joint_spec`]'s two. `seed` decides the mix; every
+    /// fourth seed gives one task alone. Some unrolls end an episode, by a fall or a clip's end, and some end in padding.
     pub(crate) fn recorded(experiment: &Experiment, spec: &TaskSpec, seed: u64, count: usize) -> Self {
         let mut unrolls = Self::random(seed, count);
         let mut numbers = Numbers::new(seed + 100);
@@ -199,7 +199,7 @@ impl Unrolls {
                 let observations = unroll * (LENGTH + 1)..(unroll + 1) * (LENGTH + 1);
                 unrolls.clip[observations.clone()].fill(3);
                 for observation in observations {
-                    // The second task's is the last two entries.
+                    // The second task's observation is the last two entries.
                     unrolls.task[observation * WIDTHS.task..][..WIDTHS.task - 2].fill(0.0);
                 }
             }
@@ -314,8 +314,8 @@ impl Unrolls {
             let (proprioception, task) = (steps(&self.proprioception, LENGTH + 1), steps(&self.task, LENGTH + 1));
             let observation = learner.policy().normalise(&proprioception, &task, None, routing);
             let (previous, noise) = (steps(&self.previous_latent, LENGTH), steps(&self.latent_noise, LENGTH));
-            let memory = RecurrentState { state: &before, first: Some(&begins) };
-            learner.policy().act(&observation, &previous, &noise, memory)
+            let recurrent = RecurrentState { state: &before, first: Some(&begins) };
+            learner.policy().act(&observation, &previous, &noise, recurrent)
         })
     }
 

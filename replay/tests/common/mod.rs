@@ -1,4 +1,4 @@
-//! A small unroll, and actors that make them.
+//! Small unrolls, and actors that send them.
 #![allow(dead_code, clippy::unwrap_used, clippy::expect_used)]
 
 use std::future::Future;
@@ -12,7 +12,7 @@ use comic_replay::{Batch, BatchOrder, Batcher, Config, Ledger, Next, Outcome, Ph
 
 pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, oldest: 0, behaviour: Behaviour::Policy };
 pub(crate) const CONFIG: Config = Config { unrolls: 3, max_staleness: 4, ahead: 2, order: BatchOrder::Arrival };
-/// Slots that fill up while nobody trains: the open batch and the full one.
+/// Slots that can be filled without a trainer: those of the open batch and of the full one.
 pub(crate) const SLOTS: usize = 2 * CONFIG.unrolls;
 
 pub(crate) fn layout() -> Arc<UnrollLayout> {
@@ -40,7 +40,7 @@ pub(crate) fn task_of(sequence: u64) -> usize {
     (sequence as usize / UNROLLS_OF_A_TASK).min(TASKS.len())
 }
 
-/// The accounting of these tasks are kept.
+/// The ledger with the accounting of [`TASKS`].
 pub(crate) fn with_tasks(ledger: Ledger) -> Ledger {
     ledger.with_tasks(TASKS.map(String::from))
 }
@@ -76,13 +76,13 @@ impl Actor {
         }
     }
 
-    /// Sends unroll `sequence`; `None` if it has to wait, and then gives up.
+    /// Sends unroll `sequence`. If it would have to wait, it is cancelled, and the result is `None`.
     pub(crate) fn send(self, batcher: &Batcher, sequence: u64) -> Option<Outcome> {
         insert_now(batcher, &self.header(sequence))
     }
 }
 
-/// An unroll whose every number says who made it.
+/// An unroll in which every number identifies the actor, the unroll, the field and the row.
 pub(crate) fn payload(header: &UnrollHeader) -> Bytes {
     let layout = layout();
     let mut unroll = UnrollBuffer::new(&layout);
@@ -101,7 +101,7 @@ pub(crate) fn mark(header: &UnrollHeader, field: Field, t: usize) -> f32 {
     header.actor as f32 * 10_000.0 + header.sequence as f32 * 100.0 + (field as usize * 4 + t) as f32 / 64.0
 }
 
-/// Inserts if that is possible without waiting; the future is dropped otherwise.
+/// Inserts an unroll. If it would have to wait, the future is dropped.
 pub(crate) fn insert_now(batcher: &Batcher, header: &UnrollHeader) -> Option<Outcome> {
     now(&mut Box::pin(batcher.insert(header, payload(header))))
 }

@@ -1,8 +1,8 @@
-//! The tasks that dm_control publishes against its own rollouts.
+//! Compares the tasks that dm_control publishes with its own rollouts.
 //!
 //! `COMIC_GOLDEN_DIR` names a folder of rollouts: `tracking_*.npz`, `tracking2019_*.npz` and the `.h5` files of their
-//! clips, `go_to_target_*.npz`, `gaps*_rollout.npz` and `walls*_rollout.npz` with the `*_arena.json` of the same stem.
-//! Without it the repository's own are used. Every number of every row is compared.
+//! clips, `go_to_target_*.npz`, `gaps*_rollout.npz` and `walls*_rollout.npz` with the `*_arena.json` of the same name.
+//! The default is `tests/fixtures/golden`. The tests compare every number of every row.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
@@ -17,7 +17,7 @@ mod vision;
 use npz::{Array, Values};
 use recording::{Rollout, folder, rollouts};
 
-/// A kind of rollout: how its files' names begin and end, and how one is compared.
+/// A kind of rollout: the prefix and suffix of its files' names, and the function that compares one.
 struct Kind {
     prefix: &'static str,
     suffix: &'static str,
@@ -43,7 +43,8 @@ fn all_rollouts() -> Vec<Rollout> {
     for Kind { prefix, suffix, .. } in KINDS {
         let found = rollouts(&folder, (prefix, suffix)).unwrap();
         if found.is_empty() {
-            eprintln!("reported: {} has no rollouts {prefix}*{suffix}.npz", folder.display());
+            assert!(std::env::var_os("COMIC_GOLDEN_DIR").is_some(), "{}: no {prefix}*{suffix}.npz", folder.display());
+            eprintln!("{} has no rollouts {prefix}*{suffix}.npz: they are not compared", folder.display());
         }
         all.extend(found);
     }
@@ -69,14 +70,14 @@ fn parity_of_every_rollout() {
     eprintln!("{} rollouts equal, {} rows", all.len(), all.iter().map(Rollout::rows).sum::<usize>());
 }
 
-/// The smallest change that a comparison must see: one unit in the last place where it is exact, else a billionth.
+/// The smallest change that a comparison must detect: one unit in the last place if it is exact, else 1e-9.
 fn altered(name: &str, value: f64) -> f64 {
     match name {
         _ if value.is_nan() => 0.25,
         "qpos" | "qvel" | "act" | "time" | "qacc_warmstart_after_reset" => value.next_up(),
         "clip" | "start" | "ncon" | "mocap_step" | "truncate" | "end_mocap" | "step_type" | "discount" | "counter"
         | "disallowed" => value + 1.0,
-        // Controls are clipped to their range, so the change goes inwards.
+        // Controls are clipped to their range, so the change is towards 0.
         "actions" => value * 0.5 + if value == 0.0 { 0.5 } else { 0.0 },
         _ => value + 1e-9,
     }
@@ -104,12 +105,12 @@ fn parity_fails_when_any_quantity_is_altered() {
                 Values::Text(_) => continue,
             };
             for index in [0, length / 2, length.saturating_sub(1)].into_iter().take(length) {
-                // What these two say of a reset is the end of the episode before.
+                // At a reset these two flags still belong to the previous episode.
                 if index == 0 && ["truncate", "end_mocap"].contains(&name.as_str()) {
                     continue;
                 }
                 let outcome = compare(&alter(&rollout, name, index));
-                assert!(outcome.is_err(), "{}: altering {name}[{index}] went unseen", rollout.file);
+                assert!(outcome.is_err(), "{}: a change of {name}[{index}] was not detected", rollout.file);
             }
         }
     }
@@ -146,7 +147,7 @@ fn parity_fails_when_names_are_altered() {
                 assert!(text[0].contains(from));
                 text[0] = text[0].replacen(from, to, 1);
             }
-            assert!(compare(&copy).is_err(), "altering {name} went unseen");
+            assert!(compare(&copy).is_err(), "a change of {name} was not detected");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The compiled model against dm_control's: every array, bit for bit.
+//! Compares every array of the compiled models with dm_control's, bit for bit.
 
 use std::path::Path;
 

@@ -1,4 +1,4 @@
-//! Reading numpy's `.npz` files as written by `numpy.savez_compressed`.
+//! Reads `.npz` files that `numpy.savez_compressed` wrote.
 
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -13,7 +13,7 @@ pub(crate) struct Array {
     pub(crate) values: Values,
 }
 
-/// What an array holds.
+/// The values of an array.
 #[derive(Clone, Debug)]
 pub(crate) enum Values {
     /// Numbers of any type.
@@ -39,7 +39,8 @@ pub(crate) fn read(path: &Path) -> Result<Arrays, String> {
             .map_err(|error| fail(error.to_string()))?
             .read_to_end(&mut bytes)
             .map_err(|error| fail(error.to_string()))?;
-        let array = parse(&bytes).ok_or_else(|| fail(format!("{name}: not an array this test can read")))?;
+        let array =
+            parse(&bytes).ok_or_else(|| fail(format!("{name}: this reader does not know the array's format")))?;
         arrays.insert(name, array);
     }
     Ok(arrays)
@@ -109,7 +110,7 @@ impl Array {
     pub(crate) fn numbers(&self) -> Result<&[f64], String> {
         match &self.values {
             Values::Numbers(numbers) => Ok(numbers),
-            Values::Text(_) => Err("text where numbers should be".into()),
+            Values::Text(_) => Err("expected numbers, found text".into()),
         }
     }
 
@@ -117,7 +118,7 @@ impl Array {
     pub(crate) fn texts(&self) -> Result<&[String], String> {
         match &self.values {
             Values::Text(text) => Ok(text),
-            Values::Numbers(_) => Err("numbers where text should be".into()),
+            Values::Numbers(_) => Err("expected text, found numbers".into()),
         }
     }
 

@@ -1,4 +1,4 @@
-//! dm_control's recorded rollouts as files: row 0 after the reset, row n after control step n.
+//! Files of dm_control's recorded rollouts: row 0 is after the reset, row n after control step n.
 
 use std::path::{Path, PathBuf};
 
@@ -6,15 +6,15 @@ use comic_tasks::{Outcome, Simulated, Step};
 
 use crate::npz::{self, Arrays};
 
-/// Observations, rewards, errors; dm_control's sums are in another order.
+/// Tolerance of observations, rewards and errors: dm_control sums in another order.
 const TOLERANCE: f64 = 1e-12;
-/// `gyro_control` takes the arccosine of a number near 1.
+/// Tolerance of `gyro_control`, which is the arccosine of a number near 1.
 const GYRO_TOLERANCE: f64 = 1e-10;
 
-/// The folder of rollouts: `COMIC_GOLDEN_DIR`, or the repository's own.
+/// The folder of rollouts: `COMIC_GOLDEN_DIR`, or `tests/fixtures/golden`.
 pub(crate) fn folder() -> PathBuf {
     match std::env::var_os("COMIC_GOLDEN_DIR") {
-        // Relative to the workspace, where the command was given.
+        // A relative path starts at the workspace, where the user gave the command.
         Some(folder) => workspace().join(folder),
         None => workspace().join("tests/fixtures/golden"),
     }
@@ -29,7 +29,7 @@ pub(crate) fn workspace() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// The files of `folder` that end in `extension`, sorted.
+/// The sorted files of `folder` with this extension.
 pub(crate) fn files(folder: &Path, extension: &str) -> Result<Vec<PathBuf>, String> {
     let entries = std::fs::read_dir(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
     let mut paths: Vec<PathBuf> = entries
@@ -53,7 +53,7 @@ pub(crate) fn rollouts(folder: &Path, (prefix, suffix): (&str, &str)) -> Result<
         .collect()
 }
 
-/// One recorded rollout: row 0 after the reset, row n after control step n.
+/// A recorded rollout.
 #[derive(Clone)]
 pub(crate) struct Rollout {
     pub(crate) folder: PathBuf,
@@ -89,13 +89,13 @@ impl Rollout {
         valid.map(|number| number as usize).ok_or_else(|| format!("{}: {name} = {number:?} is no index", self.file))
     }
 
-    /// Names and sizes of the observations, as recorded.
+    /// The recorded names and sizes of the observations.
     pub(crate) fn layout(&self) -> Result<Vec<(String, usize)>, String> {
         serde_json::from_str(self.array("obs_layout")?.text()?)
             .map_err(|error| format!("{}: obs_layout: {error}", self.file))
     }
 
-    /// What every task records: the state of the simulation, reward, discount and step type.
+    /// Compares what every task records: the state of the simulation, reward, discount and step type.
     pub(crate) fn compare_common(
         &self,
         row: usize,
@@ -124,7 +124,7 @@ impl Rollout {
         }
     }
 
-    /// The recorded controls, one for each row but the first.
+    /// The recorded controls, one for each row except the first.
     pub(crate) fn controls(&self) -> Result<Vec<&[f64; 56]>, String> {
         let actions = self.array("actions")?;
         let count = actions.shape.first().copied().unwrap_or(0);
@@ -144,7 +144,7 @@ impl Rollout {
         self.equal(row, name, self.array(name)?.row(row)?, found, TOLERANCE)
     }
 
-    /// Names, order and values of the observations.
+    /// Compares names, order and values of the observations.
     pub(crate) fn compare_observations(
         &self,
         row: usize,

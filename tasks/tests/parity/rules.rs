@@ -1,4 +1,4 @@
-//! Go-to-target and the corridors: a replay against a recorded rollout.
+//! Compares replays of go-to-target and of the corridors with recorded rollouts.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use serde::Deserialize;
 
 use crate::recording::Rollout;
 
-/// A geom of an arena, as recorded; what is not named here follows from the arena's kind.
+/// A recorded geom of an arena. The fields that are not listed follow from the arena's kind.
 #[derive(Deserialize)]
 struct Geom {
     name: String,
@@ -27,7 +27,7 @@ pub(crate) fn compare_go_to_target(rollout: &Rollout) -> Result<(), String> {
     compare(rollout, &mut replay)
 }
 
-/// Where the target was, place after place.
+/// The places of the target in their order.
 fn targets(rollout: &Rollout) -> Result<Vec<[f64; 2]>, String> {
     let recorded = rollout.array("target")?;
     let mut places: Vec<[f64; 2]> = Vec::new();
@@ -52,7 +52,7 @@ pub(crate) fn compare_corridor(rollout: &Rollout) -> Result<(), String> {
     compare(rollout, &mut replay)
 }
 
-/// A corridor as it was recorded.
+/// A recorded corridor.
 pub(crate) struct RecordedArena {
     /// m.
     pub(crate) length: f64,
@@ -76,7 +76,7 @@ impl RecordedArena {
         };
         let blocks = |body: &str| geoms.iter().filter(|geom| geom.body == body).map(block).collect::<Vec<_>>();
         let (platforms, walls) = (blocks("ground"), blocks("walls"));
-        // Four planes at the sides, and the ground.
+        // The other five geoms are four planes at the sides and the ground.
         if platforms.len() + walls.len() + 5 != geoms.len() || platforms.is_empty() == walls.is_empty() {
             return Err(fail(&"neither an arena of gaps nor one of walls"));
         }

@@ -1,4 +1,4 @@
-//! Tracking: an environment against a recorded rollout.
+//! Compares the tracking environment with recorded rollouts.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use comic_tasks::{Environment, Outcome, Simulated, Step, TrackingEnvironment, Tr
 
 use crate::recording::{Rollout, files, workspace};
 
-/// Compares every number of every row. The first difference is the error, with file, row and quantity.
+/// Compares every number of every row. The error is the first difference, with file, row and quantity.
 pub(crate) fn compare(rollout: &Rollout) -> Result<(), String> {
     let channels: Vec<String> = rollout.array("reward_channels")?.texts()?.to_vec();
     if channels != TRACKING_REWARD_TERMS {
@@ -38,14 +38,14 @@ fn compare_row(
     rollout.compare_observations(row, &environment.dictionary())?;
     let Some(step) = step else { return rollout.exact(row, "reward_terms", &[0.0; 5]) };
     rollout.close(row, "reward_terms", &step.reward_terms)?;
-    // Flags of the last step; at a reset dm_control leaves those of the episode before.
+    // These are flags of the last step. At a reset dm_control keeps those of the previous episode.
     rollout.exact(row, "truncate", &[f64::from(u8::from(step.outcome == Outcome::Terminated))])?;
     let episode = environment.episode();
     let at_the_end = environment.frame() == episode.start + episode.steps_left;
     rollout.exact(row, "end_mocap", &[f64::from(u8::from(at_the_end))])
 }
 
-/// The file that has the rollout's clip.
+/// Finds the file that contains the rollout's clip.
 fn clip_file(rollout: &Rollout, clip: &str) -> Result<PathBuf, String> {
     let wheel = std::env::var_os("COMIC_DM_CONTROL_DIR")
         .map_or_else(|| workspace().join(".deps/dm_control"), |directory| workspace().join(directory));
@@ -75,8 +75,8 @@ fn environment(rollout: &Rollout) -> Result<TrackingEnvironment, String> {
     };
     let source =
         ClipSource { ids: vec![clip.into()], ..ClipSource::whole(clip_file(rollout, clip)?.to_string_lossy()) };
-    // The clip's index is an observation. It is the clip's place in the recording's own list, which is not known
-    // beyond that: so many copies of the clip put it there.
+    // The clip's index is an observation: its place in the recording's list of clips. That list is not recorded, so copies
+    // of the clip fill the places before it.
     let catalogue = Catalogue::open(&vec![source; index + 1]).map_err(|error| fail(&error))?;
     let task = Arc::new(TrackingTask::comparison(&config, &catalogue).map_err(|error| fail(&error))?);
     let mut environment = task.tracking_environment(0);

@@ -35,12 +35,12 @@ use tonic::{Status, Streaming};
 use tower::Service as _;
 
 pub(crate) const EPOCH: u64 = 3;
-/// Which run it is.
+/// The run's number.
 pub(crate) const RUN: u64 = 0x5eed;
-/// Unrolls a batch.
+/// Unrolls of a batch.
 pub(crate) const BATCH: usize = 2;
 
-/// A learner that serves, without a trainer.
+/// A learner that serves and has no trainer.
 pub(crate) struct World {
     pub(crate) experiment: Experiment,
     pub(crate) spec: TaskSpec,
@@ -57,17 +57,17 @@ impl World {
         Self::start_with(8, Vec::new()).await
     }
 
-    /// With so many numbers of proprioception, and these assets.
+    /// With this size of proprioception, and these assets.
     pub(crate) async fn start_with(proprioception: usize, assets: Vec<Asset>) -> Self {
         Self::guarded(proprioception, assets, Security::default(), ConnectionLimits::default()).await
     }
 
-    /// Behind these limits.
+    /// With these limits.
     pub(crate) async fn limited(limits: ConnectionLimits) -> Self {
         Self::guarded(8, Vec::new(), Security::default(), limits).await
     }
 
-    /// Behind certificates and tokens.
+    /// With certificates and tokens.
     pub(crate) async fn secured(security: Security) -> Self {
         Self::guarded(8, Vec::new(), security, ConnectionLimits::default()).await
     }
@@ -77,7 +77,7 @@ impl World {
         Self::of(experiment(), 8, Vec::new(), Security::default(), ConnectionLimits::default(), quarantine).await
     }
 
-    /// In lockstep, over so many environments.
+    /// In lockstep, with so many environments.
     pub(crate) async fn in_lockstep(environments: usize) -> Self {
         let mut experiment = experiment();
         experiment.unroll = Unroll { lockstep: true, ahead: 0, batch: environments, ..experiment.unroll };
@@ -140,12 +140,12 @@ impl World {
         Self { experiment, spec, batcher, publisher, service, address, shutdown: Some(shutdown), server }
     }
 
-    /// A connection, for clients of other services than the learner's own.
+    /// A connection, for clients of other services.
     pub(crate) async fn channel(&self) -> Channel {
         Channel::from_shared(self.address.clone()).unwrap().connect().await.unwrap()
     }
 
-    /// The answer to a stream of unrolls of these frames, whatever they hold.
+    /// Sends these frames as a stream of unrolls, and returns the answer.
     pub(crate) async fn send_frames(&self, frames: impl Stream<Item = Bytes> + Send + 'static) -> Response<Body> {
         let body = StreamBody::new(frames.map(|data| Ok::<_, Infallible>(Frame::data(data))));
         let request = Request::post(format!("{}/comic.v1.Learner/SendUnrolls", self.address))
@@ -163,7 +163,7 @@ impl World {
         LearnerClient::connect(self.address.clone()).await.unwrap()
     }
 
-    /// A client that shows what `access` holds, or why there is none.
+    /// A client with this access, or the error that prevents it.
     pub(crate) async fn client_with(&self, access: &Access) -> Result<Client> {
         let scheme = if access.ca.is_some() { "https://localhost" } else { "http://127.0.0.1" };
         let port = self.address.rsplit(':').next().unwrap();
@@ -189,7 +189,7 @@ impl World {
         self.service.probed().metrics_page()
     }
 
-    /// Gives the signal to end.
+    /// Gives the shutdown signal.
     pub(crate) fn begin_shutdown(&mut self) {
         let _ = self.shutdown.take().unwrap().send(());
     }
@@ -209,7 +209,7 @@ fn experiment() -> Experiment {
     experiment
 }
 
-/// What a new process asks for.
+/// The request of a new process.
 pub(crate) fn joining(incarnation: u64) -> JoinRequest {
     JoinRequest { incarnation, protocol: PROTOCOL_VERSION, ..JoinRequest::default() }
 }
@@ -222,7 +222,7 @@ pub(crate) struct Actor {
 }
 
 impl Actor {
-    /// An unroll that is as it should be.
+    /// A valid unroll.
     pub(crate) fn unroll(&self, sequence: u64) -> UnrollMessage {
         let header = UnrollHeader {
             actor: self.reply.actor,
@@ -245,7 +245,7 @@ impl Actor {
         UnrollMessage { header: Some(header), payload: unroll.into_bytes() }
     }
 
-    /// An unroll spoilt in one place of its header.
+    /// An unroll with a changed header.
     pub(crate) fn unroll_with(&self, sequence: u64, change: impl FnOnce(&mut UnrollHeader)) -> UnrollMessage {
         let mut unroll = self.unroll(sequence);
         change(unroll.header.as_mut().unwrap());
@@ -279,7 +279,7 @@ pub(crate) struct Unrolls {
 impl Unrolls {
     /// Sends an unroll and waits for its answer.
     pub(crate) async fn send(&mut self, unroll: UnrollMessage) -> Result<UnrollAck, Status> {
-        // The stream may have ended already: then the answer says why.
+        // The stream may have ended already; the answer then says why.
         let _ = self.sender.send(unroll).await;
         let answer = within(Duration::from_secs(10), self.acks.message()).await?;
         Ok(answer.expect("an acknowledgement"))
@@ -291,12 +291,12 @@ impl Unrolls {
     }
 }
 
-/// Fails the test, instead of hanging, when something takes so long.
+/// Fails the test when something takes longer than the limit.
 pub(crate) async fn within<T>(limit: Duration, future: impl Future<Output = T>) -> T {
     tokio::time::timeout(limit, future).await.expect("in time")
 }
 
-/// A payload that tells its version.
+/// A payload that depends on its version.
 pub(crate) fn parameters(version: u64, size: usize) -> Bytes {
     Bytes::from(vec![version as u8; size])
 }

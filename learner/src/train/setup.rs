@@ -1,0 +1,45 @@
+//! What training begins with, and how it ends.
+
+use std::path::PathBuf;
+
+use comic_experiment::{Experiment, TaskSpec};
+use comic_replay::Batcher;
+
+use crate::checkpoint::Snapshot;
+use crate::device::Backend;
+use crate::publish::Publisher;
+use crate::service::TrainerHandle;
+
+/// The parts of a trainer.
+#[derive(Debug)]
+pub struct Setup {
+    /// The resolved experiment.
+    pub experiment: Experiment,
+    /// The task's sizes and names.
+    pub spec: TaskSpec,
+    /// The action at which the policy's mean starts, `[A]`.
+    pub pose: Vec<f32>,
+    /// The device.
+    pub backend: Backend,
+    /// The run's directory.
+    pub run: PathBuf,
+    /// The learner epoch.
+    pub epoch: u64,
+    /// A checkpoint to resume from.
+    pub resume: Option<Snapshot>,
+    /// The source of batches.
+    pub batcher: Batcher,
+    /// Where parameters are published.
+    pub publisher: Publisher,
+    /// The service, which shows the newest metrics and collects evaluations.
+    pub service: TrainerHandle,
+}
+
+/// Why training ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ending {
+    /// The experiment's budget is used up.
+    Budget,
+    /// The batcher was closed, because the learner was asked to stop.
+    Stopped,
+}

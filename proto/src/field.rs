@@ -1,0 +1,195 @@
+//! The fields of an unroll and the sizes that determine their shapes.
+
+use std::fmt;
+
+use comic_experiment::{Experiment, TaskSpec};
+
+/// Bytes per element of all fields except the image, whose elements are single bytes.
+pub(crate) const ELEMENT: usize = 4;
+
+/// The sizes that determine the shape of an unroll.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct UnrollShape {
+    /// T, the number of transitions.
+    pub length: usize,
+    /// P, the size of proprioception.
+    pub proprioception: usize,
+    /// X, the size of the task observation.
+    pub task: usize,
+    /// A, the size of an action.
+    pub action: usize,
+    /// Z, the size of the latent.
+    pub latent: usize,
+    /// R, the number of reward terms.
+    pub reward_terms: usize,
+    /// I, the bytes of a camera image, a multiple of 4; 0 if the humanoid has no camera.
+    pub image: usize,
+    /// K, the number of components (Gaussians) of the behaviour policy's distribution.
+    pub components: usize,
+    /// S, the size of the policy's recurrent state; 0 if it is not recurrent.
+    pub state: usize,
+}
+
+impl UnrollShape {
+    /// The shape of the unrolls of this experiment and its task spec.
+    pub fn new(spec: &TaskSpec, experiment: &Experiment) -> Self {
+        Self {
+            length: experiment.unroll.length,
+            proprioception: spec.proprioception,
+            task: spec.task,
+            action: spec.action,
+            latent: experiment.network.latent.size,
+            reward_terms: spec.reward_terms.len(),
+            // The image has whole words, so every row is aligned.
+            image: spec.image.next_multiple_of(ELEMENT),
+            components: experiment.network.components(),
+            state: experiment.network.state_size(),
+        }
+    }
+
+    /// Number of elements per row of this field.
+    pub fn width(&self, field: Field) -> usize {
+        field.width(self)
+    }
+}
+
+/// One array of an unroll. The order of the variants is the order in the payload.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Field {
+    /// `[T+1, P]` f32: proprioception, in SI units.
+    Proprioception,
+    /// `[T+1, X]` f32: the task observation.
+    Task,
+    /// `[T, Z]` f32: z of the previous step; 0 at the first step of an episode.
+    PreviousLatent,
+    /// `[T, Z]` f32: the standard-normal noise of z.
+    LatentNoise,
+    /// `[T, A]` f32: the sampled action, not clipped.
+    Action,
+    /// `[T, K·A]` f32: mean of each component of the behaviour policy.
+    Mean,
+    /// `[T, K·A]` f32, positive: standard deviation of each component of the behaviour policy.
+    Std,
+    /// `[T, K]` f32: ln of the weights of the components, which add up to 1; empty for one component.
+    LogWeights,
+    /// `[T, R]` f32: one column per reward term.
+    Reward,
+    /// `[T]` f32 in [0, 1]: 0 if the step terminated the episode, else 1.
+    Discount,
+    /// `[T]` f32, 1 or 0: whether the row has a transition.
+    Valid,
+    /// `[T+1]` f32, 1 or 0: whether the row is the first observation of an episode.
+    First,
+    /// `[1, S]` f32: the recurrent state before the first observation.
+    State,
+    /// `[T+1]` u32: the index of the clip.
+    Clip,
+    /// `[T+1, I]` u8: the camera image, rows from the top, red, green, blue.
+    Image,
+}
+
+impl Field {
+    /// All fields in payload order.
+    pub const ALL: [Self; 15] = [
+        Self::Proprioception,
+        Self::Task,
+        Self::PreviousLatent,
+        Self::LatentNoise,
+        Self::Action,
+        Self::Mean,
+        Self::Std,
+        Self::LogWeights,
+        Self::Reward,
+        Self::Discount,
+        Self::Valid,
+        Self::First,
+        Self::State,
+        Self::Clip,
+        Self::Image,
+    ];
+
+    /// The name in descriptions of layouts and in messages.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Proprioception => "proprioception",
+            Self::Task => "task",
+            Self::PreviousLatent => "previous_latent",
+            Self::LatentNoise => "latent_noise",
+            Self::Action => "action",
+            Self::Mean => "mean",
+            Self::Std => "std",
+            Self::LogWeights => "log_weights",
+            Self::Reward => "reward",
+            Self::Discount => "discount",
+            Self::Valid => "valid",
+            Self::First => "first",
+            Self::State => "state",
+            Self::Clip => "clip",
+            Self::Image => "image",
+        }
+    }
+
+    /// Rows in an unroll of `length` transitions: T, T + 1 or 1.
+    pub fn rows(self, length: usize) -> usize {
+        match self {
+            Self::Proprioception | Self::Task | Self::First | Self::Clip | Self::Image => length.saturating_add(1),
+            Self::State => 1,
+            _ => length,
+        }
+    }
+
+    /// Number of elements per row.
+    pub fn width(self, shape: &UnrollShape) -> usize {
+        match self {
+            Self::Proprioception => shape.proprioception,
+            Self::Task => shape.task,
+            Self::PreviousLatent | Self::LatentNoise => shape.latent,
+            Self::Action => shape.action,
+            Self::Mean | Self::Std => shape.components.saturating_mul(shape.action),
+            Self::LogWeights if shape.components > 1 => shape.components,
+            Self::LogWeights => 0,
+            Self::State => shape.state,
+            Self::Reward => shape.reward_terms,
+            Self::Discount | Self::Valid | Self::First | Self::Clip => 1,
+            Self::Image => shape.image,
+        }
+    }
+
+    /// What stands in a row that holds no transition, where nothing was decided: numbers that no formula can fail on.
+    /// `None` where such a row has a meaning of its own, as its observation has.
+    pub fn blank(self, shape: &UnrollShape) -> Option<f64> {
+        match self {
+            Self::PreviousLatent | Self::LatentNoise | Self::Action | Self::Mean | Self::Reward => Some(0.0),
+            Self::Std => Some(1.0),
+            Self::LogWeights => Some(-(shape.components as f64).ln()),
+            Self::Proprioception
+            | Self::Task
+            | Self::Discount
+            | Self::Valid
+            | Self::First
+            | Self::State
+            | Self::Clip
+            | Self::Image => None,
+        }
+    }
+
+    /// Type of an element.
+    pub(crate) fn element(self) -> &'static str {
+        match self {
+            Self::Clip => "u32",
+            Self::Image => "u8",
+            _ => "f32",
+        }
+    }
+
+    /// Bytes per element.
+    pub(crate) fn element_bytes(self) -> usize {
+        if self == Self::Image { 1 } else { ELEMENT }
+    }
+}
+
+impl fmt::Display for Field {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(self.name())
+    }
+}
