@@ -1,4 +1,5 @@
-//! Lists `presets/*.toml`: a preset is one file in that folder, and nothing else names it.
+//! Collects `presets/*.toml`: a preset is one file in that folder, and no code names it. The output has the documents
+//! themselves and no path, so it is valid in a copy of the repository, too.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -12,8 +13,8 @@ fn main() -> io::Result<()> {
     files.sort();
     let mut entries = String::new();
     for file in &files {
-        let name = file.file_stem().unwrap_or_default();
-        writeln!(entries, "    ({name:?}, include_str!({file:?})),").map_err(io::Error::other)?;
+        let (name, document) = (file.file_stem().unwrap_or_default(), fs::read_to_string(file)?);
+        writeln!(entries, "    ({name:?}, {document:?}),").map_err(io::Error::other)?;
     }
     let list = format!("[(&str, &str); {}] = [\n{entries}]", files.len());
     let code = format!("/// Name and document of every preset, by name.\npub const ALL: {list};\n");

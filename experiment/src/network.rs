@@ -8,7 +8,8 @@ use serde::{Deserialize, Serialize};
 pub struct Network {
     /// Hidden sizes of the reference encoder (S: 2×1024).
     pub encoder: Vec<usize>,
-    /// Adds a linear path from the encoder's input to its output (S: with the MLP low level). Not used without a bottleneck.
+    /// Adds a linear path from the encoder's input to its output (S: with the MLP low level). Not used without a
+    /// bottleneck.
     pub encoder_linear_path: bool,
     /// The low level, which turns latent and proprioception into an action. The section of the same name holds its sizes.
     pub low_level: LowLevelName,

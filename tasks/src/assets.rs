@@ -6,8 +6,8 @@ use crate::error::Error;
 
 const VARIABLE: &str = "COMIC_DM_CONTROL_DIR";
 
-/// The directory of dm_control's XML files. It is the value of the environment variable `COMIC_DM_CONTROL_DIR` now, else its
-/// value when the program was built, else `.deps/dm_control`.
+/// The directory of dm_control's XML files. It is the value of the environment variable `COMIC_DM_CONTROL_DIR` now, else
+/// its value when the program was built, else `.deps/dm_control`.
 pub(crate) fn directory() -> Result<PathBuf, Error> {
     let candidates = [
         std::env::var_os(VARIABLE).map(PathBuf::from),

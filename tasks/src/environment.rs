@@ -47,8 +47,8 @@ pub trait Environment: Debug + Send {
     /// Draws a start and begins an episode there. The first observation is then ready.
     fn reset(&mut self);
 
-    /// Begins an episode at one of the task's [starts](Task::starts). In tracking `start` is a frame, counted from the clip's
-    /// first frame. In other tasks it is the seed of the episode.
+    /// Begins an episode at one of the task's [starts](Task::starts). In tracking `start` is a frame, counted from the
+    /// clip's first frame. In other tasks it is the seed of the episode.
     ///
     /// # Errors
     /// [`Error::Start`]: the task does not have this start.

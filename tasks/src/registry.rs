@@ -1,5 +1,5 @@
-//! From an experiment to its task. [`comic_experiment::for_each_task`] lists the tasks; each implements [`BuildTask`] for its
-//! parameters, in its own file.
+//! From an experiment to its task. [`comic_experiment::for_each_task`] lists the tasks; each implements [`BuildTask`]
+//! for its parameters, in its own file.
 
 use std::sync::Arc;
 
@@ -28,7 +28,7 @@ impl Context<'_> {
     /// The task's sizes and names.
     ///
     /// # Errors
-    /// [`Error::Observation`]
+    /// [`Error::Observation`]: the tracking task does not have an observation that the experiment names.
     pub(crate) fn spec(&self) -> Result<TaskSpec, Error> {
         TaskSpec::of_task(self.experiment, self.task, clip_names(self.catalogue)).map_err(unknown_observation)
     }

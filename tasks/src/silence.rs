@@ -10,8 +10,8 @@ static INSTALLED: Once = Once::new();
 /// Drops MuJoCo's warnings and prints its errors. Only the first call in a process has an effect.
 #[allow(unsafe_code)]
 pub(crate) fn install() {
-    // SAFETY: the handler must not change while another thread runs MuJoCo. Every use of MuJoCo in this crate needs a model,
-    // and every model is built after this call has returned.
+    // SAFETY: the handler must not change while another thread runs MuJoCo. Every use of MuJoCo in this crate needs a
+    // model, and every model is built after this call has returned.
     INSTALLED.call_once(|| unsafe { set_log_handler(handle) });
 }
 

@@ -68,7 +68,8 @@ fn add_face(spec: &mut MjSpec) -> Result<(), Error> {
     Ok(())
 }
 
-/// `rescale_subtree`: scales every position, and every size that the element itself gives. Sizes from a class do not change.
+/// `rescale_subtree`: scales every position, and every size that the element itself gives. Sizes from a class do not
+/// change.
 fn rescale(body: &mut MjsBody) {
     for joint in body.joint_iter_mut(false) {
         scale(joint.pos_mut());
@@ -103,8 +104,8 @@ fn scale(vector: &mut [f64; 3]) {
     }
 }
 
-/// Scales a size unless it is equal to the class's size. It scales as many numbers as the type has: MuJoCo fills the rest of
-/// the vector, and dm_control does not know the rest.
+/// Scales a size unless it is equal to the class's size. It scales as many numbers as the type has: MuJoCo fills the
+/// rest of the vector, and dm_control does not know the rest.
 fn scale_own(size: &mut [f64; 3], kind: MjtGeomBase, inherited: Option<[f64; 3]>) {
     if inherited == Some(*size) {
         return;
@@ -168,7 +169,8 @@ fn replace_motors(spec: &mut MjSpec, servos: &[Servo], filtered: bool) -> Result
 #[allow(unsafe_code)]
 fn delete_actuators(spec: &mut MjSpec) -> Result<(), Error> {
     while let Some(motor) = spec.actuator_iter_mut().next() {
-        // SAFETY: this is the first actuator that still exists. It is deleted once, and its handle ends with this statement.
+        // SAFETY: this is the first actuator that still exists. It is deleted once, and its handle ends with this
+        // statement.
         unsafe { motor.delete() }.map_err(refused("removing the motors"))?;
     }
     Ok(())

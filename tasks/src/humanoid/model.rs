@@ -71,8 +71,8 @@ fn attach(arena: &mut MjSpec, walker: &MjSpec) -> Result<(), Error> {
     // MuJoCo adds a frame around an attached specification and around its original, too. A copy protects the kept
     // humanoid, which is attached thousands of times.
     let mut walker = walker.try_clone().map_err(refused("copying the humanoid"))?;
-    // In dm_control the compiler settings of the arena (`composer/arena.xml`) hold for all elements. In MuJoCo elements keep
-    // their own settings, so the humanoid gets the arena's.
+    // In dm_control the compiler settings of the arena (`composer/arena.xml`) hold for all elements. In MuJoCo elements
+    // keep their own settings, so the humanoid gets the arena's.
     let settings = arena.compiler();
     let (degree, mass, inertia) = (settings.degree(), settings.boundmass(), settings.boundinertia());
     walker.compiler_mut().set_degree(degree);

@@ -17,8 +17,8 @@ use crate::error::{Error, missing};
 use crate::humanoid::PREFIX;
 use crate::physics::Simulation;
 
-/// Width of the shadow map in pixels, and samples per pixel. The shadow map has half the width of dm_control's, which takes a
-/// quarter of the time in software.
+/// Width of the shadow map in pixels, and samples per pixel. The shadow map has half the width of dm_control's, which
+/// takes a quarter of the time in software.
 const SHADOW_SIZE: i32 = 2048;
 const SAMPLES: i32 = 4;
 /// Distance of the outside cameras from the humanoid's centre of mass (m), and their angle to the horizontal (degrees).

@@ -16,8 +16,8 @@ use crate::error::Error;
 use crate::humanoid::PREFIX;
 use crate::physics::Simulation;
 
-/// The first view: its extent (m), and the camera's angle to the horizontal (degrees). MuJoCo places the camera at one and a
-/// half times the extent.
+/// The first view: its extent (m), and the camera's angle to the horizontal (degrees). MuJoCo places the camera at one
+/// and a half times the extent.
 const EXTENT: f64 = 2.5;
 const ELEVATION: f32 = -14.0;
 /// The camera's first direction (rad, from +x): MuJoCo's default.
@@ -93,8 +93,8 @@ impl Screen {
     }
 }
 
-/// The model with settings for the window's first view: near the humanoid, from the side. The model's own settings would show
-/// a whole corridor of 100 m.
+/// The model with settings for the window's first view: near the humanoid, from the side. The model's own settings would
+/// show a whole corridor of 100 m.
 fn near_the_humanoid(model: &MjModel, simulation: &Simulation) -> MjModel {
     let mut settings = model.clone();
     let root = model.name_to_id(MjtObjBase::mjOBJ_BODY, &format!("{PREFIX}root"));

@@ -1,5 +1,5 @@
-//! Replays recorded episodes of dm_control's go-to-target and corridors. Rules and physics are those of training. Targets and
-//! obstacles come from the recording instead of a random number generator.
+//! Replays recorded episodes of dm_control's go-to-target and corridors. Rules and physics are those of training.
+//! Targets and obstacles come from the recording instead of a random number generator.
 
 use comic_experiment::{Corridor, GoToTarget, StartPose, Vision};
 use mujoco_rs::prelude::*;

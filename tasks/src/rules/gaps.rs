@@ -33,8 +33,8 @@ impl Obstacles for Gaps {
     }
 }
 
-/// `GapsCorridor.regenerate`: platforms and gaps to the corridor's end. There is no gap between the first platform, where the
-/// humanoid starts, and the second.
+/// `GapsCorridor.regenerate`: platforms and gaps to the corridor's end. There is no gap between the first platform,
+/// where the humanoid starts, and the second.
 fn platforms(config: &Gaps, extent: Extent, random: &mut Pcg64) -> Vec<Block> {
     let mut draw = |[low, high]: [f64; 2]| random.random_range(low..=high);
     let mut platforms = vec![corridor::first_platform(extent)];

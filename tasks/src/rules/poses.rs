@@ -45,8 +45,8 @@ impl Pose {
         self
     }
 
-    /// The pose and its linear velocity, turned about the world's axis `axis` by `angle` (rad). The angular velocity does not
-    /// change: it is in the root's own frame (`Entity.shift_pose` with `rotate_velocity`).
+    /// The pose and its linear velocity, turned about the world's axis `axis` by `angle` (rad). The angular velocity
+    /// does not change: it is in the root's own frame (`Entity.shift_pose` with `rotate_velocity`).
     pub(crate) fn turned(mut self, axis: [f64; 3], angle: f64) -> Self {
         let by = about_vector(axis, angle);
         let turned = normalize(multiply(by, self.quaternion()));

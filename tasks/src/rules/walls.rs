@@ -30,8 +30,8 @@ impl Obstacles for Walls {
     }
 }
 
-/// `WallsCorridor.regenerate`: a wall every `spacing` metres. The first one is `spacing` after the corridor's start, which is
-/// 2 m before the origin.
+/// `WallsCorridor.regenerate`: a wall every `spacing` metres. The first one is `spacing` after the corridor's start,
+/// which is 2 m before the origin.
 fn walls(config: &Walls, extent: Extent, random: &mut Pcg64) -> Vec<Block> {
     let mut x = config.spacing - X_PADDING;
     if config.initial_padding {

@@ -11,8 +11,8 @@ use crate::physics::Data;
 /// `initialize_episode`).
 const MISMATCH: f64 = 1e-2;
 
-/// The frames of a clip that the task uses, counted from the sub-range's first frame. Reading after the last frame gives the
-/// last frame. No episode reads there; the rule only prevents a panic.
+/// The frames of a clip that the task uses, counted from the sub-range's first frame. Reading after the last frame gives
+/// the last frame. No episode reads there; the rule only prevents a panic.
 #[derive(Debug)]
 pub(crate) struct Reference {
     /// Seconds between frames.
