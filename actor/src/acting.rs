@@ -22,7 +22,7 @@ const FIELDS: [Field; 8] = [
 
 /// The observations of E environments and the action distributions of the behaviour policy. Arrays are row-major.
 ///
-/// Indexed by a [`Field`] it gives `[E, width]` f32; fields that acting has no part in are empty. Actors read and write:
+/// Indexed by a [`Field`] it gives `[E, width]` f32. Fields that acting does not use are empty. The others are:
 ///
 /// - `Proprioception` and `Task`: the observation;
 /// - `PreviousLatent`: z_{t−1}, zero at an episode's first step;

@@ -1,6 +1,6 @@
 //! The loop in which environments act: observe → forward pass → action → step → record.
 //!
-//! The [worker](crate::worker) and the [evaluation](crate::evaluate) share it. They differ in the [`Recorder`]: the worker's
+//! The [worker](crate::worker) and the [evaluation](crate::evaluate) share it. They differ in the `Recorder`: the worker's
 //! writes unrolls, the evaluation's collects episodes.
 
 use std::ops::ControlFlow;

@@ -1,8 +1,7 @@
 //! `comic-actor clips`: lists, checks, imports, merges and fetches motion capture.
 //!
 //! # Layout
-//! A file per sub-command, which parses, prints and hands the work to `comic-clips`; only the network, `download`, is
-//! done here.
+//! One file for each sub-command. It parses and prints; `comic-clips` does the work. Only `download` uses the network.
 
 mod check;
 mod download;
@@ -37,9 +36,9 @@ enum Command {
     List(list::List),
     /// Finds every defect of a file's clips: penetration, floating, joint limits, jumps, NaN.
     Check(check::Check),
-    /// Makes clips of the CMU database's own ASF and AMC files.
+    /// Makes clips from the CMU database's ASF and AMC files.
     Import(import::Import),
-    /// Makes one file of the clips of several.
+    /// Merges the clips of several files into one.
     Merge(merge::Merge),
     /// Fetches DeepMind's clips of 2020, 455 MiB.
     Fetch(fetch::Fetch),
@@ -49,7 +48,7 @@ impl Clips {
     /// Runs the sub-command.
     ///
     /// # Errors
-    /// Whatever keeps it from its work; [`Error::Defects`] when `check` finds some.
+    /// The sub-command's errors; [`Error::Defects`] when `check` finds defects.
     pub fn run(&self) -> Result<(), Error> {
         match &self.command {
             Command::List(list) => list.run(),

@@ -1,4 +1,4 @@
-//! Episodes whose simulation diverged, on disk: what is needed to look at them, and to play them again.
+//! Writes episodes whose simulation diverged to disk, and replays them.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -16,12 +16,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::Error;
 
-/// Dumps a process writes at most: one cause makes many alike.
+/// Most dumps of a process: one cause makes many similar ones.
 const MOST: usize = 16;
-/// Moments before the end that a dump holds.
+/// States before the end that a dump holds.
 const LAST: usize = 8;
 
-/// Numbers as text that brings every bit of them back, infinities and NaN too, which JSON's own numbers would not.
+/// Numbers as text, so that every bit can be restored. JSON's own numbers cannot hold infinities and NaN.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(try_from = "Vec<String>", into = "Vec<String>")]
 pub struct Numbers(pub Vec<f64>);
@@ -40,7 +40,7 @@ impl TryFrom<Vec<String>> for Numbers {
     }
 }
 
-/// Bit for bit, except that one NaN is as good as another.
+/// Compares bit for bit, but all NaN are equal.
 impl PartialEq for Numbers {
     fn eq(&self, other: &Self) -> bool {
         let same = |(one, other): (&f64, &f64)| one.to_bits() == other.to_bits() || (one.is_nan() && other.is_nan());
@@ -81,26 +81,26 @@ pub struct Dump {
     pub clip_name: String,
     /// Where the episode began; see [`Episode::start`].
     pub start: usize,
-    /// Decided the environment's draws.
+    /// Seed of the environment.
     pub seed: u64,
-    /// Where the simulation was when it began.
+    /// The simulation's state at its begin.
     pub first: Moment,
-    /// What every step was given, `[steps][56]`; the last one diverged.
+    /// The action of every step, `[steps][56]`; the last step diverged.
     pub actions: Vec<Numbers>,
-    /// Where the simulation was before each of the last steps.
+    /// The simulation's state before each of the last steps.
     pub last: Vec<Moment>,
-    /// Where it was after the last one.
+    /// The state after the last step.
     pub end: Moment,
 }
 
-/// What playing a dump again gave.
+/// The result of replaying a dump.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Replay {
     /// Steps of the dump.
     pub steps: usize,
     /// The step that diverged, counted from 1.
     pub diverged: Option<usize>,
-    /// Every moment that the dump holds came again, bit for bit.
+    /// Every state in the dump was reached again, bit for bit.
     pub exact: bool,
 }
 
@@ -111,28 +111,28 @@ impl fmt::Display for Replay {
             None => write!(f, "did not diverge in {} steps", self.steps)?,
         }
         f.write_str(if self.exact {
-            ", in the dump's own states bit for bit"
+            ", through the dump's states bit for bit"
         } else {
-            ", in other states than the dump's"
+            ", through other states than the dump's"
         })
     }
 }
 
 impl Dump {
-    /// Reads one.
+    /// Reads a dump.
     ///
     /// # Errors
-    /// [`Error::File`], and [`Error::Usage`] for what is no dump.
+    /// [`Error::File`], and [`Error::Usage`] when the file is no dump.
     pub fn read(path: &Path) -> Result<Self, Error> {
         let text = std::fs::read(path).map_err(Error::file(path))?;
         serde_json::from_slice(&text)
             .map_err(|error| Error::Usage(format!("{} is no dump of a diverged episode: {error}", path.display())))
     }
 
-    /// Plays it again, on these clips if the experiment's own are not here.
+    /// Replays it, with these clips if the experiment's own are not available.
     ///
-    /// Tracking begins where its clip does, so the states come again bit for bit. Another task's draws are not known:
-    /// its episode is put into the dump's first state, in an arena of its own.
+    /// A tracking episode begins at its clip's start, so the states are the same bit for bit. The random draws of other
+    /// tasks are not known: their episodes begin in the dump's first state, in a newly drawn arena.
     ///
     /// # Errors
     /// An experiment, clip or state that this release does not have.
@@ -176,7 +176,7 @@ impl Dump {
 /// `comic-actor replay`.
 #[derive(clap::Args, Clone, Debug)]
 pub struct Command {
-    /// What `--dump-diverged` wrote.
+    /// A file that `--dump-diverged` wrote.
     #[arg(value_name = "FILE")]
     dump: PathBuf,
     /// Clips in place of the experiment's own: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP.
@@ -185,7 +185,7 @@ pub struct Command {
 }
 
 impl Command {
-    /// Plays the dump and prints what came of it.
+    /// Replays the dump and prints the result.
     ///
     /// # Errors
     /// As [`Dump::read`] and [`Dump::replay`].
@@ -196,7 +196,7 @@ impl Command {
     }
 }
 
-/// Where a process's dumps go.
+/// Writes the dumps of a process.
 #[derive(Debug)]
 pub struct Dumps {
     directory: PathBuf,
@@ -207,10 +207,10 @@ pub struct Dumps {
 }
 
 impl Dumps {
-    /// Makes the directory.
+    /// Creates the directory.
     ///
     /// # Errors
-    /// [`Error::File`] when it cannot be made.
+    /// [`Error::File`] when it cannot be created.
     pub fn new(
         directory: &Path,
         experiment: &Experiment,
@@ -226,7 +226,7 @@ impl Dumps {
         }))
     }
 
-    /// Writes one if there were not too many; a disk that refuses costs the dump and no more.
+    /// Writes a dump if there are not too many yet. A disk error loses the dump only.
     fn write(&self, dump: &Dump) {
         let number = self.written.fetch_add(1, Ordering::Relaxed);
         if number >= MOST {
@@ -241,7 +241,7 @@ impl Dumps {
         let (clip, start, steps) = (&dump.clip_name, dump.start, dump.actions.len());
         match written {
             Ok(()) => tracing::warn!(dump = %path.display(), clip, start, steps, "a simulation diverged"),
-            Err(error) => tracing::error!(dump = %path.display(), "a diverged episode is not dumped: {error}"),
+            Err(error) => tracing::error!(dump = %path.display(), "a diverged episode could not be dumped: {error}"),
         }
     }
 
@@ -250,7 +250,7 @@ impl Dumps {
     }
 }
 
-/// An environment that writes down its episode, if anybody wants to know how one diverged.
+/// An environment that records its episode, if diverged episodes are dumped.
 #[derive(Debug)]
 pub struct Watched {
     environment: Box<dyn Simulated>,
@@ -268,7 +268,7 @@ struct Tape {
 }
 
 impl Watched {
-    /// Watches an environment that was made of `seed`; only passes everything on without `dumps`.
+    /// Records an environment that was made with `seed`; records nothing without `dumps`.
     pub fn new(environment: Box<dyn Simulated>, dumps: Option<Arc<Dumps>>, seed: u64) -> Self {
         let first = Moment::of(environment.simulation());
         let tape = |dumps| Tape { dumps, seed, first, actions: Vec::new(), last: VecDeque::new() };
@@ -326,7 +326,7 @@ impl Environment for Watched {
 
     fn step(&mut self, action: &[f32]) -> Step {
         let Self { environment, tape } = self;
-        // A diverged episode is dumped once, and none when there are enough.
+        // Nothing is recorded when there are enough dumps.
         let mut tape = tape.as_mut().filter(|tape| tape.dumps.has_room());
         if let Some(tape) = &mut tape {
             tape.note(environment.simulation(), action);
@@ -372,13 +372,13 @@ mod tests {
         std::fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path()).collect()
     }
 
-    /// A wild action, the same for the same step.
+    /// An extreme action that depends on the step only.
     fn wild(step: usize) -> [f32; 56] {
         std::array::from_fn(|joint| ((step * 56 + joint) as f32).sin())
     }
 
     #[test]
-    fn a_dump_of_tracking_is_played_again_bit_for_bit() {
+    fn a_dump_of_tracking_is_replayed_bit_for_bit() {
         let directory = tempfile::tempdir().unwrap();
         let mut environment = watched(directory.path(), "quickstart");
         environment.reset();
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn states_that_are_no_numbers_come_back_from_the_disk() {
+    fn states_of_a_diverged_episode_are_restored_from_disk() {
         let directory = tempfile::tempdir().unwrap();
         let mut environment = watched(directory.path(), "quickstart");
         environment.reset();
@@ -421,11 +421,11 @@ mod tests {
         let dump = Dump::read(&path).unwrap();
         assert!(dump.last[0].qvel.0.iter().all(|value| *value == 1e11));
         assert_eq!(dump.end, Moment::of(environment.environment.simulation()));
-        assert!(!dump.replay(&[]).unwrap().exact, "the velocity came from nowhere");
+        assert!(!dump.replay(&[]).unwrap().exact, "no action explains the velocity");
     }
 
     #[test]
-    fn one_process_writes_no_more_than_a_few() {
+    fn the_number_of_dumps_is_limited() {
         let directory = tempfile::tempdir().unwrap();
         let mut environment = watched(directory.path(), "quickstart");
         for _ in 0..MOST + 3 {
@@ -436,7 +436,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_dump_is_refused_by_name() {
+    fn a_file_that_is_no_dump_is_refused_with_its_name() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("notes.json");
         for text in ["", "{}", "[1, 2]", r#"{"experiment": 3}"#] {

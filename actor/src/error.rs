@@ -1,17 +1,17 @@
-//! What can go wrong in an actor.
+//! The errors of an actor.
 
 use std::path::PathBuf;
 
-/// An actor's errors; what a variant holds as its source is not repeated in its message. [`Error::is_configuration`]
-/// tells those that no restart can mend.
+/// An actor's errors. A variant's message does not repeat its source. [`Error::is_configuration`] says whether a restart
+/// cannot help.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// The learner's address, certificates or token cannot be used.
     #[error(transparent)]
     Access(#[from] comic_proto::AccessError),
-    /// Token or certificate are not accepted, by one side or the other.
-    #[error("the learner at {url} does not let this actor in: {message}")]
+    /// One side does not accept the other's token or certificate.
+    #[error("the learner at {url} does not accept this actor: {message}")]
     Unwelcome {
         /// The learner's address.
         url: String,
@@ -26,7 +26,7 @@ pub enum Error {
         /// Why not.
         message: String,
     },
-    /// The learner answers, and will not have this actor.
+    /// The learner answers and refuses this actor.
     #[error("the learner at {url} refused this actor: {message} (do both programs come from the same release?)")]
     Refused {
         /// The learner's address.
@@ -34,21 +34,21 @@ pub enum Error {
         /// Its reason.
         message: String,
     },
-    /// The learner has worked with this process and will not do so any longer.
-    #[error("the learner does not take actor {actor} back: {message}")]
+    /// The learner had accepted this process and now refuses it.
+    #[error("the learner does not accept actor {actor} again: {message}")]
     Dismissed {
-        /// The index it had.
+        /// The index that the actor had.
         actor: u64,
         /// The learner's reason.
         message: String,
     },
-    /// A newer process of this one's name works in its place.
-    #[error("the learner does without this actor: {message}")]
+    /// A newer process of the same name has replaced this one.
+    #[error("another process has replaced this actor: {message}")]
     Superseded {
         /// The learner's reason.
         message: String,
     },
-    /// The learner's experiment document is not one that this actor understands.
+    /// This actor does not understand the learner's experiment document.
     #[error("the learner's experiment cannot be used")]
     Experiment(#[from] comic_experiment::Error),
     /// The task's specification does not parse.
@@ -74,8 +74,8 @@ pub enum Error {
         /// What was wrong.
         reason: String,
     },
-    /// Parameters off the wire that break the protocol.
-    #[error("malformed parameters off the wire: {reason}")]
+    /// Parameters from the learner that break the protocol.
+    #[error("malformed parameters from the learner: {reason}")]
     Parameters {
         /// What was wrong.
         reason: String,
@@ -105,7 +105,7 @@ pub enum Error {
         /// Why not.
         reason: String,
     },
-    /// The command line asks for what makes no sense.
+    /// The command line is wrong.
     #[error("{0}")]
     Usage(String),
     /// A download.
@@ -116,12 +116,12 @@ pub enum Error {
         /// Why not, and what can be done.
         reason: String,
     },
-    /// `clips check` found what it looks for.
+    /// `clips check` found defects.
     #[error("{clips} of {of} clips have defects")]
     Defects {
-        /// With defects.
+        /// Clips with defects.
         clips: usize,
-        /// All that were checked.
+        /// Clips that were checked.
         of: usize,
     },
     /// Reference clips.
@@ -142,7 +142,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// Whether the configuration is wrong, so that starting again cannot help (exit code 2 instead of 1).
+    /// Whether the configuration is wrong, so that a restart cannot help (exit code 2 instead of 1).
     pub fn is_configuration(&self) -> bool {
         matches!(
             self,

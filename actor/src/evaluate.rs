@@ -1,8 +1,8 @@
-//! How well a policy tracks, per clip and reward term.
+//! Evaluates a policy, per clip and reward term.
 //!
-//! An episode's normalised reward is its return / (the most a step can pay × the steps that were left at its start), so
-//! that falling early counts; for tracking that is 1.45 × the steps left in the clip. Beside it stand the reward per
-//! survived step / the most, which forgives a fall, and the fraction survived, which sees nothing else.
+//! An episode's normalised reward is its return / (largest reward of a step × steps left at its start), so an early fall
+//! lowers it; for tracking the divisor is 1.45 × the steps left in the clip. Two more figures separate its parts: the
+//! reward per survived step / the largest reward, and the fraction of steps survived.
 
 pub mod command;
 mod delivery;
@@ -44,7 +44,7 @@ pub fn evaluate<F: ForwardPass>(
     roll_out(controller, task, shape, &starts, options, audience)
 }
 
-/// Rolls out these starts, or as many as the audience wants to see.
+/// Rolls out these starts until all are done or the audience breaks.
 ///
 /// # Errors
 /// As for [`evaluate`].
@@ -62,7 +62,7 @@ pub fn roll_out<F: ForwardPass>(
     rollout::run(controller, environments, shape, starts, options, audience)
 }
 
-/// What is to be rolled out: all starts, or random ones.
+/// The starts to roll out: all of them, or random ones.
 fn chosen(clips: &[ClipStarts], options: &Options) -> Vec<Start> {
     let mut rng = Pcg64::seed_from_u64(derive(options.seed, u64::MAX));
     let mut chosen = Vec::new();
@@ -81,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_start_once_or_so_many_random_ones_that_a_seed_repeats() {
+    fn every_start_is_chosen_once_or_random_ones_by_the_seed() {
         let clips = [0..3, 0..0, 5..6].into_iter().enumerate();
         let clips: Vec<_> = clips.map(|(clip, frames)| ClipStarts { clip, frames, probability: 0.0 }).collect();
         let all = chosen(&clips, &Options::default());

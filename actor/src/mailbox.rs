@@ -1,4 +1,4 @@
-//! The newest directive of the learner, kept for the workers.
+//! Holds the learner's newest directive for the workers.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -7,20 +7,20 @@ use bytes::Bytes;
 use comic_proto::v1::Behaviour;
 use parking_lot::{Condvar, Mutex, MutexGuard};
 
-/// One version of how to act; a version means nothing without its learner epoch.
+/// How to act, in one version. Versions of different learner epochs cannot be compared.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Directive {
-    /// Which life of the learner published it.
+    /// The learner epoch that published it.
     pub learner_epoch: u64,
-    /// Its version within that life.
+    /// Its version within that epoch.
     pub version: u64,
-    /// How to act with it.
+    /// What chooses the actions.
     pub behaviour: Behaviour,
-    /// The acting parameters (safetensors); may be empty for a demonstration.
+    /// The parameters of the policy (safetensors); may be empty for a demonstration.
     pub parameters: Bytes,
 }
 
-/// Holds one directive, always the newest: a slow worker skips the ones in between. Closing it stops the workers.
+/// Holds only the newest directive: a slow worker skips the ones in between. Closing it stops the workers.
 #[derive(Debug, Default)]
 pub struct Mailbox {
     state: Mutex<State>,
@@ -31,7 +31,7 @@ pub struct Mailbox {
 #[derive(Debug, Default)]
 struct State {
     newest: Option<Arc<Directive>>,
-    /// Learner epoch and version that are known to be out, though they may still be on their way.
+    /// Newest learner epoch and version that the learner has announced; the parameters may still be on their way.
     announced: (u64, u64),
 }
 
@@ -42,24 +42,24 @@ impl Mailbox {
         self.changed.notify_all();
     }
 
-    /// A new connection: what was announced on the last one may never come.
+    /// Forgets announcements at a new connection: parameters announced on the last one may never arrive.
     pub fn reconnected(&self) {
         self.lock().announced = (0, 0);
         self.changed.notify_all();
     }
 
-    /// Says that this version is out: nobody gets an older directive from now on.
+    /// Notes that the learner has published this version. From now on no older directive is returned.
     pub fn announce(&self, learner_epoch: u64, version: u64) {
         let mut state = self.lock();
         state.announced = state.announced.max((learner_epoch, version));
     }
 
-    /// The newest directive, waiting for the one that was announced; `None` once the mailbox is closed.
+    /// Returns the newest directive, after waiting for the announced one; `None` once the mailbox is closed.
     pub fn wait(&self) -> Option<Arc<Directive>> {
         self.wait_from((0, 0))
     }
 
-    /// The same, waiting for one that is at least of this learner epoch and version too.
+    /// As [`wait`](Self::wait), but waits for at least this learner epoch and version.
     pub fn wait_from(&self, oldest: (u64, u64)) -> Option<Arc<Directive>> {
         let mut state = self.lock();
         loop {
@@ -81,7 +81,7 @@ impl Mailbox {
 
     /// Tells the workers to stop after the step they are in.
     pub fn close(&self) {
-        // Under the lock, or a waiter between its check and its wait would sleep for ever.
+        // The lock is needed: a waiter between its check and its wait would sleep for ever.
         let _state = self.lock();
         self.closed.store(true, Ordering::Release);
         self.changed.notify_all();
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_gets_an_older_directive_than_was_announced() {
+    fn no_directive_older_than_the_announced_one_is_returned() {
         let mailbox = Arc::new(Mailbox::default());
         mailbox.publish(directive(1));
         mailbox.announce(1, 2);
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn who_wants_a_newer_directive_waits_for_it() {
+    fn a_worker_can_wait_for_a_newer_directive() {
         let mailbox = Arc::new(Mailbox::default());
         mailbox.publish(directive(1));
         let waiter = std::thread::spawn({

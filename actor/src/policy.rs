@@ -18,7 +18,8 @@ pub struct TorchPolicy {
     tasks: usize,
 }
 
-/// One thread a forward pass: environments are spread over threads already. Call it once, before any other libtorch.
+/// Makes libtorch use one thread for a forward pass, since environments are spread over threads already. Call it once,
+/// before any other use of libtorch.
 pub fn use_one_torch_thread() {
     tch::set_num_interop_threads(1);
     tch::set_num_threads(1);
@@ -27,7 +28,7 @@ pub fn use_one_torch_thread() {
 impl TorchPolicy {
     /// Freshly initialised networks of the experiment, drawn from `seed`.
     ///
-    /// `mean_action` (`[A]`, control order) is the clips' mean pose as an action, asked for only if the experiment
+    /// `mean_action` (`[A]`, control order) is the clips' mean pose as an action. It is called only if the experiment
     /// starts there.
     ///
     /// # Errors
@@ -42,7 +43,7 @@ impl TorchPolicy {
             InitialPose::MidRange => vec![0.0; spec.action],
             InitialPose::ReferenceMean => mean_action()?.iter().map(|value| *value as f32).collect(),
         };
-        // Two's complement, so every seed is one of libtorch's.
+        // libtorch takes signed seeds; two's complement maps every seed to one.
         tch::manual_seed(seed.cast_signed());
         let store = VarStore::new(Device::Cpu);
         let policy = Policy::new(&store.root(), spec, &experiment.network, &pose).map_err(misfit)?;

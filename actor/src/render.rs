@@ -1,10 +1,9 @@
-//! Looking: films of a policy at work, and a window on it.
+//! Films a policy, or shows it in a window.
 //!
 //! # Layout
-//! - [`scene`] is who acts in which task; a film and a window share it, and the acting itself is
-//!   [`evaluate`](crate::evaluate)'s.
-//! - [`recorder`] draws an environment step by step into a film, of an evaluation too.
-//! - [`encode`] writes pictures as GIF, WebP, MP4 or a contact sheet, one after the other: no film is held in memory.
+//! - [`scene`] is the task and the policy of a film or a window; [`evaluate`](crate::evaluate) rolls it out.
+//! - [`recorder`] draws an environment's steps into a film, also during an evaluation.
+//! - [`encode`] writes pictures one by one as GIF, WebP, MP4 or a contact sheet; no film is held in memory.
 //! - [`command`] is `comic-actor render`, [`view`] is `comic-actor view`.
 
 pub mod command;

@@ -1,13 +1,13 @@
-//! A worker's last unrolls, until the learner has answered for each of them.
+//! Waits until the learner has answered for each of a worker's last unrolls.
 //!
-//! A worker begins new unrolls only then. That is the back-pressure of the whole system: what waits at an actor is one
-//! round of unrolls a thread, and experience is no older than it has to be.
+//! A worker begins new unrolls only after that. This is the back-pressure of the whole system: at most one round of unrolls
+//! a thread waits at an actor, and unrolls stay as fresh as possible.
 
 use std::sync::Arc;
 
 use parking_lot::{Condvar, Mutex};
 
-/// Counts the tickets that are out.
+/// Counts the tickets that are not returned yet.
 #[derive(Debug, Default)]
 pub struct Round {
     shared: Arc<Shared>,
@@ -19,20 +19,20 @@ struct Shared {
     returned: Condvar,
 }
 
-/// Goes with an unroll and comes back when it is dropped: acknowledged, or given up with the connection.
+/// Belongs to an unroll. Dropping it returns it: the unroll is acknowledged, or the session has ended.
 #[derive(Debug)]
 pub struct Ticket {
     shared: Arc<Shared>,
 }
 
 impl Round {
-    /// A ticket of this round.
+    /// A new ticket of this round.
     pub fn ticket(&self) -> Arc<Ticket> {
         *self.shared.out.lock() += 1;
         Arc::new(Ticket { shared: Arc::clone(&self.shared) })
     }
 
-    /// Waits until every ticket is back.
+    /// Waits until every ticket is returned.
     pub fn wait(&self) {
         let mut out = self.shared.out.lock();
         while *out > 0 {
@@ -53,7 +53,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_round_is_over_when_every_ticket_is_back() {
+    fn a_round_is_over_when_every_ticket_is_returned() {
         let round = Round::default();
         let tickets = [round.ticket(), round.ticket()];
         let dropper = std::thread::spawn(move || drop(tickets));

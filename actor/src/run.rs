@@ -25,8 +25,8 @@ use crate::worker::{FinishedUnroll, Pace, Progress, Worker};
 
 /// How long a stopped actor sends finished unrolls. It promises to exit within five seconds; this is one second less.
 const FLUSH: Duration = Duration::from_secs(4);
-/// Unrolls that may wait between the workers and the connection, and how many the learner may still have to
-/// acknowledge: two for each environment, within these limits.
+/// Most unrolls without acknowledgement: two for each environment, within these limits. Half as many may wait between the
+/// workers and the connection.
 const FEWEST_UNACKNOWLEDGED: usize = 4;
 const MOST_UNACKNOWLEDGED: usize = 256;
 /// Names, shapes and alignment may make the learner's safetensors document a little larger than this actor's.
@@ -46,9 +46,9 @@ pub struct Options {
     pub threads: Option<usize>,
     /// Environments a thread; the experiment's number when absent.
     pub environments: Option<usize>,
-    /// Directory of the asset cache; the user's own when absent.
+    /// Directory of the asset cache; the user's cache directory when absent.
     pub cache: Option<PathBuf>,
-    /// Directory for episodes that diverged, if they are to be kept.
+    /// Directory for episodes that diverged, if they are kept.
     pub dump_diverged: Option<PathBuf>,
     /// File that is written while environments are stepped, for a health check.
     pub liveness: Option<PathBuf>,
@@ -126,7 +126,7 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
     if settled.over { Ok(()) } else { Err(Error::Stopped) }
 }
 
-/// Stops everything at SIGTERM or SIGINT.
+/// Stops everything at SIGTERM, SIGINT or SIGHUP.
 fn stop_on_signal(runtime: &Runtime, closing: Closing) -> Result<(), Error> {
     let _context = runtime.enter();
     let mut terminate = signal(SignalKind::terminate()).map_err(Error::Thread)?;
@@ -144,7 +144,7 @@ fn stop_on_signal(runtime: &Runtime, closing: Closing) -> Result<(), Error> {
     Ok(())
 }
 
-/// The workers, at most one a thread, and the bytes that the acting parameters take.
+/// The workers, at most one a thread, and the bytes of the policy's parameters.
 fn build(
     joined: &Joined,
     threads: usize,

@@ -2,17 +2,17 @@
 
 use comic_experiment::seed::derive;
 
-/// What is random about one environment, whoever simulates it and beside which others.
+/// The seeds of one environment. They do not depend on the actor, the thread, or the other environments.
 #[derive(Clone, Copy, Debug)]
 pub struct EnvironmentSeeds {
-    /// Of its episodes.
+    /// Of its episodes and simulation.
     pub simulation: u64,
-    /// Of its latents' and its actions' noise.
+    /// Of the noise of its latents and actions.
     pub noise: u64,
 }
 
 impl EnvironmentSeeds {
-    /// Of environment `number` of the family `seed`.
+    /// The seeds of environment `number`, derived from `seed`.
     pub fn new(seed: u64, number: u32) -> Self {
         let own = derive(seed, u64::from(number));
         Self { simulation: derive(own, 0), noise: derive(own, 1) }

@@ -1,9 +1,12 @@
-//! The connection to the learner, which an actor keeps for its whole life and never gives up on.
+//! The connection to the learner, for the whole time of the process.
 //!
-//! [`join`] asks the learner who we are and what to run; [`Joined::run`] then exchanges unrolls and parameters. A lost
-//! connection is made again, with back-off, for ever; what was not acknowledged is sent again, in order. Only another
-//! experiment, a refusal, or the learner's word that the run is over end it. A refused token or certificate ends an
-//! actor that was never let in; one that was waits until the files, which are read for every connection, are renewed.
+//! [`join`] asks the learner for this actor's index and for the experiment. [`Joined::run`] then sends unrolls and receives
+//! parameters. It reconnects after every loss, with back-off and without a limit, and sends unrolls without
+//! acknowledgement again, in order. It ends only when the experiment changes, when the learner refuses the actor, or when
+//! the run is over.
+//!
+//! A refused token or certificate ends an actor that has never joined. An actor that has joined before retries: the files
+//! are read for every connection and may be renewed.
 
 mod assets;
 mod backoff;
@@ -36,10 +39,10 @@ pub use assets::default_cache;
 pub use outbox::Settled;
 pub use parameters::{Assembled, Assembler};
 
-/// Shorter connections are failures too: the back-off goes on growing.
+/// A shorter connection counts as a failure: the back-off continues to grow.
 const STABLE: Duration = Duration::from_secs(5);
 
-/// Where the learner is, where assets are kept, and how much this actor does.
+/// The learner's address, the asset cache, and the size of this actor.
 #[derive(Clone, Debug)]
 pub struct Options {
     /// For instance `http://host:7070`.
@@ -48,7 +51,7 @@ pub struct Options {
     pub access: Access,
     /// Directory of the asset cache; [`default_cache`] when absent.
     pub cache: Option<PathBuf>,
-    /// Who this actor is over its restarts: a newer process of a name takes the older one's place. Nobody when absent.
+    /// A name that stays the same over restarts. A newer process of the same name replaces the older one.
     pub name: Option<String>,
     /// Threads; the experiment's number when absent.
     pub threads: Option<usize>,
@@ -59,15 +62,15 @@ pub struct Options {
 /// Limits of an exchange.
 #[derive(Clone, Copy, Debug)]
 pub struct Limits {
-    /// Unrolls sent or waiting to be sent that are not acknowledged yet; beyond, none is taken from the workers.
+    /// Most unrolls without acknowledgement; when there are so many, no unroll is taken from the workers.
     pub window: usize,
-    /// Bytes of parameters the experiment's networks can have.
+    /// Most bytes of parameters in one version.
     pub parameters: u64,
-    /// How long a stopped actor goes on delivering what its workers had finished.
+    /// How long a stopped actor continues to send finished unrolls.
     pub flush: Duration,
 }
 
-/// What the learner told this actor, and the connection it said it on.
+/// The learner's reply to `Join`, and the connection.
 #[derive(Debug)]
 pub struct Joined {
     /// The experiment, resolved.
@@ -80,16 +83,16 @@ pub struct Joined {
     pub actor: u64,
     /// Seed of this actor's random numbers.
     pub seed: u64,
-    /// What of a run in lockstep this actor simulates, never empty; none when the run is in no lockstep.
+    /// The numbers of this actor's environments in lockstep, never empty; none without lockstep.
     pub environments: Option<Range<u32>>,
-    /// Where the experiment's clip sources lie on this machine.
+    /// The experiment's clip sources and their files on this machine.
     pub assets: HashMap<String, PathBuf>,
     terms: Terms,
     connector: Connector,
     link: Link,
 }
 
-/// What may not change between two `Join`s.
+/// What must be the same in every reply to `Join`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Terms {
     experiment: String,
@@ -109,7 +112,8 @@ impl Terms {
     }
 }
 
-/// What of an experiment may not change under a running actor: how long, how often and with how many threads may.
+/// The part of an experiment that must not change while an actor runs. Budget, learner settings and actor settings may
+/// change.
 fn lasting(document: &str) -> String {
     let Ok(mut experiment) = Experiment::from_toml("the learner's experiment", document) else {
         return document.to_string();
@@ -121,7 +125,7 @@ fn lasting(document: &str) -> String {
     experiment.to_toml().unwrap_or_else(|_| document.to_string())
 }
 
-/// Joins the learner, waiting for it as long as it takes, and fetches the assets this machine lacks.
+/// Joins the learner, retrying without a limit, and fetches the assets that this machine lacks.
 ///
 /// # Errors
 /// A refusal, an experiment that cannot be used, no cache directory, a full disk; [`Error::Stopped`] when `stop` became
@@ -138,7 +142,7 @@ async fn join_for_ever(options: &Options) -> Result<Joined, Error> {
     let mut backoff = Backoff::default();
     loop {
         match attempt(options, &mut connector).await {
-            Ok((link, Told { experiment, spec, layout, environments }, assets)) => {
+            Ok((link, CheckedReply { experiment, spec, layout, environments }, assets)) => {
                 let reply = &link.reply;
                 return Ok(Joined {
                     experiment,
@@ -159,24 +163,24 @@ async fn join_for_ever(options: &Options) -> Result<Joined, Error> {
     }
 }
 
-type Answer = (Link, Told, HashMap<String, PathBuf>);
+type Reply = (Link, CheckedReply, HashMap<String, PathBuf>);
 
-async fn attempt(options: &Options, connector: &mut Connector) -> Result<Answer, Failure> {
+async fn attempt(options: &Options, connector: &mut Connector) -> Result<Reply, Failure> {
     let mut link = connector.connect(0).await?;
-    let told = read_reply(&link.reply).map_err(Failure::Fatal)?;
+    let checked = read_reply(&link.reply).map_err(Failure::Fatal)?;
     let assets = assets::fetch(&mut link, options.cache.as_deref()).await?;
-    Ok((link, told, assets))
+    Ok((link, checked, assets))
 }
 
-/// What a reply says, checked.
-struct Told {
+/// The checked content of a reply.
+struct CheckedReply {
     experiment: Experiment,
     spec: TaskSpec,
     layout: Arc<UnrollLayout>,
     environments: Option<Range<u32>>,
 }
 
-fn read_reply(reply: &JoinReply) -> Result<Told, Error> {
+fn read_reply(reply: &JoinReply) -> Result<CheckedReply, Error> {
     let experiment = Experiment::from_toml("the learner's experiment", &reply.experiment)?;
     let spec: TaskSpec = toml::from_str(&reply.task_spec)?;
     let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
@@ -184,7 +188,7 @@ fn read_reply(reply: &JoinReply) -> Result<Told, Error> {
         return Err(Error::Disagreement { what: "the layout of an unroll" });
     }
     let environments = read_environments(reply, &experiment)?;
-    Ok(Told { experiment, spec, layout: Arc::new(layout), environments })
+    Ok(CheckedReply { experiment, spec, layout: Arc::new(layout), environments })
 }
 
 fn read_environments(reply: &JoinReply, experiment: &Experiment) -> Result<Option<Range<u32>>, Error> {
@@ -201,9 +205,8 @@ fn read_environments(reply: &JoinReply, experiment: &Experiment) -> Result<Optio
 }
 
 impl Joined {
-    /// Sends unrolls and receives parameters until the run is over (`Ok`), or all workers are gone and everything is
-    /// acknowledged (`Ok`). When `stop` becomes true it delivers what the workers had finished, for at most
-    /// `limits.flush`.
+    /// Sends unrolls and receives parameters until the run is over, or until all workers have ended and every unroll is
+    /// acknowledged; both are `Ok`. When `stop` becomes true it sends the finished unrolls, for at most `limits.flush`.
     ///
     /// # Errors
     /// [`Error::Changed`], a refusal at a reconnect.
@@ -220,12 +223,12 @@ impl Joined {
             () = deadline(stop, limits.flush) => Ok(false),
         };
         if !outbox.is_empty() {
-            tracing::warn!(unrolls = outbox.len(), "left with unrolls that were not acknowledged");
+            tracing::warn!(unrolls = outbox.len(), "some unrolls were not acknowledged in time");
         }
         ended.map(|over| Settled { over, ..outbox.settled() })
     }
 
-    /// Whether it ended because the run is over.
+    /// Returns whether it ended because the run is over.
     async fn keep_connected(
         mut self,
         limits: Limits,
@@ -268,7 +271,7 @@ impl Joined {
 
 async fn deadline(mut stop: watch::Receiver<bool>, flush: Duration) {
     if stop.wait_for(|stop| *stop).await.is_err() {
-        // Nobody can ask us to stop any more.
+        // The sender is gone, so no stop can come.
         std::future::pending::<()>().await;
     }
     tokio::time::sleep(flush).await;

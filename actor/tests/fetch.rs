@@ -186,7 +186,7 @@ fn a_missing_page_and_a_bad_address_are_errors_at_once() {
         Server::start(|_, _| b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\nConnection: close\r\n\r\n".to_vec());
     let directory = tempfile::tempdir().unwrap();
     let message = fetch(&server, directory.path()).unwrap_err().to_string();
-    assert!(message.ends_with("the server answers 404 Not Found; try another --url"), "{message}");
+    assert!(message.ends_with("the server answered 404 Not Found; try another --url"), "{message}");
     assert_eq!(server.requests().len(), 1);
     let error = download("nowhere", &directory.path().join("b"), &EXPECTED, false, &mut |_| ()).unwrap_err();
     assert!(error.is_configuration(), "{error}");

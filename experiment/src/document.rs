@@ -6,7 +6,7 @@ use crate::clips::ClipSource;
 use crate::for_each_task;
 use crate::network::Network;
 use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
-use crate::tasks::{BallCatch, Gaps, GetUp, GoToTarget, TaskName, TaskParameters, Tracking, Walls};
+use crate::tasks::{self, TaskName, TaskParameters};
 
 macro_rules! document {
     ($($(#[$description:meta])* $task:ident, $section:ident, $name:literal;)*) => {
@@ -25,7 +25,7 @@ macro_rules! document {
             pub joint: Vec<Complement>,
             /// Motion capture, one entry per source: the references of tracking, and the start poses of other tasks.
             pub clips: Vec<ClipSource>,
-            $($(#[$description])* pub $section: $task,)*
+            $($(#[$description])* pub $section: tasks::$task,)*
             /// Sizes and initial values of the networks.
             pub network: Network,
             /// Parameters of V-MPO.
@@ -52,7 +52,7 @@ macro_rules! document {
                     task: TaskName::Tracking,
                     joint: Vec::new(),
                     clips: vec![ClipSource::whole("builtin:CMU_007_01")],
-                    $($section: $task::default(),)*
+                    $($section: tasks::$task::default(),)*
                     network: Network::default(),
                     vmpo: Vmpo::default(),
                     optimiser: Optimiser::default(),

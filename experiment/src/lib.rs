@@ -44,7 +44,4 @@ pub use network::{InitialPose, Latent, LowLevelName, Lstm, Mlp, Network, Primiti
 pub use resolve::resolve;
 pub use settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
 pub use spec::{TaskPart, TaskSpec};
-pub use tasks::{
-    BallCatch, Corridor, Gaps, GetUp, GoToTarget, LyingPose, StartPose, TRACKING_MAX_REWARD, TRACKING_OBSERVATIONS,
-    TRACKING_REWARD_TERMS, TaskName, TerminationError, Tracking, Vision, WallSide, Walls, tracking_observation_size,
-};
+pub use tasks::*;

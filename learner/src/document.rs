@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 /// The experiment and its changes.
 #[derive(Clone, Debug, Args)]
 pub struct DocumentArguments {
-    /// Name of a preset (README.md lists them), or path of an experiment file [default: tracking-mlp].
+    /// Name of a preset (docs/experiments.md lists them), or path of an experiment file [default: tracking-mlp].
     #[arg(long, value_name = "NAME|FILE", global = true)]
     pub preset: Option<String>,
     /// Clips to track instead of the experiment's: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP.

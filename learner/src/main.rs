@@ -11,7 +11,7 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
 
 /// glibc's allocator does not reuse the memory that thousands of connections freed: under 4000 actors the learner grew by
-/// 27 MB a minute, without end. With this allocator it stays at its size. docs/operations.md has the figures.
+/// 27 MB a minute, without end. With this allocator it stays at its size. docs/benchmarks.md has the figures.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 

@@ -86,7 +86,7 @@ pub enum Command {
     Manual(Manual),
 }
 
-/// The actor has the same exit codes; `docs/operations.md` says more.
+/// The actor has the same exit codes; `docs/running.md` says more.
 const EXIT_CODES: &str = "\
 Exit codes: 0 when the run is over, or when the learner was told to stop and wrote its checkpoint; 2 when the configuration
 is wrong, so that starting again cannot help; 1 otherwise.

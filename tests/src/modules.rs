@@ -3,8 +3,8 @@
 //! Module A needs module B when a path in A leads to B. Every path counts: in `use`, in expressions, in types, in macros and
 //! in attributes. Code under `#[cfg(test)]` does not count.
 //!
-//! A module and the modules inside it may need each other: the outer one declares the inner ones and exports their items
-//! again, the inner ones use its types. Every other circle is one too many.
+//! A module and the modules inside it may need each other: the outer module declares the inner ones and re-exports their
+//! items, and the inner ones use its types. No other circle is allowed.
 
 mod source;
 mod tree;
@@ -20,7 +20,7 @@ use tree::{Edge, Id, Tree};
 
 /// Modules that need each other.
 pub struct Circle {
-    /// All modules from each of which a chain of paths leads to each other one.
+    /// All modules of the circle: a chain of paths leads from each of them to every other one.
     pub modules: Vec<String>,
     /// A shortest chain among them: the module, the one that it needs, and the place of the path, as `file:line`.
     pub chain: Vec<(String, String, String)>,
@@ -53,7 +53,7 @@ pub fn circles(root: &str, files: &BTreeMap<&str, &str>) -> Result<Vec<Circle>> 
 /// Looks for circles among `members`.
 fn search(tree: &Tree, edges: &[Edge], members: Vec<Id>, found: &mut Vec<Circle>) {
     for component in components(edges, &members) {
-        // A module that holds all others may be in a circle with them; they may have circles without it.
+        // A module that contains all others may be in a circle with them. The others may have circles without it.
         let outer = component.iter().find(|outer| component.iter().all(|id| id == *outer || tree.holds(**outer, *id)));
         match outer {
             Some(outer) => search(tree, edges, component.iter().copied().filter(|id| id != outer).collect(), found),
@@ -84,7 +84,7 @@ fn components(edges: &[Edge], members: &[Id]) -> Vec<Vec<Id>> {
 fn circle(tree: &Tree, edges: &[Edge], component: &[Id]) -> Circle {
     let inside: Vec<&Edge> =
         edges.iter().filter(|edge| component.contains(&edge.from) && component.contains(&edge.to)).collect();
-    // Between two modules of which the outermost holders are different, so that none of the circle's modules holds the rest.
+    // The chain contains an edge between two modules with different outermost modules. So no module contains all the others.
     let outermost = |id: Id| component.iter().copied().find(|outer| *outer == id || tree.holds(*outer, id));
     let crossing = inside.iter().filter(|edge| outermost(edge.from) != outermost(edge.to));
     let chain = crossing

@@ -214,11 +214,11 @@ impl System {
         for log in &self.actors {
             let text = fs::read_to_string(log).context("no log")?;
             let Some((_, last)) = text.rsplit_once("Settled {") else {
-                ensure!(!text.contains("leaving"), "an actor ended without logging its unrolls: {text}");
+                ensure!(!text.contains("exiting"), "an actor ended without logging its unrolls: {text}");
                 answered.all = false;
                 continue;
             };
-            answered.all &= !text.contains("left with unrolls that were not acknowledged");
+            answered.all &= !text.contains("some unrolls were not acknowledged in time");
             for verdict in ["taken", "duplicate", "stale", "invalid"] {
                 let rest = last.split_once(&format!("{verdict}: ")).map(|(_, rest)| rest);
                 let digits = rest.and_then(|rest| rest.split(|letter: char| !letter.is_ascii_digit()).next());

@@ -9,9 +9,9 @@ use comic_experiment::ClipSource;
 use super::{print, print_json, table::table};
 use crate::Error;
 
-/// Finds every defect of every clip, all at once; exits with 1 when there is any.
+/// Finds every defect of every clip; exits with 1 when there is any.
 ///
-/// Floor and joint limits are those of the CMU humanoid V2020; clips of another body are searched for the rest.
+/// Floor and joint limits are those of the CMU humanoid V2020. Clips of another body are checked for other defects only.
 #[derive(Args, Clone, Debug)]
 #[command(after_long_help = help())]
 pub(super) struct Check {
@@ -81,7 +81,7 @@ fn as_table(checked: &[Checked]) -> String {
             rows.push(row("-".into(), String::new(), String::new(), String::new(), said.into()));
         }
         for defect in &clip.defects {
-            // As JSON names it.
+            // The name in JSON.
             let kind = serde_json::to_value(defect.kind).ok().and_then(|kind| kind.as_str().map(String::from));
             rows.push(row(
                 kind.unwrap_or_default(),

@@ -1,4 +1,4 @@
-//! A file off the network, known by size and SHA-256, in as many sittings as it takes.
+//! Downloads a file of known size and SHA-256, with as many connections as it takes.
 
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Write as _};
@@ -13,7 +13,7 @@ use ureq::http::{Response, StatusCode};
 
 use crate::Error;
 
-/// What a whole file is known by.
+/// Size and hash of the complete file.
 #[derive(Clone, Copy, Debug)]
 pub struct Expected {
     /// Bytes.
@@ -22,17 +22,16 @@ pub struct Expected {
     pub sha256: &'static str,
 }
 
-/// Without a byte for so long, a connection is lost.
+/// A connection without a byte for this time is lost.
 const SILENCE: Duration = Duration::from_secs(60);
-/// Attempts in a row that may end without a new byte.
+/// Most attempts in a row without a new byte.
 const FRUITLESS: usize = 3;
 const PAUSE: Duration = Duration::from_millis(500);
 const BUFFER: usize = 1 << 18;
 
-/// Fetches `url` to `out`, by way of `out.part`, which a later call goes on with; a lost connection is taken up again
-/// while there is progress. `out` appears whole and verified, or not at all; a whole download that is not the expected
-/// file is removed. Whether anything was fetched is returned: the file may be there already. `progress` is told the
-/// bytes that are there.
+/// Downloads `url` to `out`. The bytes go to `out.part` first, and a later call continues there. A lost connection is made
+/// again while there is progress. `out` appears complete and verified, or not at all; a complete download that is not the
+/// expected file is removed. Returns false when the file was there already. `progress` receives the number of bytes so far.
 ///
 /// # Errors
 /// [`Error::Download`] with the remedy; [`Error::Usage`] when `out` is another file and `overwrite` is not given;
@@ -73,7 +72,7 @@ fn part_of(out: &Path) -> PathBuf {
 
 fn place(part: &Path, out: &Path) -> Result<(), Error> {
     let mut temporary = TempPath::try_from_path(part).map_err(Error::file(part))?;
-    // Should it not go into its place, the verified bytes stay.
+    // If the rename fails, the verified bytes stay.
     temporary.disable_cleanup(true);
     temporary.persist(out).map_err(|failed| Error::file(out)(failed.error))?;
     let directory = out.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -96,15 +95,15 @@ struct Download<'a> {
     part: PathBuf,
 }
 
-/// How an attempt ended that did not bring the last byte.
+/// The end of an attempt that did not receive the last byte.
 enum Ended {
-    /// Worth another attempt.
+    /// Another attempt may help.
     Lost(String),
     Fatal(Error),
 }
 
 impl Download<'_> {
-    /// What is there of the file, locked: two downloads must not write the same.
+    /// The partial file, locked: two downloads must not write the same file.
     fn open(&self) -> Result<File, Error> {
         let file = OpenOptions::new().create(true).append(true).open(&self.part).map_err(Error::file(&self.part))?;
         if file.try_lock().is_err() {
@@ -135,7 +134,7 @@ impl Download<'_> {
             if fruitless == FRUITLESS {
                 return Err(self.failed(&format!(
                     "{reason}; check the network, or fetch it elsewhere and put it in place (--url names another \
-                     address). {there} of {} bytes are kept, and the same command goes on from there",
+                     address). {there} of {} bytes are kept, and the same command continues from there",
                     self.expected.size
                 )));
             }
@@ -153,7 +152,7 @@ impl Download<'_> {
         config.build().into()
     }
 
-    /// One request for what is missing.
+    /// One request for the missing bytes.
     fn attempt(&self, agent: &Agent, file: &mut File, there: u64, progress: &mut dyn FnMut(u64)) -> Result<(), Ended> {
         let mut request = agent.get(self.url);
         if there > 0 {
@@ -161,7 +160,7 @@ impl Download<'_> {
         }
         let response = request.call().map_err(|error| match error {
             ureq::Error::BadUri(_) | ureq::Error::Http(_) => {
-                Ended::Fatal(Error::Usage(format!("`{}` is no address to fetch from: {error}", self.url)))
+                Ended::Fatal(Error::Usage(format!("`{}` is no valid URL: {error}", self.url)))
             }
             error => Ended::Lost(error.to_string()),
         })?;
@@ -170,7 +169,7 @@ impl Download<'_> {
         self.take(body, file, start, progress)
     }
 
-    /// From which byte on the answer is; what is there already is thrown away when it is from the first.
+    /// The first byte of the response. The partial file is emptied when the response begins at byte 0.
     fn start(&self, response: &Response<ureq::Body>, file: &File, there: u64) -> Result<u64, Ended> {
         let wrong = |size: u64| {
             let reason = format!("the file there has {size} bytes, expected {}; try another --url", self.expected.size);
@@ -199,8 +198,8 @@ impl Download<'_> {
                 again().map(|()| 0)
             }
             StatusCode::RANGE_NOT_SATISFIABLE => again().and(Err(Ended::Lost("the server's file is shorter".into()))),
-            status if status.is_server_error() => Err(Ended::Lost(format!("the server answers {status}"))),
-            status => Err(Ended::Fatal(self.failed(&format!("the server answers {status}; try another --url")))),
+            status if status.is_server_error() => Err(Ended::Lost(format!("the server answered {status}"))),
+            status => Err(Ended::Fatal(self.failed(&format!("the server answered {status}; try another --url")))),
         }
     }
 

@@ -10,23 +10,23 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::{Expected, download, print};
 use crate::Error;
 
-/// Where DeepMind publishes the CMU clips fitted to the V2020 body, and what they are known by (dm_control 1.0.49,
-/// `locomotion/mocap/cmu_mocap_data.py`).
+/// DeepMind's CMU clips, fitted to the V2020 body: URL, size and hash are those of dm_control 1.0.49,
+/// `locomotion/mocap/cmu_mocap_data.py`.
 const URL: &str = "https://storage.googleapis.com/dm_control/cmu_2020_dfe3e9e0.h5";
 const PUBLISHED: Expected =
     Expected { size: 476_559_420, sha256: "dfe3e9e0b08d32960bdafbf89e541339ca8908a9a5e7f4a2c986362890d72863" };
-/// Between two log lines where there is no terminal.
+/// Time between two log lines, when there is no terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Fetches DeepMind's clips of 2020 (836 of the CMU database, 455 MiB) and verifies size and SHA-256.
 ///
-/// What is there of an interrupted download is gone on with; a file that is there whole is left alone.
+/// An interrupted download is continued. A complete file is not fetched again.
 #[derive(Args, Clone, Debug)]
 pub(super) struct Fetch {
-    /// Where it is published, or a mirror: the file must be the same.
+    /// The URL of the file, or of a mirror with the same file.
     #[arg(long, value_name = "URL", default_value = URL)]
     url: String,
-    /// Where it goes.
+    /// The new file.
     #[arg(long, value_name = "FILE", default_value = "cmu_2020_dfe3e9e0.h5")]
     out: PathBuf,
     /// Replace another file of that name.
@@ -44,7 +44,7 @@ impl Fetch {
     }
 }
 
-/// A bar on a terminal, log lines elsewhere.
+/// A progress bar on a terminal, log lines elsewhere.
 struct Progress {
     total: u64,
     bar: Option<ProgressBar>,

@@ -13,8 +13,8 @@ use crate::Error;
 /// Makes clips of the CMU humanoid V2020 from ASF and AMC files of the CMU database (mocap.cs.cmu.edu), 120 frames a
 /// second.
 ///
-/// Constants that are not given are found in the recording; what was taken is printed, as options that give the same
-/// clip again.
+/// Constants that are not given are computed from the recording. They are printed as options that make the same clip
+/// again.
 #[derive(Args, Clone, Debug)]
 pub(super) struct Import {
     /// The subject's skeleton.
@@ -36,14 +36,16 @@ pub(super) struct Import {
     /// The clip's name; CMU_002_03 for 02_03.amc unless given.
     #[arg(long, value_name = "CLIP", conflicts_with = "manifest")]
     name: Option<String>,
-    /// The motion's size; the body's leg over the subject's unless given.
+    /// Scale of the motion; the body's leg length / the subject's unless given.
     #[arg(long, value_name = "FACTOR", requires = "amc")]
     scale: Option<f64>,
-    /// Degrees to take off the left and the right ankle, positive: toes up; by the soles that stand unless given.
+    /// Degrees to subtract from the left and the right ankle, positive: toes up; computed from standing soles unless
+    /// given.
     #[arg(long, value_names = ["LEFT", "RIGHT"], num_args = 2, allow_negative_numbers = true, requires = "amc")]
     sole_deg: Option<Vec<f64>>,
-    /// The floor under the recording: sliding:PERCENTILE:HALF:SMOOTH, windows in steps of 0.03 s, follows one that
-    /// drifts (sliding:50:12:8); const:PERCENTILE is level (const:30, for jumps); by the heights unless given.
+    /// The floor under the recording. sliding:PERCENTILE:HALF:SMOOTH follows a drifting floor, with windows in steps of
+    /// 0.03 s (sliding:50:12:8). const:PERCENTILE is a level floor (const:30, for jumps). Computed from the heights unless
+    /// given.
     #[arg(long, value_name = "FLOOR", requires = "amc")]
     floor: Option<Floor>,
     /// m/rad: how much arms keep their angles, rather than elbow and wrist their places, where a range is left; 0.2
@@ -69,7 +71,7 @@ impl Import {
             let (frames, seconds) = (clip.steps(), clip.dt * clip.steps() as f64);
             told += &format!("{}: {frames} frames, {seconds:.2} s, with {taken}\n", clip.name);
         }
-        // Whoever reads the words may be gone: the file comes first.
+        // The file is written first: standard output may be closed.
         writer.finish()?;
         print(&format!("{told}{} in {}; see `comic-actor clips check`\n", takes.len(), self.out.display()))
     }
@@ -117,7 +119,7 @@ fn frames(text: &str) -> Result<Range<usize>, String> {
     range.filter(|range: &Range<usize>| !range.is_empty()).ok_or_else(|| "give first and end, like 0..1200".into())
 }
 
-/// The database's file names as dm_control names clips: subject in three digits, take in two.
+/// dm_control's clip name for a file of the database: subject in three digits, take in two.
 fn name_of(amc: &Path) -> String {
     let stem = amc.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
     let numbers = stem.split_once('_').and_then(|(subject, take)| Some((subject.parse().ok()?, take.parse().ok()?)));

@@ -8,12 +8,12 @@ use serde::Serialize;
 use super::{print, print_json, table::table};
 use crate::Error;
 
-/// Lists clips: name, frames, seconds, dm_control's subsets that have it, and the frames that can be starts.
+/// Lists clips: name, frames, seconds, the subsets of dm_control that contain the clip, and the possible start frames.
 ///
-/// Starts are counted with the tracking task's defaults; the last frames are none, since references lie ahead of them.
+/// Starts follow from the tracking task's defaults. The last frames are no starts, since no reference frames follow them.
 #[derive(Args, Clone, Debug)]
 pub(super) struct List {
-    /// What to list: FILE.h5, FILE.h5#SUBSET, FILE.h5#CLIP,CLIP or builtin:NAME.
+    /// The clips to list: FILE.h5, FILE.h5#SUBSET, FILE.h5#CLIP,CLIP or builtin:NAME.
     #[arg(value_name = "FILE", required = true)]
     sources: Vec<String>,
     /// One JSON array: clip, frames, seconds, dt, model, subsets, starts ([first, end), or null when there are none).

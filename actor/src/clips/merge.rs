@@ -8,11 +8,11 @@ use comic_experiment::ClipSource;
 use super::print;
 use crate::Error;
 
-/// Writes the clips of several sources into one file, which dm_control reads too. Poses, velocities and features go along;
-/// markers, props, dates and body masses, which no task here reads, do not.
+/// Writes the clips of several sources into one file, which dm_control can read too. The file has poses, velocities and
+/// features. Markers, props, dates and body masses are left out, since no task reads them.
 #[derive(Args, Clone, Debug)]
 pub(super) struct Merge {
-    /// What to take: FILE.h5, FILE.h5#SUBSET, FILE.h5#CLIP,CLIP or builtin:NAME.
+    /// The clips to merge: FILE.h5, FILE.h5#SUBSET, FILE.h5#CLIP,CLIP or builtin:NAME.
     #[arg(value_name = "SOURCE", required = true)]
     sources: Vec<String>,
     /// The new file.

@@ -1,6 +1,6 @@
-//! Rows for people.
+//! Prints rows as a table.
 
-/// Columns as wide as they must be, the first and the last to the left, the others to the right.
+/// Aligns the columns: the first and the last to the left, the others to the right.
 pub(super) fn table<const N: usize>(header: [&str; N], rows: &[[String; N]]) -> String {
     let header = header.map(String::from);
     let all = || std::iter::once(&header).chain(rows);

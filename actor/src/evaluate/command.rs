@@ -43,8 +43,8 @@ With --json one object goes to standard output:
 #[derive(Args, Clone, Debug)]
 #[command(after_long_help = JSON_HELP)]
 pub struct Evaluate {
-    /// A run's directory, its `checkpoints`, or one checkpoint, of which the newest complete one is taken; or a policy that
-    /// `comic-learner export` wrote.
+    /// A run's directory, its `checkpoints`, or one checkpoint; the newest complete checkpoint is evaluated. Or a policy
+    /// that `comic-learner export` wrote.
     #[arg(long, value_name = "DIR|FILE", visible_alias = "policy", required_unless_present = "preset")]
     checkpoint: Option<PathBuf>,
     /// The experiment to evaluate without a checkpoint: a preset's name or a TOML file.
@@ -53,10 +53,10 @@ pub struct Evaluate {
     /// Overrides a field of the preset, for instance `--set tracking.termination_threshold=0.5`.
     #[arg(long, value_name = "FIELD=VALUE", requires = "preset")]
     set: Vec<String>,
-    /// The policy as it is before any learning.
+    /// The policy with its initial parameters.
     #[arg(long)]
     untrained: bool,
-    /// The servo action itself, the pose of the next reference frame, instead of a policy.
+    /// The servo action (the pose of the next reference frame) instead of a policy.
     #[arg(long, conflicts_with = "untrained")]
     servo: bool,
     /// Clips in place of the experiment's own: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP.
@@ -74,11 +74,11 @@ pub struct Evaluate {
     /// JSON instead of a table; see below.
     #[arg(long)]
     json: bool,
-    /// Write the reward of every step there too, one JSON object an episode: clip, start (its frame), rewards.
+    /// Write the reward of every step to this file, one JSON object an episode: clip, start (its frame), rewards.
     #[arg(long, value_name = "FILE")]
     rewards: Option<PathBuf>,
-    /// Report the evaluation of a checkpoint to this learner too, which keeps it in `evaluations.jsonl`, and the checkpoint
-    /// as `checkpoints/best` if none was better.
+    /// Report the evaluation of a checkpoint to this learner. The learner stores it in `evaluations.jsonl`, and the
+    /// checkpoint as `checkpoints/best` if no other was better.
     #[arg(long, value_name = "URL", requires = "checkpoint", conflicts_with_all = ["untrained", "servo"])]
     learner: Option<String>,
     #[command(flatten)]
@@ -98,17 +98,17 @@ struct Subject {
 }
 
 impl Evaluate {
-    /// Evaluates and prints.
+    /// Evaluates and prints the report.
     ///
     /// # Errors
-    /// Whatever keeps it from that.
+    /// A wrong command line, a checkpoint that cannot be used, a failing evaluation, film or report.
     pub fn run(&self) -> Result<(), Error> {
         let subject = self.subject()?;
         let position = subject.position;
         let (report, film) = self.evaluate(subject)?;
         let json = serde_json::to_string_pretty(&report)
             .map_err(|error| Error::Usage(format!("cannot write the report as JSON: {error}")))?;
-        // First of all the figures: neither a film that fails nor a learner that is away may cost them.
+        // The report is printed first: a failing film or an unreachable learner must not lose it.
         let text = if self.json { format!("{json}\n") } else { report.to_string() };
         std::io::stdout().write_all(text.as_bytes()).map_err(Error::file("standard output"))?;
         if let Some(learner) = &self.learner {
@@ -118,14 +118,14 @@ impl Evaluate {
         film
     }
 
-    /// The report, and what became of the film.
+    /// The report, and the result of the film.
     fn evaluate(&self, subject: Subject) -> Result<(Report, Result<(), Error>), Error> {
         let Subject { experiment, parameters, .. } = subject;
         if let Some(out) = &self.video {
             Format::of(out)?;
             self.look.suits(experiment.task)?;
         }
-        // A policy that was never trained starts from the pose of its own clips, whatever it is evaluated on.
+        // An untrained policy starts from the mean pose of the experiment's clips, also when it is evaluated on others.
         let own = if self.untrained { Some(Catalogue::open(&experiment.clips)?) } else { None };
         let experiment = experiment.with_clips(&self.clips);
         let catalogue = Catalogue::open(&experiment.clips)?;
@@ -192,10 +192,10 @@ impl Evaluate {
     }
 }
 
-/// Shows how far the evaluation is, and films its first episode if that is wanted.
+/// Shows the evaluation's progress, and films its first episode if a film was asked for.
 struct Follower {
     recorder: Option<Recorder>,
-    /// Why filming ended before its time.
+    /// The error that ended the film early.
     failed: Option<Error>,
 }
 
@@ -216,7 +216,7 @@ fn show_progress(done: usize, all: usize) {
     let mut stderr = std::io::stderr();
     if stderr.is_terminal() {
         let end = if done == all { "\n" } else { "" };
-        // Progress that cannot be shown is no reason to stop.
+        // The evaluation continues when its progress cannot be shown.
         let _ = write!(stderr, "\r{done} of {all} episodes{end}");
     } else if done.is_multiple_of(100) || done == all {
         tracing::info!(done, all, "episodes");

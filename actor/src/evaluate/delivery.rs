@@ -1,4 +1,4 @@
-//! An evaluation on its way to the learner.
+//! Sends an evaluation to the learner.
 
 use std::time::Duration;
 
@@ -9,10 +9,10 @@ use tonic::Code;
 
 use crate::Error;
 
-/// A learner that does not answer in this time is not there.
+/// A learner that does not answer in this time counts as unreachable.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Reports an evaluation to the learner at `url`, which keeps it with the run.
+/// Reports an evaluation to the learner at `url`, which stores it with the run.
 ///
 /// # Errors
 /// [`Error::Access`], [`Error::Unwelcome`], [`Error::Refused`] with the learner's reason, or [`Error::Unreachable`].

@@ -1,4 +1,4 @@
-//! What an evaluation found.
+//! The result of an evaluation.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ pub struct Finished {
     pub start: usize,
     /// Steps that were left in the clip at the start.
     pub steps_left: usize,
-    /// The reward of each step it lasted.
+    /// The reward of each step.
     pub rewards: Vec<f64>,
     /// Sums of the reward terms.
     pub returns: [f64; MAX_REWARD_TERMS],
@@ -28,7 +28,7 @@ pub struct Finished {
 }
 
 impl Finished {
-    /// Steps it lasted.
+    /// Number of steps.
     pub fn steps(&self) -> usize {
         self.rewards.len()
     }
@@ -59,15 +59,15 @@ pub struct ClipReport {
     pub clip: String,
     /// Number of episodes.
     pub episodes: usize,
-    /// How many of them ended because the simulation diverged.
+    /// Episodes that ended because the simulation diverged.
     pub diverged: usize,
     /// Mean number of steps.
     pub length_mean: f64,
     /// Mean return.
     pub return_mean: f64,
-    /// Mean of return / (the most a step pays × steps left at the start).
+    /// Mean of return / (largest reward of a step × steps left at the start).
     pub normalised_reward: f64,
-    /// Mean over all steps of reward / the most a step pays.
+    /// Mean over all steps of reward / largest reward of a step.
     pub reward_per_step: f64,
     /// Mean of steps / steps left in the clip at the start.
     pub fraction_survived: f64,
@@ -129,7 +129,7 @@ impl ClipReport {
     }
 }
 
-/// 0 where there is nothing to divide by: JSON has no NaN.
+/// A quotient, 0 when the divisor is 0: JSON has no NaN.
 fn ratio(sum: f64, count: f64) -> f64 {
     if count > 0.0 { sum / count } else { 0.0 }
 }
@@ -173,9 +173,9 @@ mod tests {
 
         let walk = &report.clips[0];
         close(walk.return_mean, f64::midpoint(4.35, 29.0));
-        // 4.35 / (1.45 × 10) = 0.3 and 29 / (1.45 × 20) = 1: falling half-way costs the other half.
+        // 4.35 / (1.45 × 10) = 0.3 and 29 / (1.45 × 20) = 1: a fall half-way loses the other half.
         close(walk.normalised_reward, 0.65);
-        // (3 + 20) / 25: a fall is forgiven.
+        // (3 + 20) / 25: steps after a fall do not count.
         close(walk.reward_per_step, 23.0 / 25.0);
         close(walk.fraction_survived, 0.75);
         close(walk.length_mean, 12.5);
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn several_tasks_have_a_row_each_relative_to_what_each_can_pay() {
+    fn each_task_has_a_row_relative_to_its_own_largest_reward() {
         let mut spec = spec();
         spec.tasks[0].clips = 2;
         spec.tasks.push(TaskPart { name: "get-up".into(), max_reward: 1.0, clips: 1, ..spec.tasks[0].clone() });
@@ -200,12 +200,12 @@ mod tests {
         assert_eq!(rows, [("tracking", 2, 0.5), ("get-up", 1, 0.5)]);
         assert!(
             Report::new(&self::spec(), &finished[..2], &Options::default()).tasks.is_empty(),
-            "one task is the whole"
+            "a single task has no rows of tasks"
         );
     }
 
     #[test]
-    fn no_episode_at_all_is_no_nan() {
+    fn a_report_without_episodes_has_no_nan() {
         let report = Report::new(&spec(), &[], &Options::default());
         let json = serde_json::to_string(&report).unwrap();
         assert_eq!(serde_json::from_str::<Report>(&json).unwrap(), report);

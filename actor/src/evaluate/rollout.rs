@@ -277,32 +277,32 @@ mod tests {
         assert_eq!(episodes(&mut Controller::Policy(&mut Quarter), 1), expected);
     }
 
-    /// Notes what it sees, and leaves after so many looks.
+    /// Records what it watches, and breaks after `patience` calls.
     struct Spectator {
-        seen: Vec<(usize, usize)>,
+        watched: Vec<(usize, usize)>,
         patience: usize,
     }
 
     impl Audience<Fixed> for Spectator {
         fn watch(&mut self, number: usize, environment: &mut Fixed) -> Result<ControlFlow<()>, Error> {
-            self.seen.push((number, environment.step));
-            Ok(if self.seen.len() < self.patience { ControlFlow::Continue(()) } else { ControlFlow::Break(()) })
+            self.watched.push((number, environment.step));
+            Ok(if self.watched.len() < self.patience { ControlFlow::Continue(()) } else { ControlFlow::Break(()) })
         }
 
         fn count(&mut self, _: usize, _: usize) {}
     }
 
     #[test]
-    fn the_audience_sees_every_state_of_every_episode_and_may_leave_at_any() {
+    fn the_audience_watches_every_state_of_every_episode_and_may_break_at_any() {
         let starts = [1, 3, 2].map(|start| Start { clip: 0, start });
         let steps = |number, last| (0..=last).map(move |step| (number, step));
         let all: Vec<_> = steps(0, 3).chain(steps(1, 3)).chain(steps(2, 10)).collect();
         for (patience, episodes) in [(1, 0), (3, 0), (4, 1), (5, 1), (8, 2), (100, 3)] {
-            let mut spectator = Spectator { seen: Vec::new(), patience };
+            let mut spectator = Spectator { watched: Vec::new(), patience };
             let (environments, options) = (vec![Fixed { start: 0, step: 0 }], Options::default());
             let finished =
                 run(&mut Controller::<Quarter>::Zero, environments, &SHAPE, &starts, &options, &mut spectator).unwrap();
-            assert_eq!(spectator.seen, all[..patience.min(all.len())]);
+            assert_eq!(spectator.watched, all[..patience.min(all.len())]);
             assert_eq!(finished.len(), episodes, "{patience}");
             assert!(finished.iter().all(|episode| episode.returns[0] == 0.0), "the action was not 0");
         }

@@ -1,4 +1,4 @@
-//! A report for people.
+//! A report as a table.
 
 use std::fmt;
 
@@ -11,11 +11,11 @@ impl fmt::Display for Report {
         let terms: Vec<&str> = self.overall.reward_terms.keys().map(String::as_str).collect();
         let mut rows = vec![header(&terms)];
         rows.extend(self.clips.iter().map(row));
-        // A task of one clip has its row already.
+        // A task of one clip already has a row.
         if self.clips.len() > self.tasks.len() {
             rows.extend(self.tasks.iter().map(row));
         }
-        // With one clip the two are the same.
+        // With one clip the overall row would repeat the clip's row.
         if self.clips.len() != 1 {
             rows.push(row(&self.overall));
         }

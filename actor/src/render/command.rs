@@ -16,7 +16,7 @@ const USUAL_SECONDS: f64 = 10.0;
 /// The most seconds that can be asked for: an hour.
 const MOST_SECONDS: f64 = 3600.0;
 
-/// Films a policy at work, without a display: .gif, .webp, .mp4 (through ffmpeg) or .png (a contact sheet).
+/// Films a policy, without a display: .gif, .webp, .mp4 (through ffmpeg) or .png (a contact sheet).
 #[derive(Args, Clone, Debug)]
 pub struct Render {
     #[command(flatten)]
@@ -26,18 +26,18 @@ pub struct Render {
     /// Seconds to film, episode after episode; the first episode, 10 s of it at most, unless given.
     #[arg(long, value_name = "S", value_parser = seconds, help_heading = "Film")]
     seconds: Option<f64>,
-    /// The film; its extension says what it is: .gif, .webp, .mp4 or .png.
+    /// The film; the extension chooses the format: .gif, .webp, .mp4 or .png.
     #[arg(long, value_name = "FILE", help_heading = "Film")]
     out: PathBuf,
 }
 
 impl Render {
-    /// Films.
+    /// Makes the film.
     ///
     /// # Errors
-    /// Whatever keeps it from that.
+    /// A wrong command line, a checkpoint that cannot be used, a failing rollout or film.
     pub fn run(&self) -> Result<(), Error> {
-        // What is wrong with the film is said before anything is built.
+        // Errors of the film's options are reported before the task is built.
         super::encode::Format::of(&self.out)?;
         self.look.suits(self.scene.task())?;
         let mut cast = self.scene.cast()?;
@@ -45,14 +45,14 @@ impl Render {
         let seconds = self.seconds.unwrap_or(USUAL_SECONDS);
         let recorder = Recorder::new(&self.look, &self.out, step)?.with_bar(seconds);
         let mut filming = Filming { recorder, seconds };
-        // Every episode has a step at least, so there are enough.
+        // Every episode has at least one step, so there are enough episodes.
         let episodes = if self.seconds.is_some() { (seconds / step).ceil() as usize } else { 1 };
         cast.play(episodes, &mut filming)?;
         filming.recorder.finish()
     }
 }
 
-/// Films all it sees until the time is up.
+/// Films every step until the time is over.
 struct Filming {
     recorder: Recorder,
     seconds: f64,

@@ -1,4 +1,4 @@
-//! Pictures into a file, in the form that the file's extension names.
+//! Writes pictures into a film; the file's extension chooses the format.
 
 mod gif;
 mod mp4;
@@ -15,7 +15,7 @@ use tempfile::NamedTempFile;
 
 use crate::Error;
 
-/// What a film can be.
+/// The format of a film.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     /// 256 colours a frame.
@@ -24,12 +24,12 @@ pub enum Format {
     WebP,
     /// Through ffmpeg.
     Mp4,
-    /// A contact sheet: frames from begin to end beside one another.
+    /// A contact sheet: frames from begin to end, side by side.
     Png,
 }
 
 impl Format {
-    /// The form of the file at `path`.
+    /// The format of the file at `path`.
     ///
     /// # Errors
     /// [`Error::Usage`] when it has none of the known extensions.
@@ -47,7 +47,7 @@ impl Format {
         }
     }
 
-    /// The size of a picture unless another one is asked for: smaller where files grow large, or where it is a tile of many.
+    /// The default size of a picture: smaller in formats with large files, and for a tile of a contact sheet.
     pub fn usual_size(self) -> &'static str {
         match self {
             Self::Gif | Self::WebP => "400x300",
@@ -57,19 +57,19 @@ impl Format {
     }
 }
 
-/// Takes pictures, [`Size::bytes`] bytes each, in the order they are shown.
+/// Takes pictures of [`Size::bytes`] bytes each, in display order.
 trait Encoder {
     fn frame(&mut self, picture: &[u8]) -> io::Result<()>;
 
-    /// Writes what is left.
+    /// Writes the rest.
     fn finish(self: Box<Self>) -> io::Result<()>;
 }
 
-/// A film on its way into a file. The file appears, whole, when the film is finished; until then there is a temporary
-/// one beside it, which goes away with a film that is given up.
+/// A film that is being written. The pictures go to a temporary file in the same directory. It gets its name when the film
+/// is finished, and is removed when the film is dropped before.
 pub struct Movie {
     out: PathBuf,
-    // Before the file: an encoder that is given up ends its work before the file goes away.
+    // Declared before the file, so that it is dropped before the file is removed.
     encoder: Box<dyn Encoder>,
     file: NamedTempFile,
 }
@@ -87,7 +87,7 @@ impl Movie {
         #[cfg(unix)]
         {
             use std::os::unix::fs::PermissionsExt as _;
-            // The process's umask applies, as to any file that a program writes.
+            // The process's umask applies, as for other files.
             builder.permissions(std::fs::Permissions::from_mode(0o666));
         }
         let file = builder.tempfile_in(directory).map_err(Error::file(out))?;
@@ -109,7 +109,7 @@ impl Movie {
         self.encoder.frame(picture).map_err(Error::file(&self.out))
     }
 
-    /// Ends the film, and gives the file its name.
+    /// Finishes the film and gives the file its name.
     ///
     /// # Errors
     /// [`Error::File`] when it cannot be written.
@@ -122,7 +122,7 @@ impl Movie {
     }
 }
 
-/// When frames change, in a form's own units of time: rounding does not add up.
+/// Times at which frames change, in a format's own units. Rounding errors do not add up.
 struct Clock {
     frame_time: Duration,
     unit: Duration,
@@ -143,7 +143,7 @@ impl Clock {
     }
 }
 
-/// A buffered writer's file at its end, written out.
+/// Flushes a buffered writer.
 fn written(writer: io::BufWriter<File>) -> io::Result<()> {
     writer.into_inner().map(drop).map_err(io::IntoInnerError::into_error)
 }

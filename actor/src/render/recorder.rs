@@ -1,4 +1,4 @@
-//! An environment, step by step, into a film.
+//! Draws the steps of an environment into a film.
 
 use std::io::IsTerminal as _;
 use std::path::{Path, PathBuf};
@@ -13,13 +13,13 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::encode::{Format, Movie};
 use crate::Error;
 
-/// Frames between two log lines, where there is no terminal for a bar.
+/// Frames between two log lines, when there is no terminal.
 const FRAMES_A_LINE: usize = 100;
 
 /// How a film looks.
 #[derive(Args, Clone, Debug)]
 pub struct Look {
-    /// Whence it is filmed.
+    /// The camera.
     #[arg(long, value_enum, default_value_t = Place::Tracking, help_heading = "Film")]
     camera: Place,
     /// The reference as a ghost, in tracking: on the humanoid, or with `--ghost=beside` a metre beside it.
@@ -36,11 +36,11 @@ pub struct Look {
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Place {
-    /// From behind its right shoulder, following.
+    /// From behind its right shoulder, following it.
     Tracking,
-    /// Through its own eyes.
+    /// The humanoid's own camera.
     Egocentric,
-    /// From its right, following.
+    /// From its right, following it.
     Side,
 }
 
@@ -59,15 +59,17 @@ pub struct Recorder {
 }
 
 impl Look {
-    /// Whether a film of this task can look like that.
+    /// Checks whether a film of this task can look like this.
     ///
     /// # Errors
-    /// A ghost of what has no reference.
+    /// A ghost in a task without a reference.
     pub fn suits(&self, task: TaskName) -> Result<(), Error> {
         if self.ghost.is_none() || task == TaskName::Tracking {
             return Ok(());
         }
-        Err(Error::Usage(format!("--ghost: {task} has no reference to show, only tracking has: leave it out")))
+        Err(Error::Usage(format!(
+            "--ghost: {task} has no reference to show, only tracking has one: leave the option out"
+        )))
     }
 }
 
@@ -75,7 +77,7 @@ impl Recorder {
     /// Begins a film in the file `out` of a task with control steps of `step` seconds.
     ///
     /// # Errors
-    /// An extension that names no film, a file that cannot be made.
+    /// An unknown extension, or a file that cannot be created.
     pub fn new(look: &Look, out: &Path, step: f64) -> Result<Self, Error> {
         let size = match look.size {
             Some(size) => size,
@@ -92,7 +94,7 @@ impl Recorder {
         Ok(Self { film, movie, out: out.to_path_buf(), step, every, steps: 0, frames: 0, bar: None })
     }
 
-    /// Shows on a terminal how much of so many seconds has been filmed.
+    /// Shows on a terminal how many of `seconds` have been filmed.
     #[must_use]
     pub fn with_bar(mut self, seconds: f64) -> Self {
         if std::io::stderr().is_terminal() {
@@ -103,11 +105,10 @@ impl Recorder {
         self
     }
 
-    /// Films the environment as it stands, when it is time for a picture. Called once at an episode's begin, and after
-    /// each of its steps.
+    /// Draws a picture of the environment if one is due. Called at an episode's begin and after each of its steps.
     ///
     /// # Errors
-    /// [`comic_tasks::Error::Graphics`] when there is nothing to draw with, [`Error::File`] when the film cannot be
+    /// [`comic_tasks::Error::Graphics`] when OpenGL is not available, [`Error::File`] when the film cannot be
     /// written.
     pub fn shoot(&mut self, environment: &mut dyn Simulated) -> Result<(), Error> {
         if self.steps.is_multiple_of(self.every) {
@@ -124,12 +125,12 @@ impl Recorder {
         Ok(())
     }
 
-    /// Seconds that have been filmed.
+    /// Seconds filmed so far.
     pub fn seconds(&self) -> f64 {
         self.steps as f64 * self.step
     }
 
-    /// Ends the film.
+    /// Finishes the film.
     ///
     /// # Errors
     /// [`Error::File`] when it cannot be written.

@@ -1,4 +1,4 @@
-//! Who acts in which task, for films and windows.
+//! The task and the policy of a film or a window.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -15,20 +15,20 @@ use crate::checkpoint::{self, Checkpoint};
 use crate::evaluate::{Audience, Finished, Options, Start, roll_out};
 use crate::policy::TorchPolicy;
 
-/// The preset of tracking; every other task has one of its own name.
+/// The preset of tracking; every other task's preset has the task's name.
 const TRACKING_PRESET: &str = "quickstart";
 
-/// What is played, and by whom.
+/// The task, and what acts in it.
 #[derive(Args, Clone, Debug)]
 pub(super) struct Scene {
     /// The task: tracking, go-to-target, gaps, walls, get-up or ball-catch.
     #[arg(long, value_name = "TASK")]
     task: TaskName,
-    /// The clip to follow, or to start from, in place of the experiment's own: builtin:NAME, FILE.h5#CLIP.
+    /// The clip to follow or to start from, instead of the experiment's clips: builtin:NAME, FILE.h5#CLIP.
     #[arg(long, value_name = "SOURCE")]
     clip: Option<String>,
     /// The policy that acts: a run's directory, its `checkpoints`, one checkpoint, or a policy that `comic-learner export`
-    /// wrote. Without, the servo action follows a clip, and the zero action plays any other task.
+    /// wrote. Without it, the servo action follows a clip, and the zero action acts in any other task.
     #[arg(long, value_name = "DIR|FILE", visible_alias = "policy")]
     checkpoint: Option<PathBuf>,
     /// The experiment without a checkpoint: a preset's name or a TOML file; the task's own preset unless given.
@@ -38,7 +38,7 @@ pub(super) struct Scene {
     #[arg(long, value_name = "FIELD=VALUE", conflicts_with = "checkpoint")]
     set: Vec<String>,
     /// Where the first episode starts: the clip's frame, or the number of a drawn episode; the task's first unless
-    /// given. Episodes that follow start one further on.
+    /// given. Each later episode begins at the next start.
     #[arg(long, value_name = "N")]
     start: Option<usize>,
     /// The mean action and the latent's mean instead of samples.
@@ -49,7 +49,7 @@ pub(super) struct Scene {
     seed: u64,
 }
 
-/// A task, and who acts in it.
+/// A task, and what acts in it.
 pub(super) struct Cast {
     pub(super) task: Arc<dyn Task>,
     policy: Option<TorchPolicy>,
@@ -60,15 +60,15 @@ pub(super) struct Cast {
 }
 
 impl Scene {
-    /// The task that is played.
+    /// The task's name.
     pub(super) fn task(&self) -> TaskName {
         self.task
     }
 
-    /// Reads what there is to read, and builds the task.
+    /// Reads experiment, checkpoint and clips, and builds the task.
     ///
     /// # Errors
-    /// Whatever is wrong with experiment, checkpoint, clip or start.
+    /// Errors of the experiment, the checkpoint, a clip or the start.
     pub(super) fn cast(&self) -> Result<Cast, Error> {
         let (mut experiment, parameters) = self.experiment()?;
         if let Some(clip) = &self.clip {
@@ -127,7 +127,7 @@ impl Scene {
 }
 
 impl Cast {
-    /// Plays `episodes` episodes, or as many as the audience wants to see.
+    /// Rolls out `episodes` episodes, or fewer if the audience breaks.
     ///
     /// # Errors
     /// A failing forward pass, or what the audience returns.

@@ -7,7 +7,7 @@ use super::scene::Scene;
 #[cfg(not(feature = "viewer"))]
 use crate::Error;
 
-/// Shows a policy at work in MuJoCo's viewer, until its window is closed.
+/// Shows a policy in MuJoCo's viewer until the window is closed.
 #[derive(Args, Clone, Debug)]
 pub struct View {
     #[command(flatten)]
@@ -18,10 +18,10 @@ pub struct View {
 }
 
 impl View {
-    /// Shows.
+    /// Opens the window.
     ///
     /// # Errors
-    /// Whatever keeps it from that: no display, or a program that was built without the viewer.
+    /// No display, or a program that was built without the viewer.
     #[cfg(not(feature = "viewer"))]
     pub fn run(&self) -> Result<(), Error> {
         let _ = (&self.scene, &self.ghost);
@@ -47,18 +47,18 @@ mod window {
     use crate::Error;
     use crate::evaluate::Audience;
 
-    /// Episodes after which the window closes by itself: nobody looks so long.
+    /// Episodes after which the window closes by itself.
     const EPISODES: usize = 100_000;
 
     impl View {
-        /// Shows.
+        /// Opens the window.
         ///
         /// # Errors
-        /// Whatever keeps it from that: no display, or what is wrong with the scene.
+        /// No display, or errors of the scene.
         pub fn run(&self) -> Result<(), Error> {
             let mut cast = self.scene.cast()?;
             let step = Duration::from_secs_f64(cast.task.control_timestep());
-            // Only its layout counts: the episodes are played in environments of their own.
+            // The viewer needs its model only: the episodes run in other environments.
             let environment = Arc::clone(&cast.task).environment(0)?;
             let (mut viewer, screen) = Viewer::open(environment.as_ref(), self.ghost)?;
             let open = AtomicBool::new(true);
@@ -84,7 +84,7 @@ mod window {
     impl Audience<Box<dyn Simulated>> for Shown<'_> {
         fn watch(&mut self, _: usize, environment: &mut Box<dyn Simulated>) -> Result<ControlFlow<()>, Error> {
             self.screen.show(environment.as_mut());
-            // Time that was lost is not caught up with.
+            // Lost time is not made up for.
             self.due = (self.due + self.step).max(Instant::now());
             std::thread::sleep(self.due - Instant::now());
             let open = self.open.load(Ordering::Relaxed);

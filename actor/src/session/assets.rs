@@ -1,4 +1,4 @@
-//! Files the experiment needs, fetched from the learner once and kept by their SHA-256.
+//! The experiment's files, fetched from the learner once and stored under their SHA-256.
 
 use std::collections::HashMap;
 use std::io::{Read as _, Write as _};
@@ -11,14 +11,14 @@ use tempfile::NamedTempFile;
 use super::connection::{Failure, Link};
 use crate::Error;
 
-/// Where assets are kept unless told otherwise: `comic` under `XDG_CACHE_HOME` or `~/.cache`.
+/// The default directory of the asset cache: `comic` under `XDG_CACHE_HOME` or `~/.cache`.
 pub fn default_cache() -> Option<PathBuf> {
     let absolute = |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
     let base = absolute("XDG_CACHE_HOME").or_else(|| absolute("HOME").map(|home| home.join(".cache")))?;
     Some(base.join("comic"))
 }
 
-/// Makes every asset of the reply a verified file on this machine; the result goes from source to file.
+/// Makes every asset of the reply a verified file on this machine; returns the file of each source.
 pub(super) async fn fetch(link: &mut Link, cache: Option<&Path>) -> Result<HashMap<String, PathBuf>, Failure> {
     let assets = link.reply.assets.clone();
     if assets.is_empty() {
@@ -41,7 +41,7 @@ pub(super) async fn fetch(link: &mut Link, cache: Option<&Path>) -> Result<HashM
     Ok(located)
 }
 
-/// The name in the cache is the hash alone: nothing that a learner calls an asset can lead out of the directory.
+/// The name in the cache is the hash alone, so that no name from a learner can lead out of the directory.
 fn file_name(asset: &Asset) -> Result<String, Failure> {
     if asset.sha256.len() != 32 {
         return Err(broken(asset, format!("its SHA-256 has {} bytes", asset.sha256.len())));
@@ -72,7 +72,7 @@ fn is_whole(path: &Path, asset: &Asset) -> Result<bool, Error> {
     }
 }
 
-/// Writes beside the final name and renames, so that another actor on this machine sees the whole file or none.
+/// Writes to a temporary file and renames it, so that another actor on this machine sees the whole file or none.
 async fn download(link: &mut Link, asset: &Asset, directory: &Path, path: &Path) -> Result<(), Failure> {
     let local = |error| Failure::Fatal(Error::file(path)(error));
     let mut file = NamedTempFile::new_in(directory).map_err(local)?;
@@ -88,7 +88,7 @@ async fn download(link: &mut Link, asset: &Asset, directory: &Path, path: &Path)
         file.write_all(&chunk.data).map_err(local)?;
     }
     if received < asset.size {
-        // The learner went away in the middle: that is no fault of the asset.
+        // The connection was lost; the asset may be correct.
         return Err(Failure::Lost(format!("asset `{}` broke off after {received} bytes", asset.source)));
     }
     if hash.finalize()[..] != asset.sha256[..] {

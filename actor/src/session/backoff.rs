@@ -1,4 +1,4 @@
-//! Waiting before another attempt.
+//! The wait before another attempt.
 
 use std::time::Duration;
 
@@ -7,7 +7,8 @@ use rand::Rng as _;
 const FIRST: Duration = Duration::from_millis(100);
 const LONGEST: Duration = Duration::from_secs(5);
 
-/// Exponential back-off, 0.1 s to 5 s, with jitter, so that a restarted learner is not met by all actors at once.
+/// Exponential back-off, 0.1 s to 5 s, with jitter, so that not all actors
+/// reach a restarted learner at the same moment.
 #[derive(Debug)]
 pub(super) struct Backoff {
     next: Duration,
@@ -20,14 +21,14 @@ impl Default for Backoff {
 }
 
 impl Backoff {
-    /// Between half of the current delay and all of it; the delay doubles.
+    /// Between half of the current delay and the whole; the delay doubles.
     fn draw(&mut self) -> Duration {
         let delay = self.next.mul_f64(rand::rng().random_range(0.5..=1.0));
         self.next = (self.next * 2).min(LONGEST);
         delay
     }
 
-    /// Logs why, and waits.
+    /// Logs the reason, and waits.
     pub(super) async fn wait(&mut self, learner: &str, reason: &str) {
         let delay = self.draw();
         tracing::warn!(learner, again_in_seconds = delay.as_secs_f32(), "no connection to the learner: {reason}");

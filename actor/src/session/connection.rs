@@ -1,4 +1,4 @@
-//! Making a connection: TCP, HTTP/2, `Join`.
+//! Connects to the learner: TCP, HTTP/2, `Join`.
 
 use std::time::Duration;
 
@@ -13,15 +13,15 @@ use crate::Error;
 
 /// Deadline of a unary call.
 const CALL: Duration = Duration::from_secs(10);
-/// Pieces of parameters and assets are far smaller; the experiment with the names of some thousand clips fits.
+/// Room for the experiment with the names of some thousand clips. Pieces of parameters and assets are far smaller.
 const MESSAGE_LIMIT: usize = 16 << 20;
 
 /// Why there is no connection.
 #[derive(Debug)]
 pub(super) enum Failure {
-    /// Try again.
+    /// Retry.
     Lost(String),
-    /// Trying again cannot help.
+    /// A retry cannot help.
     Fatal(Error),
 }
 
@@ -31,7 +31,7 @@ impl From<Status> for Failure {
     }
 }
 
-/// A status without its metadata, and what led to it.
+/// A status with its causes and without its metadata.
 pub(super) fn describe(status: &Status) -> String {
     format!("{}: {}", status.code(), chain(status))
 }
@@ -54,12 +54,12 @@ pub(super) struct Connector {
     incarnation: u64,
     actor: Option<u64>,
     learner_epoch: Option<u64>,
-    /// Which run it belongs to.
+    /// The run that this actor belongs to.
     run: Option<u64>,
 }
 
 impl Connector {
-    /// Looks at address, certificates and token, so that what is wrong with them is said at once.
+    /// Checks address, certificates and token, so that their errors are reported at once.
     pub(super) fn new(options: &Options) -> Result<Self, Error> {
         let number = |given: Option<usize>| given.map(|number| u32::try_from(number).unwrap_or(u32::MAX));
         let connector = Self {
@@ -90,7 +90,7 @@ impl Connector {
         self.incarnation
     }
 
-    /// `acknowledged` is the number below which all were.
+    /// Connects and joins. `acknowledged` is the sequence number below which every unroll is acknowledged.
     pub(super) async fn connect(&mut self, acknowledged: u64) -> Result<Link, Failure> {
         let mut client = self.client().await?.max_decoding_message_size(MESSAGE_LIMIT);
         let mut request = Request::new(JoinRequest {
@@ -114,13 +114,13 @@ impl Connector {
             tracing::info!(actor = reply.actor, "reconnected to the learner");
         }
         self.actor = Some(reply.actor);
-        // A learner from before there were numbers of runs says 0.
+        // 0 means that the run has no number.
         self.run = Some(reply.run).filter(|run| *run != 0);
         Ok(Link { client, reply })
     }
 
     async fn client(&self) -> Result<Client, Failure> {
-        // They fitted together when this actor started: in the middle of a renewal they may not, and do a moment later.
+        // The files matched when this actor started. During a renewal they may not match for a moment.
         let renewed = |error: AccessError| Failure::Lost(chain(&error));
         let (endpoint, bearer) = (self.endpoint().map_err(renewed)?, self.access.bearer().map_err(renewed)?);
         let channel = endpoint.connect().await.map_err(|error| match self.is_barred(&error) {
@@ -130,7 +130,7 @@ impl Connector {
         Ok(LearnerClient::with_interceptor(channel, bearer))
     }
 
-    /// Whether a certificate is at fault, and was from the beginning.
+    /// Whether a certificate is refused, and this actor has never joined.
     fn is_barred(&self, error: &(dyn std::error::Error + 'static)) -> bool {
         self.actor.is_none() && distrusted(error)
     }
@@ -147,7 +147,8 @@ impl Connector {
 
     fn judge(&self, status: &Status) -> Failure {
         let message = describe(status);
-        // Who was let in once is configured rightly; a new process, or a renewed token, may be let in again.
+        // An actor that has joined before has a correct configuration. It may be accepted again, for instance with a
+        // renewed token.
         match (status.code(), self.actor) {
             (Code::Unauthenticated, None) => Failure::Fatal(self.unwelcome(status.message().to_string())),
             (

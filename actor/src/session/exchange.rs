@@ -1,4 +1,4 @@
-//! One connection's worth of unrolls, acknowledgements and parameters.
+//! Unrolls, acknowledgements and parameters over one connection.
 
 use std::sync::Arc;
 
@@ -19,7 +19,7 @@ const ACKS: usize = 64;
 /// Why an exchange is over.
 #[derive(Debug)]
 pub(super) enum Ended {
-    /// The workers are gone and everything is acknowledged.
+    /// The workers have ended and every unroll is acknowledged.
     Drained,
     /// The learner says the run is over.
     Over,
@@ -35,7 +35,7 @@ pub(super) struct Exchange<'a> {
 }
 
 impl Exchange<'_> {
-    /// Runs until the connection ends. Dropping the task set on the way out ends both streams.
+    /// Runs until the connection ends. Dropping the task set at the end closes both streams.
     pub(super) async fn run(self, link: Link, incarnation: u64) -> Ended {
         let Link { client, reply } = link;
         let actor = reply.actor;
@@ -55,11 +55,11 @@ impl Exchange<'_> {
             }
             tokio::select! {
                 Some(ack) = acks.recv() => {
-                    // Before the ticket comes back: the worker that waits for it goes on with this version or a newer.
+                    // Before the ticket is returned, so that the worker continues with this version or a newer one.
                     self.mailbox.announce(ack.learner_epoch, ack.version);
                     self.outbox.settle(&ack);
                     if ack.verdict() == Verdict::Rejoin && ack.learner_epoch != reply.learner_epoch {
-                        break Ended::Lost("the learner began another life: joining that".into());
+                        break Ended::Lost("the learner has restarted: joining again".into());
                     }
                 }
                 Ok(permit) = up.reserve(), if self.outbox.has_unsent() => {
@@ -76,7 +76,7 @@ impl Exchange<'_> {
                 }
             }
         };
-        // What was acknowledged before the end needs no sending again.
+        // Unrolls acknowledged before the end are not sent again.
         while let Ok(ack) = acks.try_recv() {
             self.mailbox.announce(ack.learner_epoch, ack.version);
             self.outbox.settle(&ack);

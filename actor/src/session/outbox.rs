@@ -1,4 +1,4 @@
-//! Unrolls that the learner has not acknowledged.
+//! Unrolls without the learner's acknowledgement.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -8,17 +8,17 @@ use tracing::Span;
 
 use crate::worker::FinishedUnroll;
 
-/// How often a refusal is logged.
+/// A refusal is logged at most once in this time.
 const REFUSAL_LOG: Duration = Duration::from_secs(60);
 
-/// How the learner answered: numbers of unrolls, and its last word.
+/// How the learner answered: numbers of unrolls, and whether the run is over.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Settled {
     /// Taken into a batch.
     pub taken: u64,
-    /// Known to the learner already: the acknowledgement was lost, not the unroll.
+    /// The learner had the unroll already; only its acknowledgement was lost.
     pub duplicate: u64,
-    /// Too old, or made under an earlier life of the learner.
+    /// Too old, or made in an earlier learner epoch or phase.
     pub stale: u64,
     /// Refused as invalid, or with a verdict this actor does not know.
     pub invalid: u64,
@@ -26,17 +26,17 @@ pub struct Settled {
     pub over: bool,
 }
 
-/// An unroll that has a number, and no answer.
+/// An unroll with a sequence number and without an answer.
 #[derive(Debug)]
 struct Waiting {
     sequence: u64,
     unroll: FinishedUnroll,
-    /// From its number to its answer, or to the session's end. The learner's log has the same incarnation and sequence number;
-    /// which actor that is may change with the learner's life.
+    /// From the sequence number to the answer, or to the session's end. The learner's log has the same incarnation and
+    /// sequence number; the actor's index may change when the learner restarts.
     span: Span,
 }
 
-/// A bounded queue in the order of sequence numbers; the front part has been sent on the current connection.
+/// A bounded queue in the order of sequence numbers; the first `sent` unrolls were sent on the current connection.
 #[derive(Debug)]
 pub(super) struct Outbox {
     window: usize,
@@ -81,17 +81,17 @@ impl Outbox {
         self.settled
     }
 
-    /// One past the last number before which everything was acknowledged.
+    /// The sequence number below which every unroll is acknowledged.
     pub(super) fn acknowledged(&self) -> u64 {
         self.waiting.front().map_or(self.next_sequence, |waiting| waiting.sequence)
     }
 
-    /// A new connection: everything is to be sent again.
+    /// At a new connection: all waiting unrolls are sent again.
     pub(super) fn rewind(&mut self) {
         self.sent = 0;
     }
 
-    /// Gives the unroll its sequence number.
+    /// Adds an unroll and gives it its sequence number.
     pub(super) fn push(&mut self, unroll: FinishedUnroll, incarnation: u64) {
         let (sequence, version, environment) = (self.next_sequence, unroll.version, unroll.environment);
         let incarnation = format_args!("{incarnation:016x}");
@@ -101,7 +101,7 @@ impl Outbox {
         self.next_sequence += 1;
     }
 
-    /// The next unroll to send, or none.
+    /// The message of the next unroll to send, if there is one.
     pub(super) fn send(&mut self, actor: u64, incarnation: u64) -> Option<UnrollMessage> {
         let Waiting { sequence, unroll, span } = self.waiting.get(self.sent)?;
         self.sent += 1;
@@ -121,14 +121,14 @@ impl Outbox {
         Some(UnrollMessage { header: Some(header), payload: unroll.payload.clone() })
     }
 
-    /// Forgets an acknowledged unroll, whatever the verdict: a refused one is not made better by sending it again.
+    /// Removes an acknowledged unroll, whatever the verdict: a refused unroll would be refused again.
     pub(super) fn settle(&mut self, ack: &UnrollAck) {
         let Ok(place) = self.waiting.binary_search_by_key(&ack.sequence, |waiting| waiting.sequence) else {
-            tracing::debug!(sequence = ack.sequence, "an acknowledgement of what is not waiting for one");
+            tracing::debug!(sequence = ack.sequence, "an acknowledgement of an unroll that does not wait for one");
             return;
         };
         if place >= self.sent {
-            tracing::warn!(sequence = ack.sequence, "an acknowledgement of what was not sent");
+            tracing::warn!(sequence = ack.sequence, "an acknowledgement of an unroll that was not sent");
             return;
         }
         if let Some(waiting) = self.waiting.remove(place) {
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_not_acknowledged_is_sent_again_in_order() {
+    fn unrolls_without_acknowledgement_are_sent_again_in_order() {
         let mut outbox = Outbox::new(8, [0; 32]);
         (0..4).for_each(|_| outbox.push(unroll(), 0));
         assert_eq!(sent(&mut outbox), [0, 1, 2, 3]);
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn acknowledgements_of_the_unknown_and_the_unsent_change_nothing() {
+    fn acknowledgements_of_unknown_and_unsent_unrolls_change_nothing() {
         let mut outbox = Outbox::new(2, [0; 32]);
         outbox.push(unroll(), 0);
         outbox.settle(&ack(0, Verdict::Taken));
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn the_window_bounds_it() {
+    fn the_window_bounds_the_queue() {
         let mut outbox = Outbox::new(2, [0; 32]);
         (0..2).for_each(|_| outbox.push(unroll(), 0));
         assert!(!outbox.has_room());

@@ -1,4 +1,4 @@
-//! Putting parameters together from the pieces they come in.
+//! Assembles parameters from the pieces in which they arrive.
 
 use bytes::{Bytes, BytesMut};
 use comic_proto::v1::{Behaviour, ParametersChunk};
@@ -6,24 +6,24 @@ use comic_proto::v1::{Behaviour, ParametersChunk};
 use crate::Error;
 use crate::mailbox::Directive;
 
-/// What a whole version says.
+/// A whole version.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Assembled {
-    /// How to act from now on.
+    /// How to act from the next unroll on.
     Act(Directive),
     /// The run is over.
     RunOver,
 }
 
-/// Assembles versions; trusts nothing it is sent.
+/// Assembles versions, and checks every piece.
 #[derive(Debug)]
 pub struct Assembler {
     limit: u64,
-    /// The version being received, and what has come of it.
+    /// The version being received, and its bytes so far.
     open: Option<(Announced, BytesMut)>,
 }
 
-/// What every piece of a version repeats.
+/// What all pieces of a version have in common.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Announced {
     learner_epoch: u64,
@@ -39,12 +39,12 @@ impl Assembler {
         Self { limit, open: None }
     }
 
-    /// Takes the next piece; returns the version that it completes.
+    /// Takes the next piece, and returns the version if this piece completes it.
     ///
-    /// A piece at offset 0 begins a version, and drops the one before it if that was not whole.
+    /// A piece at offset 0 begins a version. An incomplete version before it is dropped.
     ///
     /// # Errors
-    /// [`Error::Parameters`] for a piece that breaks the protocol; the stream is not to be trusted after it.
+    /// [`Error::Parameters`] for a piece that breaks the protocol. The stream cannot be used after that.
     pub fn push(&mut self, chunk: &ParametersChunk) -> Result<Option<Assembled>, Error> {
         let announced = Announced {
             learner_epoch: chunk.learner_epoch,
@@ -127,7 +127,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn however_a_version_is_cut_it_comes_out_whole(
+        fn a_version_is_whole_however_it_is_cut(
             payload in prop::collection::vec(any::<u8>(), 1..200),
             piece in 1_usize..64,
         ) {
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn a_newer_version_may_cut_an_older_one_short() {
+    fn a_newer_version_may_replace_an_incomplete_one() {
         let mut assembler = Assembler::new(10);
         assert_eq!(assembler.push(&chunk(1, 4, 0, b"ab")).unwrap(), None);
         assert!(matches!(assembler.push(&chunk(2, 1, 0, b"c")).unwrap(), Some(Assembled::Act(d)) if d.version == 2));

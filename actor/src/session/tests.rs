@@ -1,4 +1,4 @@
-//! The session against a learner that does what a test tells it to, over real sockets.
+//! The session with a scripted learner, over real sockets.
 
 mod learner;
 
@@ -22,7 +22,7 @@ fn options_for(learner: impl Into<String>) -> Options {
     }
 }
 
-/// An unroll that names itself by its version.
+/// An unroll whose version is its number.
 fn unroll(number: u64) -> FinishedUnroll {
     FinishedUnroll {
         payload: Bytes::from(vec![7; 100]),
@@ -60,7 +60,7 @@ async fn first_directive(mailbox: &Arc<Mailbox>) -> Arc<Directive> {
 
 #[tokio::test]
 async fn connections_dropped_in_mid_stream_lose_nothing_repeat_nothing_and_keep_the_order() {
-    // Each connection breaks after so many unrolls, some of which it took without a word.
+    // Each connection breaks after some unrolls. Some of them were taken without an acknowledgement.
     let script = Script { breaks: vec![(3, 1), (1, 1), (5, 5), (0, 0), (2, 0)], ..Script::default() };
     let learner = FakeLearner::start(script).await;
     let running = start(&learner).await;
@@ -72,7 +72,7 @@ async fn connections_dropped_in_mid_stream_lose_nothing_repeat_nothing_and_keep_
 
     let seen = learner.seen();
     assert_eq!(seen.taken, (0..40).map(|number| (number, number)).collect::<Vec<_>>(), "sequence and content");
-    // 2 + 0 + 0 + 0 + 2 were taken without an acknowledgement, and came again.
+    // 2 + 0 + 0 + 0 + 2 unrolls were taken without an acknowledgement and sent again.
     assert_eq!((settled.taken, settled.duplicate), (36, 4));
     assert_eq!(seen.joins.len(), 6);
     assert!(
@@ -81,12 +81,12 @@ async fn connections_dropped_in_mid_stream_lose_nothing_repeat_nothing_and_keep_
     );
     assert_eq!((seen.joins[0].actor, seen.joins[0].run), (None, None));
     let acknowledged: Vec<_> = seen.joins.iter().map(|join| join.acknowledged).collect();
-    assert_eq!(acknowledged, [0, 1, 2, 7, 7, 7], "as far as every number was");
+    assert_eq!(acknowledged, [0, 1, 2, 7, 7, 7], "the number below which all were acknowledged");
     assert!(seen.joins[1..].iter().all(|join| (join.actor, join.run) == (Some(learner::ACTOR), Some(learner::RUN))));
 }
 
 #[tokio::test]
-async fn an_actor_says_its_name_and_when_it_is_superseded_ends_as_one_whose_configuration_is_right() {
+async fn an_actor_sends_its_name_and_superseding_it_is_no_configuration_error() {
     let learner = FakeLearner::start(Script { superseded: true, ..Script::default() }).await;
     let options = Options { name: Some("pod-0".into()), ..options_for(learner.address()) };
     let (_stop, stopped) = watch::channel(false);
@@ -96,7 +96,7 @@ async fn an_actor_says_its_name_and_when_it_is_superseded_ends_as_one_whose_conf
 }
 
 #[tokio::test]
-async fn a_learner_in_another_life_than_the_one_that_was_joined_is_joined_again() {
+async fn an_actor_joins_a_restarted_learner_again() {
     let learner = FakeLearner::start(Script { rejoin: true, ..Script::default() }).await;
     let running = start(&learner).await;
     running.unrolls.send(unroll(0)).await.unwrap();
@@ -109,10 +109,10 @@ async fn a_learner_in_another_life_than_the_one_that_was_joined_is_joined_again(
 }
 
 #[tokio::test]
-async fn a_learner_that_acknowledges_nothing_holds_the_actor_at_its_window() {
+async fn without_acknowledgements_the_actor_stops_at_its_window() {
     let learner = FakeLearner::start(Script { silent: true, ..Script::default() }).await;
     let running = start(&learner).await;
-    // The window, one in the channel, and then no room.
+    // The window and one unroll in the channel fill all room.
     for number in 0..LIMITS.window as u64 + 1 {
         running.unrolls.send(unroll(number)).await.unwrap();
     }
@@ -122,7 +122,7 @@ async fn a_learner_that_acknowledges_nothing_holds_the_actor_at_its_window() {
 }
 
 #[tokio::test]
-async fn parameters_reach_the_mailbox_and_leaving_ends_the_session() {
+async fn parameters_reach_the_mailbox_and_the_end_of_the_run_ends_the_session() {
     let learner = FakeLearner::start(Script::default()).await;
     let running = start(&learner).await;
     learner.publish(Behaviour::Policy, 5, b"parameters in pieces");
@@ -138,7 +138,7 @@ async fn parameters_reach_the_mailbox_and_leaving_ends_the_session() {
 }
 
 #[tokio::test]
-async fn parameters_that_break_the_protocol_cost_a_connection_and_nothing_else() {
+async fn parameters_that_break_the_protocol_end_only_the_connection() {
     let learner = FakeLearner::start(Script::default()).await;
     let running = start(&learner).await;
     learner.publish(Behaviour::Policy, 5, &[1; 2000]);
@@ -149,7 +149,7 @@ async fn parameters_that_break_the_protocol_cost_a_connection_and_nothing_else()
 }
 
 #[tokio::test]
-async fn another_experiment_at_a_reconnect_is_an_error_that_a_restart_mends() {
+async fn another_experiment_at_a_reconnect_is_no_configuration_error() {
     let learner = FakeLearner::start(Script { breaks: vec![(1, 1)], ..Script::default() }).await;
     let running = start(&learner).await;
     learner.change_experiment();
@@ -160,7 +160,7 @@ async fn another_experiment_at_a_reconnect_is_an_error_that_a_restart_mends() {
 }
 
 #[tokio::test]
-async fn stopping_flushes_what_is_finished() {
+async fn stopping_sends_the_finished_unrolls() {
     let learner = FakeLearner::start(Script::default()).await;
     let running = start(&learner).await;
     for number in 0..3 {
@@ -173,7 +173,7 @@ async fn stopping_flushes_what_is_finished() {
 }
 
 #[tokio::test]
-async fn stopping_does_not_wait_for_a_learner_for_ever() {
+async fn stopping_does_not_wait_for_a_silent_learner() {
     let learner = FakeLearner::start(Script { silent: true, ..Script::default() }).await;
     let (stop, stopped) = watch::channel(false);
     let options = options_for(learner.address());
@@ -187,7 +187,7 @@ async fn stopping_does_not_wait_for_a_learner_for_ever() {
 }
 
 #[tokio::test]
-async fn a_learner_that_comes_up_later_is_waited_for() {
+async fn an_actor_waits_for_a_learner_that_starts_later() {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap();
     drop(listener);
@@ -214,13 +214,13 @@ async fn a_refusal_is_a_configuration_error_and_stopping_ends_the_wait() {
 
     let (stop, stopped) = watch::channel(false);
     stop.send_replace(true);
-    // Nobody listens at port 1.
+    // No server listens at port 1.
     let options = options_for("http://127.0.0.1:1");
     assert!(matches!(join(&options, stopped).await, Err(Error::Stopped)));
 }
 
 #[tokio::test]
-async fn an_actor_simulates_environments_that_there_are_in_lockstep_and_only_then() {
+async fn the_learner_assigns_existing_environments_in_lockstep_only() {
     let told = |lockstep, environments: Option<(u32, u32)>| async move {
         let environments = environments.map(|(first, count)| Environments { first, count });
         let learner = FakeLearner::start(Script { lockstep, environments, ..Script::default() }).await;
@@ -243,7 +243,7 @@ async fn an_actor_simulates_environments_that_there_are_in_lockstep_and_only_the
 }
 
 #[tokio::test]
-async fn an_address_that_is_none_is_refused_at_once() {
+async fn an_invalid_address_is_refused_at_once() {
     let (_stop, stopped) = watch::channel(false);
     for learner in ["host:7070", "https://host:7070", "", "http://", "not a url"] {
         let options = options_for(learner);
@@ -279,7 +279,7 @@ mod assets {
     }
 
     #[tokio::test]
-    async fn that_are_not_what_was_announced_are_refused() {
+    async fn that_differ_from_the_announcement_are_refused() {
         for sent in [b"clipz".as_slice(), b"longer than announced"] {
             let asset = Some(b"clips".to_vec());
             let learner =

@@ -1,4 +1,4 @@
-//! The law of the rows, with an environment and a policy that can be counted by hand.
+//! The rows of unrolls, with an environment and a policy that count episodes and steps.
 
 use comic_proto::{Field, UnrollShape};
 use comic_tasks::{Episode, MAX_REWARD_TERMS, Outcome, Step};
@@ -74,8 +74,8 @@ impl Environment for Counter {
     }
 }
 
-/// The mean is the parameters' first byte, the latent counts the episode's steps (z_t = z_{t−1} + 1), and so does
-/// what it remembers.
+/// The mean is the parameters' first byte. The latent counts the episode's steps (z_t = z_{t−1} + 1), and so does the
+/// recurrent state.
 #[derive(Debug, Default)]
 struct Plain {
     parameter: f32,
@@ -116,7 +116,7 @@ fn directive(version: u64, behaviour: Behaviour) -> Arc<Directive> {
     Arc::new(Directive { learner_epoch: 7, version, behaviour, parameters: Bytes::from(vec![version as u8]) })
 }
 
-/// Reads an unroll as the learner would: by the layout alone.
+/// Reads an unroll as the learner does, by the layout.
 struct Rows<'a> {
     layout: &'a UnrollLayout,
     payload: &'a [u8],
@@ -145,26 +145,26 @@ impl Rows<'_> {
 }
 
 /// `unrolls` unrolls of environments with these episode lengths; `[environment][unroll]`.
-fn record(length: usize, lanes: &[Vec<usize>], unrolls: usize) -> (Arc<UnrollLayout>, Vec<Vec<FinishedUnroll>>) {
-    record_from(0, length, lanes, unrolls)
+fn record(length: usize, environments: &[Vec<usize>], unrolls: usize) -> (Arc<UnrollLayout>, Vec<Vec<FinishedUnroll>>) {
+    record_from(0, length, environments, unrolls)
 }
 
-/// The same for environments that are numbered from `first` on.
+/// As [`record`], for environments that are numbered from `first` on.
 fn record_from(
     first: u32,
     length: usize,
-    lanes: &[Vec<usize>],
+    environments: &[Vec<usize>],
     unrolls: usize,
 ) -> (Arc<UnrollLayout>, Vec<Vec<FinishedUnroll>>) {
     let layout = layout(length);
-    let environments = lanes.iter().map(|lengths| Counter::new(lengths)).collect();
-    let mut worker = Worker::new(environments, Plain::default(), Arc::clone(&layout), 0.1, first, 3);
+    let counters = environments.iter().map(|lengths| Counter::new(lengths)).collect();
+    let mut worker = Worker::new(counters, Plain::default(), Arc::clone(&layout), 0.1, first, 3);
     worker.adopt(&directive(0, Behaviour::Policy)).unwrap();
-    let mut recorded = vec![Vec::new(); lanes.len()];
+    let mut recorded = vec![Vec::new(); environments.len()];
     for _ in 0..unrolls {
         let finished = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap();
-        for (lane, unroll) in recorded.iter_mut().zip(finished) {
-            lane.push(unroll);
+        for (own, unroll) in recorded.iter_mut().zip(finished) {
+            own.push(unroll);
         }
     }
     (layout, recorded)
@@ -185,14 +185,14 @@ fn episode_lengths() -> impl Strategy<Value = Vec<usize>> {
 }
 
 proptest! {
-    /// Whatever the lengths of episodes and unrolls: reading the valid rows in order gives every transition once.
+    /// The valid rows in order hold every transition once, for all lengths of episodes and unrolls.
     #[test]
     fn every_transition_appears_exactly_once(
         length in 1_usize..10,
-        lanes in prop::collection::vec(episode_lengths(), 1..4),
+        environments in prop::collection::vec(episode_lengths(), 1..4),
     ) {
-        let (layout, recorded) = record(length, &lanes, 8);
-        for (unrolls, lengths) in recorded.iter().zip(&lanes) {
+        let (layout, recorded) = record(length, &environments, 8);
+        for (unrolls, lengths) in recorded.iter().zip(&environments) {
             let mut expected = (1, 0);
             for unroll in unrolls {
                 let rows = Rows { layout: &layout, payload: &unroll.payload };
@@ -212,7 +212,7 @@ proptest! {
         }
     }
 
-    /// First[t+1] = 1 iff Valid[t] = 0; row 0 is first iff it is an episode's first; an invalid row carries nothing.
+    /// First[t+1] = 1 iff Valid[t] = 0; First[0] = 1 iff row 0 begins an episode; an invalid row has no reward.
     #[test]
     fn first_and_valid_mark_the_episode_boundaries(length in 1_usize..10, lengths in episode_lengths()) {
         let (layout, recorded) = record(length, std::slice::from_ref(&lengths), 8);
@@ -232,7 +232,7 @@ proptest! {
         }
     }
 
-    /// Row 0 repeats row T of the unroll before, or is a fresh episode's first where that was an episode's last.
+    /// Row 0 repeats row T of the unroll before. If that row was an episode's last, row 0 begins a new episode.
     #[test]
     fn the_next_unroll_continues(length in 1_usize..10, lengths in episode_lengths()) {
         let (layout, recorded) = record(length, std::slice::from_ref(&lengths), 8);
@@ -274,14 +274,14 @@ proptest! {
             reported.extend(unroll.episodes.iter().map(|e| (e.steps, e.steps_left_at_start, e.returns.clone())));
             prop_assert_eq!(&reported, &expected, "an episode is reported in the unroll it ends in");
             for episode in &unroll.episodes {
-                // The head is as many metres high as the episode has steps, which is its second term, too.
+                // The head's height in metres is the step's number, like the second reward term.
                 let mean = episode.returns[1] / episode.steps as f32;
                 prop_assert!((episode.head_height.unwrap() - mean).abs() < 1e-5, "{:?}", episode);
             }
         }
     }
 
-    /// An unroll is of one task: an episode of another waits for the next one, and the rows up to there are padding.
+    /// An unroll belongs to one task. An episode of another task waits for the next unroll, and padding fills the rows.
     #[test]
     fn an_unroll_belongs_to_one_task_and_padding_fills_it(
         length in 1_usize..10,
@@ -295,9 +295,9 @@ proptest! {
             let rows = Rows { layout: &layout, payload: &unroll.payload };
             let task = rows.clip(0);
             prop_assert_eq!(unroll.task, task, "each task has one clip");
-            prop_assert_eq!(rows.place(0), expected, "no step is lost and none comes twice");
-            prop_assert!(!padded || rows.one(Field::First, 0) == 1.0, "an episode that has waited begins the unroll");
-            prop_assert_eq!(rows.row(Field::State, 0), vec![expected.1 as f32; 3], "and has nothing to remember");
+            prop_assert_eq!(rows.place(0), expected, "no step is lost or repeated");
+            prop_assert!(!padded || rows.one(Field::First, 0) == 1.0, "an episode that waited begins the unroll");
+            prop_assert_eq!(rows.row(Field::State, 0), vec![expected.1 as f32; 3], "its recurrent state is zero");
             padded = false;
             for t in 0..length {
                 let ends = expected.1 == lengths[(expected.0 - 1) % lengths.len()];
@@ -329,7 +329,7 @@ proptest! {
         }
     }
 
-    /// What an unroll says is remembered at its first row is what its episode's earlier steps left, across unrolls too.
+    /// The recurrent state of an unroll's first row comes from the episode's steps before, also in earlier unrolls.
     #[test]
     fn the_state_travels_from_unroll_to_unroll_and_begins_empty(length in 1_usize..10, lengths in episode_lengths()) {
         let (layout, recorded) = record(length, &[lengths], 8);
@@ -339,24 +339,24 @@ proptest! {
         }
     }
 
-    /// Which worker an environment belongs to, and beside which others, changes nothing about its unrolls.
+    /// An environment's unrolls do not depend on its worker or on the other environments.
     #[test]
     fn an_environments_unrolls_are_its_own(
         length in 1_usize..10,
-        lanes in prop::collection::vec(episode_lengths(), 1..5),
+        environments in prop::collection::vec(episode_lengths(), 1..5),
         cut in any::<prop::sample::Index>(),
     ) {
-        let cut = cut.index(lanes.len() + 1);
-        let (_, together) = record(length, &lanes, 4);
-        let (_, mut apart) = record(length, &lanes[..cut], 4);
-        apart.extend(record_from(cut as u32, length, &lanes[cut..], 4).1);
+        let cut = cut.index(environments.len() + 1);
+        let (_, together) = record(length, &environments, 4);
+        let (_, mut apart) = record(length, &environments[..cut], 4);
+        apart.extend(record_from(cut as u32, length, &environments[cut..], 4).1);
         for (number, (one, other)) in together.iter().flatten().zip(apart.iter().flatten()).enumerate() {
             prop_assert_eq!(&one.payload, &other.payload);
             prop_assert_eq!((one.environment, other.environment), ((number / 4) as u32, (number / 4) as u32));
         }
     }
 
-    /// z_{t−1} is 0 at an episode's first step and the sampled latent afterwards, across unrolls too.
+    /// z_{t−1} is 0 at an episode's first step and the latent of the step before at all others, also across unrolls.
     #[test]
     fn the_previous_latent_follows_the_episode(length in 1_usize..10, lengths in episode_lengths()) {
         let (layout, recorded) = record(length, &[lengths], 8);
@@ -417,9 +417,9 @@ fn a_demonstration_is_the_servo_action_with_noise_and_no_latent() {
 
 #[test]
 fn a_seed_fixes_every_byte() {
-    let lanes = [vec![4, 7], vec![3]];
-    let (_, once) = record(6, &lanes, 3);
-    let (_, again) = record(6, &lanes, 3);
+    let environments = [vec![4, 7], vec![3]];
+    let (_, once) = record(6, &environments, 3);
+    let (_, again) = record(6, &environments, 3);
     for (a, b) in once.iter().flatten().zip(again.iter().flatten()) {
         assert_eq!(a.payload, b.payload);
     }

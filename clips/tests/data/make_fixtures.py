@@ -4,8 +4,8 @@
     python3 make_fixtures.py OUTPUT_DIRECTORY [SEED]        (needs h5py and numpy; the committed files have seed 1)
 
 tiny.h5: two sound V2020 clips in dm_control's layout, with its file format (superblock 0, symbol tables, shuffle +
-deflate). defects.h5: one clip per defect, its name, a sound one and a sound V2019 one; newest file format. Sound
-datasets are shared by hard links.
+deflate). defects.h5: one clip for each defect, with the defect's name, a sound clip and a sound V2019 clip, in the
+newest file format. Hard links lead to one copy of each sound dataset.
 Every number is a multiple of 1/64, so the files stay small.
 """
 

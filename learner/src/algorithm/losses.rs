@@ -92,3 +92,19 @@ impl LossValues {
         self.named.iter().all(|(_, value)| value.is_finite())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_loss_is_read_by_the_name_it_was_packed_with() {
+        let [mean, std] = [1.0f32, 2.0].map(Tensor::from);
+        let (temperatures, taken) = (Tensor::from_slice(&[3.0f32, 4.0]), Tensor::from(true));
+        let losses = Losses::pack([("kl_mean", &mean), ("kl_std", &std)], &temperatures, &taken);
+        let values = Losses::mean(&[losses]).unwrap().to_values();
+        assert_eq!([values.get("kl_mean"), values.get("kl_std")], [1.0, 2.0]);
+        assert_eq!((values.temperatures.as_slice(), values.skipped), (&[3.0, 4.0][..], 0));
+        assert!(values.get("another").is_nan());
+    }
+}

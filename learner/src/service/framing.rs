@@ -22,7 +22,7 @@
 //!
 //! # What it bought
 //! Measured by `cargo xtask bench ingest` and `publish` on two x86-64 cores, which the service shares with the actors. An
-//! unroll has 208 KB and a version 5 MB; docs/operations.md has all figures and their conditions.
+//! unroll has 208 KB and a version 5 MB; docs/benchmarks.md has all figures and their conditions.
 //!
 //! | figure | value | compared with |
 //! | --- | --- | --- |

@@ -63,7 +63,8 @@ impl Intake {
                 let _waiting = self.roster.begin_waiting(header.incarnation);
                 let insertion = self.batcher.insert(&header, payload).instrument(tracing::debug_span!("insert"));
                 let outcome = insertion.await;
-                let reason = "its accounting is not possible, or its environment has no place in the batch";
+                let reason =
+                    "its sequence number does not fit its account, or its environment has no place in the batch";
                 self.answer(&header, outcome, || reason.into())
             }
             Err(invalid) => {

@@ -1,4 +1,4 @@
-//! What one Rust file says about modules, read from its tokens: declarations, imports, and every path.
+//! Reads the tokens of one Rust file: its modules, its imports, and every path.
 
 use std::collections::BTreeSet;
 use std::iter::Peekable;
@@ -55,7 +55,7 @@ pub(super) fn read(tokens: TokenStream) -> Contents {
 }
 
 impl Contents {
-    /// `items`: the tokens are the module's items, not what stands inside one of them.
+    /// `items` says that the tokens are the module's items, and not the tokens inside an item.
     fn read(&mut self, tokens: TokenStream, items: bool) {
         let mut tokens = peekable(tokens);
         let mut attributes: Vec<TokenStream> = Vec::new();
@@ -92,7 +92,7 @@ impl Contents {
                         _ => self.read_path(&mut tokens, Path { segments: vec![name], line }),
                     }
                 }
-                // What follows `::` or `.` without a segment before it is not relative to this module.
+                // A name after `.` or a leading `::` is not relative to this module.
                 TokenTree::Punct(punct) if [':', '.'].contains(&punct.as_char()) => {
                     if punct.as_char() == '.' || colons_follow_one(&mut tokens) {
                         tokens.next_if(|next| matches!(next, TokenTree::Ident(_)));
@@ -105,7 +105,7 @@ impl Contents {
         }
     }
 
-    /// Attributes name paths also in strings, as serde's do; the string of a doc comment is text.
+    /// Attributes may hold paths in strings, as serde's do. The string of a doc comment is only text.
     fn read_attribute(&mut self, group: &Group) {
         let stream = group.stream();
         if matches!(stream.clone().into_iter().next(), Some(TokenTree::Ident(name)) if name == "doc") {
@@ -144,7 +144,7 @@ impl Contents {
         self.declared.push(Declaration { name: plain(&name.to_string()), file, body });
     }
 
-    /// One branch of a `use` tree, up to the `,` or `;` behind it. `use<'a>` in a type has no segment, and is ignored.
+    /// Reads one branch of a `use` tree up to the next `,` or `;`. `use<'a>` in a type has no segment and is ignored.
     fn read_use(&mut self, tokens: &mut Tokens, prefix: &[String]) {
         let mut segments = prefix.to_vec();
         let mut line = 0;
@@ -180,7 +180,7 @@ impl Contents {
         }
     }
 
-    /// Goes on with a path of which the first segment is read.
+    /// Reads the rest of a path after its first segment.
     fn read_path(&mut self, tokens: &mut Tokens, mut path: Path) {
         while tokens.next_if(|next| is(next, ':')).is_some() && colons_follow_one(tokens) {
             match tokens.next_if(|next| matches!(next, TokenTree::Ident(_))) {
@@ -194,7 +194,7 @@ impl Contents {
     }
 }
 
-/// Whether a second `:` follows the one that is read; it is taken.
+/// Reads the second `:` of `::`, and says whether it was there.
 fn colons_follow_one(tokens: &mut Tokens) -> bool {
     tokens.next_if(|next| is(next, ':')).is_some()
 }
@@ -206,7 +206,7 @@ fn bracketed(tokens: &mut Tokens) -> Option<Group> {
     }
 }
 
-/// An item ends with a `;`, or with its braces; those of a `use` have a `;` behind them, which does no harm.
+/// Reads to the end of an item: a `;`, or braces. The braces of a `use` tree also end it; the `;` that is left has no effect.
 fn skip_item(tokens: &mut Tokens) {
     for token in tokens.by_ref() {
         if is(&token, ';') || is_group(&token, Delimiter::Brace) {

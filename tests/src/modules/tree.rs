@@ -45,7 +45,7 @@ impl Tree {
         Ok(tree)
     }
 
-    /// `directory` is where the files of the module's children lie.
+    /// `directory` holds the files of the module's children.
     fn add(
         &mut self,
         parent: Option<Id>,
@@ -79,7 +79,7 @@ impl Tree {
         Ok(id)
     }
 
-    /// Whether `ancestor` holds `module`, at any depth.
+    /// Whether `ancestor` contains `module`, at any depth.
     pub(super) fn holds(&self, ancestor: Id, module: Id) -> bool {
         let mut at = self.modules[module].parent;
         while let Some(id) = at {
@@ -91,7 +91,7 @@ impl Tree {
         false
     }
 
-    /// Every edge between two modules, by the first line that makes it.
+    /// Every edge between two modules, with its first line.
     pub(super) fn edges(&self) -> Vec<Edge> {
         let mut first: BTreeMap<(Id, Id), usize> = BTreeMap::new();
         for (from, module) in self.modules.iter().enumerate() {
@@ -128,8 +128,8 @@ impl Tree {
         }
     }
 
-    /// What a module says in the name of another one is the other's only where the user knows the first one anyway, since it
-    /// is inside: else every module that takes something from a folder would miss the folder.
+    /// A re-export in a module that encloses the user leads to the module with the item. A re-export in any other module
+    /// leads only to that module, since the user depends on it.
     fn descend(&self, user: Id, at: Id, segments: &[String], steps: usize) -> Option<Id> {
         let Some((first, rest)) = segments.split_first() else { return Some(at) };
         if let Some(child) = self.modules[at].children.get(first) {
@@ -158,7 +158,7 @@ impl Tree {
         })
     }
 
-    /// Where an edge is made, as `path:line`.
+    /// The place of an edge, as `path:line`.
     pub(super) fn place(&self, edge: &Edge) -> String {
         format!("{}:{}", self.modules[edge.from].file, edge.line)
     }

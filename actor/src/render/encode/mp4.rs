@@ -13,51 +13,51 @@ use super::Encoder;
 use crate::Error;
 
 const PROGRAM: &str = "ffmpeg";
-/// Bytes of its complaints that are passed on.
+/// Bytes of its error messages that are shown.
 const LONGEST_COMPLAINT: u64 = 4096;
 
-/// A running ffmpeg; dropped before its end, it is stopped.
+/// A running ffmpeg; it is stopped when this is dropped.
 #[derive(Debug)]
 pub(super) struct Mp4 {
     child: Child,
-    /// What it says of errors.
-    complaints: File,
+    /// Its error messages.
+    messages: File,
 }
 
 impl Mp4 {
     pub(super) fn new(out: &Path, size: Size, frame_time: Duration) -> Result<Self, Error> {
         let program = find(&std::env::var_os("PATH").unwrap_or_default())?;
-        // A file, not a pipe: one that nobody drains would stop it, and the film with it.
-        let complaints = tempfile::tempfile().map_err(Error::file(PROGRAM))?;
+        // A file, not a pipe: a full pipe would block ffmpeg.
+        let messages = tempfile::tempfile().map_err(Error::file(PROGRAM))?;
         let child = Command::new(&program)
             .args(["-hide_banner", "-loglevel", "error", "-y"])
             .args(["-f", "rawvideo", "-pix_fmt", "rgb24"])
             .args(["-video_size", &format!("{}x{}", size.width(), size.height())])
             .args(["-framerate", &format!("1000000/{}", frame_time.as_micros().max(1))])
             .args(["-i", "-"])
-            // Players want pixels of half the colours' resolution, for which width and height must be even.
+            // Players need yuv420p, for which width and height must be even.
             .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-movflags", "+faststart"])
             .args(["-f", "mp4"])
             .arg(out)
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
-            .stderr(complaints.try_clone().map_err(Error::file(PROGRAM))?)
+            .stderr(messages.try_clone().map_err(Error::file(PROGRAM))?)
             .spawn()
             .map_err(Error::file(program))?;
-        Ok(Self { child, complaints })
+        Ok(Self { child, messages })
     }
 
-    /// Waits for ffmpeg's end, and says what it had to say if it failed.
+    /// Waits for ffmpeg's end; an error has its messages.
     fn end(&mut self) -> io::Result<()> {
         drop(self.child.stdin.take());
         let status = self.child.wait()?;
         if status.success() {
             return Ok(());
         }
-        let mut complaint = String::new();
-        self.complaints.rewind()?;
-        (&self.complaints).take(LONGEST_COMPLAINT).read_to_string(&mut complaint)?;
-        Err(io::Error::other(format!("{PROGRAM} failed ({status}): {}", complaint.trim())))
+        let mut message = String::new();
+        self.messages.rewind()?;
+        (&self.messages).take(LONGEST_COMPLAINT).read_to_string(&mut message)?;
+        Err(io::Error::other(format!("{PROGRAM} failed ({status}): {}", message.trim())))
     }
 }
 
@@ -65,7 +65,7 @@ impl Encoder for Mp4 {
     fn frame(&mut self, picture: &[u8]) -> io::Result<()> {
         let Some(pipe) = &mut self.child.stdin else { return Ok(()) };
         match pipe.write_all(picture) {
-            // It has ended before its time: its own words say more than a broken pipe.
+            // ffmpeg has ended early: its messages say more than a broken pipe.
             Err(error) if error.kind() == io::ErrorKind::BrokenPipe => self.end().and(Err(error)),
             written => written,
         }
@@ -78,7 +78,7 @@ impl Encoder for Mp4 {
 
 impl Drop for Mp4 {
     fn drop(&mut self) {
-        // Nothing happens to one that has been waited for.
+        // This does nothing after a wait.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

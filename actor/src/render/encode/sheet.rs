@@ -1,4 +1,4 @@
-//! A contact sheet: frames of a whole film beside one another, in one PNG.
+//! A contact sheet: frames of a whole film side by side, in one PNG.
 
 use std::fs::File;
 use std::io::{self, BufWriter};
@@ -7,13 +7,13 @@ use comic_tasks::film::Size;
 
 use super::{Encoder, written};
 
-/// The most frames beside one another, and below.
+/// Most columns and rows.
 const COLUMNS: usize = 4;
 const ROWS: usize = 3;
 const TILES: usize = COLUMNS * ROWS;
 
-/// Keeps every n-th frame. When there are twice as many as the sheet has tiles, n doubles and every other one goes: so
-/// many are kept, however long the film.
+/// Keeps every n-th frame. When there are twice as many as the sheet has tiles, n doubles and every other frame is
+/// dropped, so that memory is bounded for films of any length.
 pub(super) struct Sheet {
     file: File,
     size: Size,
@@ -32,7 +32,7 @@ impl Sheet {
         self.kept.len()
     }
 
-    /// As many tiles as fit, evenly over the film.
+    /// As many tiles as fit, evenly spread over the film.
     pub(super) fn tiles(&self) -> Vec<&[u8]> {
         let count = self.kept.len().min(TILES);
         let place = |tile: usize| tile * (self.kept.len() - 1) / (count - 1).max(1);
@@ -48,7 +48,7 @@ impl Encoder for Sheet {
                 self.kept.retain(|_| place.next().is_some_and(|place: usize| place.is_multiple_of(2)));
                 self.every *= 2;
             }
-            // After the doubling this frame's turn may have passed.
+            // After the doubling this frame may not be kept.
             if self.seen.is_multiple_of(self.every) {
                 self.kept.push(picture.to_vec());
             }

@@ -2,7 +2,7 @@ use std::ffi::OsStr;
 
 use super::*;
 
-/// A picture of one colour, `frame`'s own.
+/// A picture of one colour, which depends on `frame`.
 fn picture(size: Size, frame: u8) -> Vec<u8> {
     let colour = [20 * frame, 100, 255 - 20 * frame];
     colour.into_iter().cycle().take(size.bytes()).collect()
@@ -110,7 +110,7 @@ fn a_missing_ffmpeg_is_named_with_what_helps() {
 }
 
 #[test]
-fn a_film_that_is_given_up_leaves_nothing() {
+fn a_film_that_is_not_finished_leaves_no_file() {
     let directory = tempfile::tempdir().unwrap();
     let size = Size::new(16, 16).unwrap();
     let mut movie = Movie::create(&directory.path().join("film.gif"), size, Duration::from_millis(30)).unwrap();

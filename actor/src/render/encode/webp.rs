@@ -1,5 +1,5 @@
-//! Animated WebP without loss: each frame is a still image of the `image-webp` crate, which writes no animations; the
-//! container around them is here (WebP Container Specification, "Animation").
+//! Animated WebP without loss: each frame is a still image of the `image-webp` crate, which writes no animations; this
+//! file writes the container around them (WebP Container Specification, "Animation").
 
 use std::fs::File;
 use std::io::{self, BufWriter, Seek as _, SeekFrom, Write as _};
@@ -10,11 +10,11 @@ use image_webp::{ColorType, WebPEncoder};
 
 use super::{Clock, Encoder, written};
 
-/// `RIFF`, the file's size, `WEBP`: what stands before the chunks of a file.
+/// Bytes before the chunks of a file: `RIFF`, the file's size, `WEBP`.
 const HEADER: usize = 12;
 /// Flag of `VP8X`: the file is an animation.
 const ANIMATION: u8 = 0b10;
-/// Flag of `ANMF`: the frame replaces what is there.
+/// Flag of `ANMF`: the frame replaces the one before.
 const NO_BLENDING: u8 = 0b10;
 /// Bytes of `ANMF` before the image's own chunks.
 const FRAME_HEADER: u32 = 16;
@@ -28,12 +28,12 @@ pub(super) struct WebP {
 impl WebP {
     pub(super) fn new(file: File, size: Size, frame_time: Duration) -> io::Result<Self> {
         let mut writer = BufWriter::new(file);
-        // The size of the whole is known at the end.
+        // The file's size is written at the end.
         writer.write_all(b"RIFF\0\0\0\0WEBP")?;
         writer.write_all(b"VP8X\x0a\0\0\0")?;
         writer.write_all(&[ANIMATION, 0, 0, 0])?;
         writer.write_all(&canvas(size))?;
-        // A black background, and frames that come again without end.
+        // A black background, and endless repetition.
         writer.write_all(b"ANIM\x06\0\0\0\0\0\0\xff\0\0")?;
         Ok(Self { writer, size, clock: Clock::new(frame_time, Duration::from_millis(1)) })
     }

@@ -1,4 +1,4 @@
-//! A learner without learning.
+//! A scripted learner.
 
 use std::collections::HashSet;
 use std::pin::Pin;
@@ -17,37 +17,37 @@ use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
 use tonic::{Request, Response, Status, Streaming};
 
 pub(super) const ACTOR: u64 = 3;
-/// Which run it is.
+/// The number of its run.
 pub(super) const RUN: u64 = 8;
 /// Bytes of parameters or assets in a message.
 const PIECE: usize = 7;
 
-/// What this learner does that others do not.
+/// How this learner differs from a real one.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Script {
-    /// Connection k breaks after it took so many unrolls, of which it acknowledged so many.
+    /// For connection k: the number of unrolls it takes before it breaks, and how many of them it acknowledges.
     pub(super) breaks: Vec<(usize, usize)>,
-    /// Takes and never acknowledges.
+    /// Takes unrolls and never acknowledges them.
     pub(super) silent: bool,
-    /// The first unroll was made under another life of the learner.
+    /// Answers the first unroll as one of another learner epoch.
     pub(super) rejoin: bool,
     pub(super) refuse: bool,
-    /// Somebody newer is there.
+    /// A newer process of the same name has joined.
     pub(super) superseded: bool,
     pub(super) wrong_layout: bool,
-    /// What it has the actor simulate in lockstep.
+    /// The environments that it assigns to the actor in lockstep.
     pub(super) environments: Option<Environments>,
     pub(super) lockstep: bool,
     pub(super) asset: Option<Vec<u8>>,
-    /// What comes in the asset's place.
+    /// Bytes that it sends instead of the asset.
     pub(super) asset_sent: Option<Vec<u8>>,
 }
 
-/// What it saw.
+/// What this learner received.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Seen {
     pub(super) joins: Vec<JoinRequest>,
-    /// Sequence and version of each unroll, the first time it came.
+    /// Sequence number and version of each unroll at its first arrival.
     pub(super) taken: Vec<(u64, u64)>,
     pub(super) assets: usize,
 }
@@ -130,7 +130,7 @@ impl FakeLearner {
         self.inner.parameters.send_replace(pieces);
     }
 
-    /// Takes an unroll once.
+    /// Takes an unroll; the second time it is a duplicate.
     fn take(&self, header: &UnrollHeader) -> Verdict {
         if !self.inner.numbers.lock().unwrap().insert(header.sequence) {
             return Verdict::Duplicate;

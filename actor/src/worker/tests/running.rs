@@ -1,4 +1,4 @@
-//! A worker that runs: what it waits for, and what ends it.
+//! The running worker: what it waits for, and what ends it.
 
 use super::*;
 
@@ -15,14 +15,14 @@ fn in_lockstep_a_version_makes_one_unroll_of_every_environment() {
             parameters: Bytes::from_static(b"1"),
         });
     };
-    // There is room for more, if the worker made more.
+    // The channel has room for more unrolls than the worker makes.
     let (sender, mut receiver) = mpsc::channel(16);
     std::thread::scope(|scope| {
         let running = scope.spawn(|| {
             let sender = sender;
             worker.run(Pace::Lockstep, &mailbox, &sender, &Progress::default())
         });
-        // What is published again is no new version, and a restarted learner's first one is.
+        // The same version again is not new; the first version of a restarted learner is.
         for (learner_epoch, version) in [(1, 1), (1, 2), (2, 1)] {
             publish(learner_epoch, version);
             for environment in 0..2 {
@@ -34,7 +34,7 @@ fn in_lockstep_a_version_makes_one_unroll_of_every_environment() {
         }
         mailbox.close();
         running.join().unwrap().unwrap();
-        assert!(receiver.blocking_recv().is_none(), "nothing was made beyond that");
+        assert!(receiver.blocking_recv().is_none(), "the worker made too many unrolls");
     });
 }
 
@@ -59,10 +59,10 @@ fn a_closed_mailbox_ends_the_worker_and_a_full_channel_holds_it() {
         for _ in 0..3 {
             receiver.blocking_recv().unwrap();
         }
-        // At most one unroll waits in the channel and one in the worker's hand: it cannot have run ahead further.
+        // At most one unroll waits in the channel, and the worker holds one.
         assert!(progress.steps.load(Ordering::Relaxed) <= 4 * 5);
         mailbox.close();
-        // What waits in the channel is given up, and its tickets with it.
+        // The waiting unrolls are dropped together with their tickets.
         drop(receiver);
         running.join().unwrap().unwrap();
     });
