@@ -35,7 +35,7 @@ impl Manual {
             clap_complete::generate(shell, &mut command, &program, &mut script);
             fs::write(directory.join(name.replace("{}", &program)), script)?;
         }
-        clap_mangen::generate_to(command, self.directory("man/man1")?)
+        clap_mangen::generate_to(without_help(command), self.directory("man/man1")?)
     }
 
     /// The directory `path` below `out`, which is made if it does not exist.
@@ -44,6 +44,11 @@ impl Manual {
         fs::create_dir_all(&directory)?;
         Ok(directory)
     }
+}
+
+/// `command` without the subcommand `help`, which would have a page for every other page.
+fn without_help(command: Command) -> Command {
+    command.disable_help_subcommand(true).mut_subcommands(without_help)
 }
 
 #[cfg(test)]
@@ -69,5 +74,7 @@ mod tests {
             let written = fs::read_to_string(directory.path().join(file)).unwrap();
             assert!(written.contains(text), "{file} has no {text}");
         }
+        let pages = fs::read_dir(directory.path().join("man/man1")).unwrap().count();
+        assert_eq!(pages, 2, "the subcommand `help` has no page");
     }
 }

@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use comic_experiment::{Experiment, TaskSpec};
 use comic_fuzz::{experiment, layout, seed, spec};
+use comic_learner::algorithm::Algorithm as _;
 use comic_learner::checkpoint::{Name, Snapshot, Store, read};
 use comic_learner::tensors;
 use comic_learner::train::statistics::ObservationStatistics;
