@@ -44,7 +44,7 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Vec<(String, Tensor)>> {
             Dtype::F32 => Kind::Float,
             Dtype::F64 => Kind::Double,
             Dtype::I64 => Kind::Int64,
-            other => return Err(unknown_kind(&name, other)),
+            other => return Err(unknown_kind(name, other)),
         };
         let shape: Vec<i64> = view.shape().iter().map(|size| *size as i64).collect();
         named.push((name.to_string(), Tensor::f_from_data_size(view.data(), &shape, kind)?));

@@ -9,6 +9,7 @@
 mod source;
 mod tree;
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
 
@@ -113,8 +114,8 @@ fn shortest<'a>(edges: &[&'a Edge], from: Id, to: Id) -> Option<Vec<&'a Edge>> {
             return Some(chain);
         }
         for edge in edges.iter().filter(|edge| edge.from == at) {
-            if !chains.contains_key(&edge.to) {
-                chains.insert(edge.to, [chain.as_slice(), &[*edge]].concat());
+            if let Entry::Vacant(unseen) = chains.entry(edge.to) {
+                unseen.insert([chain.as_slice(), &[*edge]].concat());
                 waiting.push_back(edge.to);
             }
         }
