@@ -135,7 +135,7 @@ fn the_error_of_an_unknown_name_lists_the_nearest_and_all_names() {
 #[test]
 fn a_builtin_clip_takes_neither_subset_nor_ids() {
     let source = ClipSource { subset: Some("walk_tiny".into()), ..ClipSource::whole("builtin:walk") };
-    assert_eq!(refused(source), "builtin:walk: a built-in clip is a single clip, and has neither subset nor ids");
+    assert_eq!(refused(source), "builtin:walk: a built-in clip is a single clip and has neither subset nor ids");
     let message = refused(with_ids("builtin:walk", &["CMU_007_01"]));
     assert!(message.contains("neither subset nor ids"), "{message}");
 }

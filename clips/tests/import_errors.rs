@@ -60,7 +60,7 @@ fn a_truncated_recording_is_recognised_by_its_missing_bones() {
     let directory = tempfile::tempdir().unwrap();
     let cut = |text: String| text[..text.rfind("\nlfemur").unwrap() + 1].to_string();
     let message = changed(directory.path(), same, cut).unwrap_err();
-    assert!(message.contains("has other bones than the first (they differ in lfemur"), "{message}");
+    assert!(message.contains("has other bones than the first frame (they differ in lfemur"), "{message}");
     assert!(message.ends_with("is the file complete?"), "{message}");
 }
 

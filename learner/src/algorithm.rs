@@ -6,7 +6,7 @@
 //! # Layout
 //! - [`minibatch`]: unrolls as tensors, batch first, with the numbers of rows without a transition blanked. [`shape`] is
 //!   their sizes.
-//! - [`losses`]: what a gradient step reports, by name, read from the device once.
+//! - [`loss_report`]: what a gradient step reports, by name, read from the device once.
 //! - [`error`]: what an algorithm refuses.
 //!
 //! # A second algorithm
@@ -15,7 +15,7 @@
 //! name, so they reach the metrics without another list.
 
 pub mod error;
-pub mod losses;
+pub mod loss_report;
 pub mod minibatch;
 pub mod shape;
 
@@ -25,7 +25,7 @@ use comic_networks::NormaliserStatistics;
 use tch::Tensor;
 
 use crate::algorithm::error::Error;
-use crate::algorithm::losses::Losses;
+use crate::algorithm::loss_report::Losses;
 use crate::algorithm::minibatch::MinibatchTensors;
 
 /// Networks and their optimiser, changed one gradient step at a time.

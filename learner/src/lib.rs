@@ -11,7 +11,7 @@
 //! - [`observe`] is what people and Prometheus see of a run: metrics, telemetry and probes.
 //! - [`commands`] are the commands besides serving and training. [`options`] is the whole command line, and [`document`] its
 //!   arguments for the experiment.
-//! - [`error`] is the one error type, which also decides the exit code. `log_limiter` keeps faulty peers from flooding the log.
+//! - [`error`] is the one error type; `exit_code` decides the exit code by it. `log_limiter` keeps faulty peers from flooding the log.
 //!
 //! The learner does not link MuJoCo: actors do everything that needs a simulator.
 
@@ -22,6 +22,7 @@ pub mod commands;
 pub mod device;
 pub mod document;
 pub mod error;
+mod exit_code;
 mod log_limiter;
 pub mod observe;
 pub mod options;

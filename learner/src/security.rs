@@ -5,7 +5,7 @@
 //!   renewed without a restart.
 //! - [`ConnectionLimits`] is how much of the learner all peers together may use.
 
-mod limits;
+mod limit_arguments;
 mod tls;
 mod tokens;
 mod watched;
@@ -17,7 +17,7 @@ use clap::Args;
 
 use crate::error::{Error, Result};
 
-pub use limits::ConnectionLimits;
+pub use limit_arguments::ConnectionLimits;
 pub use tls::Tls;
 pub use tokens::Tokens;
 

@@ -9,7 +9,7 @@ use std::sync::OnceLock;
 
 use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
 use comic_learner::algorithm::Algorithm as _;
-use comic_learner::algorithm::losses::{LossValues, Losses};
+use comic_learner::algorithm::loss_report::{LossValues, Losses};
 use comic_learner::device::Backend;
 use comic_learner::vmpo::VmpoLearner;
 use tch::Device;

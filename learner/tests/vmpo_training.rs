@@ -7,7 +7,7 @@ mod vmpo_support;
 use comic_experiment::{Experiment, Prior};
 use comic_learner::algorithm::Algorithm as _;
 use comic_learner::algorithm::error::Error;
-use comic_learner::algorithm::losses::Losses;
+use comic_learner::algorithm::loss_report::Losses;
 use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::vmpo::VmpoLearner;
 use comic_proto::Field;

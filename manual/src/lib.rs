@@ -29,13 +29,15 @@ impl Manual {
     /// A directory that cannot be written.
     pub fn write(&self, mut command: Command) -> io::Result<()> {
         let program = command.get_name().to_owned();
+        // Before `generate`, which adds the subcommand `help`.
+        let pages = without_help(command.clone());
         for (shell, directory, name) in COMPLETIONS {
             let directory = self.directory(directory)?;
             let mut script = Vec::new();
             clap_complete::generate(shell, &mut command, &program, &mut script);
             fs::write(directory.join(name.replace("{}", &program)), script)?;
         }
-        clap_mangen::generate_to(without_help(command), self.directory("man/man1")?)
+        clap_mangen::generate_to(pages, self.directory("man/man1")?)
     }
 
     /// The directory `path` below `out`, which is made if it does not exist.

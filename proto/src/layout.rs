@@ -1,4 +1,4 @@
-//! The position of each field of an unroll in the payload.
+//! The position of each field of an unroll in the payload. The order is that of [`Field::ALL`].
 
 use std::fmt::Write as _;
 use std::ops::Range;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::accounting::TaskAccounting;
+use crate::counts::TaskAccounting;
 
 /// The tasks of a run with their accounting, in the order of the task indices in the headers of unrolls.
 #[derive(Clone, Debug, Default)]

@@ -2,7 +2,7 @@
 //!
 //! # Layout
 //! - [`Task`] is what all environments of a process share, and [`Environment`] is one simulation of it. [`build`] makes the
-//!   task of an experiment (`registry.rs`). Acting needs nothing else.
+//!   task of an experiment (`build_task.rs`). Acting needs nothing else.
 //! - `tracking/` follows clips: [`TrackingTask`] and [`TrackingEnvironment`].
 //! - `rules/` has all other tasks. Each is one file of rules: how an episode begins, the reward of a step, and when the
 //!   humanoid fails. One environment plays the rules of any task. [`comparison`] replays recorded episodes of dm_control.
@@ -16,22 +16,22 @@
 
 mod arenas;
 mod assets;
+mod build_task;
 mod environment;
 mod error;
 pub mod humanoid;
 mod joint;
 mod physics;
 pub mod raw_physics;
-mod registry;
 mod rendering;
 mod rules;
 mod silence;
 mod tracking;
 
+pub use build_task::build;
 pub use environment::{ClipStarts, Environment, Episode, MAX_REWARD_TERMS, Outcome, Scenery, Simulated, Step, Task};
 pub use error::Error;
 pub use physics::Simulation;
-pub use registry::build;
 pub use rendering::ghost::Ghost;
 #[cfg(feature = "viewer")]
 pub use rendering::viewer;

@@ -117,7 +117,7 @@ impl Project {
                 Ok(status) => {
                     ensure!(
                         balance_of_json(&status["accounting"]),
-                        "{what}: the accounting do not balance: {}",
+                        "{what}: the accounting does not balance: {}",
                         status["accounting"]
                     );
                     if condition(&status) {

@@ -51,7 +51,7 @@ pub enum Error {
 impl From<Error> for crate::error::Error {
     fn from(error: Error) -> Self {
         match error {
-            Error::Torch(error) => Self::Torch(error),
+            Error::Torch(error) | Error::State(StateError::Torch(error)) => Self::Torch(error),
             Error::Networks(error) => Self::Networks(error),
             error => Self::Update(Box::new(error)),
         }

@@ -229,6 +229,8 @@ impl Store {
 fn is_damage(error: &Error) -> bool {
     match error {
         Error::File { source, .. } => source.kind() == ErrorKind::NotFound,
+        Error::Within { source, .. } => is_damage(source),
+        Error::System { .. } => false,
         _ => true,
     }
 }
@@ -253,6 +255,8 @@ mod tests {
         let torch = || tch::TchError::Torch("out of memory".into());
         assert_eq!(failed(torch().into()).exit_code(), 1);
         assert_eq!(failed(crate::algorithm::error::Error::from(torch()).into()).exit_code(), 1);
+        let state = crate::algorithm::error::Error::from(crate::adam::StateError::from(torch()));
+        assert_eq!(failed(state.into()).exit_code(), 1);
         assert_eq!(failed(Error::Checkpoint("the checkpoint does not fit".into())).exit_code(), 2);
     }
 

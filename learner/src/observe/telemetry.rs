@@ -194,7 +194,7 @@ impl Default for Telemetry {
             connections_refused: all.labelled(
                 "counter",
                 ("comic_connections_refused", "reason"),
-                &["per_address", "in_all", "tls"],
+                &["per_address", "total", "tls"],
                 "Connections closed at once: beyond --max-connections-per-address, beyond the limit on all connections, or without agreement on TLS",
             ),
             requests: all.gauge("comic_requests", "Calls in flight, streams included"),

@@ -10,10 +10,10 @@ use tokio::net::TcpListener;
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 
-use super::acceptor::Acceptor;
 use super::admission::AdmissionLayer;
 use super::assembly::Service;
 use super::calls::Calls;
+use super::connections::Acceptor;
 use super::framing::router::Router;
 use super::http2::server;
 use crate::error::{Error, Result};

@@ -9,7 +9,7 @@ use comic_proto::v1::{EpisodeEnd, UnrollHeader};
 use comic_replay::{AccountingByTask, Batch};
 use serde_json::{Map, Value, json};
 
-use crate::algorithm::losses::{LossValues, Losses};
+use crate::algorithm::loss_report::{LossValues, Losses};
 use crate::checkpoint::Evaluated;
 use crate::checkpoint::progress::Progress;
 use crate::error::Result;

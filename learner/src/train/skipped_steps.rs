@@ -1,6 +1,6 @@
 //! Gradient steps that were skipped, because a loss or a gradient was not finite, and how training recovers.
 
-use crate::algorithm::losses::LossValues;
+use crate::algorithm::loss_report::LossValues;
 use crate::log_limiter::LogLimiter;
 
 /// The remedies that an operator is told when training gives up.

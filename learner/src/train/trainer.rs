@@ -6,7 +6,7 @@ use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::v1::Behaviour;
 use comic_replay::{Batch, Batcher, Next, Reason};
 
-use crate::algorithm::losses::{LossValues, Losses};
+use crate::algorithm::loss_report::{LossValues, Losses};
 use crate::algorithm::minibatch::MinibatchTensors;
 use crate::checkpoint::{Name, Snapshot, incompatible};
 use crate::device::Backend;

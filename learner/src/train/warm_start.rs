@@ -8,7 +8,7 @@ use rand::seq::index::sample;
 use tch::Device;
 
 use crate::algorithm::Algorithm;
-use crate::algorithm::losses::Losses;
+use crate::algorithm::loss_report::Losses;
 use crate::algorithm::minibatch::MinibatchTensors;
 use crate::error::Result;
 use crate::train::minibatches::masked_to_device;

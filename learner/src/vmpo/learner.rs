@@ -8,7 +8,7 @@ use tch::{Device, Kind, Tensor, nn};
 use crate::adam::{self, Adam};
 use crate::algorithm::Algorithm;
 use crate::algorithm::error::Error;
-use crate::algorithm::losses::Losses;
+use crate::algorithm::loss_report::Losses;
 use crate::algorithm::minibatch::MinibatchTensors;
 use crate::algorithm::shape::MinibatchShape;
 use crate::vmpo::improvement::{Evidence, KlLimits, masked_mean, policy_improvement};

@@ -3,7 +3,7 @@
 use comic_networks::{Acting, ActionDistribution};
 use tch::{Kind, Tensor};
 
-use crate::algorithm::losses::Losses;
+use crate::algorithm::loss_report::Losses;
 use crate::vmpo::improvement::{Improvement, masked_mean};
 use crate::vmpo::multipliers::Multipliers;
 

@@ -30,11 +30,11 @@ use super::interface::{Rules, Verdict};
 use super::poses::Poses;
 use super::stage::{Arena, Part, Stage};
 use crate::arenas::floor;
+use crate::build_task::{BuildTask, Context};
 use crate::environment::{MAX_REWARD_TERMS, Task};
 use crate::error::Error;
 use crate::humanoid;
 use crate::humanoid::observation::{Number, fill};
-use crate::registry::{BuildTask, Context};
 
 /// Gravity, m/s² (MuJoCo's default).
 const GRAVITY: f64 = 9.81;

@@ -11,10 +11,10 @@ use super::corridor::{CorridorRules, Obstacles};
 use super::environment::RuledTask;
 use super::poses::Poses;
 use crate::arenas::corridor::{self, Block, Extent};
+use crate::build_task::{BuildTask, Context};
 use crate::environment::Task;
 use crate::error::Error;
 use crate::humanoid;
-use crate::registry::{BuildTask, Context};
 
 impl BuildTask for Gaps {
     fn build(&self, context: &Context<'_>) -> Result<Arc<dyn Task>, Error> {

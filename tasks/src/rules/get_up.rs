@@ -27,12 +27,12 @@ use super::interface::{Rules, Verdict};
 use super::poses::{Pose, Poses, UP};
 use super::stage::{Arena, CONTROL_TIMESTEP, Part, Stage};
 use crate::arenas::floor;
+use crate::build_task::{BuildTask, Context};
 use crate::environment::Task;
 use crate::error::Error;
 use crate::humanoid;
 use crate::humanoid::observation::{Number, fill};
 use crate::physics::is_healthy;
-use crate::registry::{BuildTask, Context};
 
 /// Standard deviation of the joints of a pose that is dropped, rad.
 const DROPPED_JOINTS: f64 = 0.3;

@@ -13,11 +13,11 @@ use super::interface::{Recorded, Rules, Verdict};
 use super::poses::{Poses, UP};
 use super::stage::{Arena, Stage};
 use crate::arenas::floor;
+use crate::build_task::{BuildTask, Context};
 use crate::environment::Task;
 use crate::error::Error;
 use crate::humanoid;
 use crate::humanoid::observation::{Number, fill};
-use crate::registry::{BuildTask, Context};
 
 /// The rules of go-to-target.
 #[derive(Debug)]

@@ -12,11 +12,11 @@ use super::observation::{Observation, View};
 use super::reference::Reference;
 use super::reward;
 use super::task::TrackingTask;
+use crate::build_task::{BuildTask, Context};
 use crate::environment::{ClipStarts, Environment, Episode, Outcome, Scenery, Simulated, Step, Task, control};
 use crate::error::Error;
 use crate::humanoid::observation::Body;
 use crate::physics::{Data, Simulation, is_healthy};
-use crate::registry::{BuildTask, Context};
 
 impl BuildTask for Tracking {
     fn build(&self, context: &Context<'_>) -> Result<Arc<dyn Task>, Error> {

@@ -93,7 +93,7 @@ impl Acceptor {
         let mut open = self.open.lock();
         let taken = open.by_address.get(&address).copied().unwrap_or_default();
         let reason = if open.total >= self.total {
-            "in_all"
+            "total"
         } else if taken >= self.per_address {
             "per_address"
         } else {
