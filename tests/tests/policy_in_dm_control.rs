@@ -162,5 +162,8 @@ async fn a_file_that_is_no_policy_is_refused_and_the_error_names_the_remedy() ->
         let refused = refused.context("exported")?.to_string();
         ensure!(refused.contains(remedy), "{part} to {out}: {refused}");
     }
+    let absent = export(&directory.path().join("absent"), "policy", &directory.path().join("policy.safetensors"));
+    let refused = absent.err().context("exported from nowhere")?.to_string();
+    ensure!(refused.contains("name a run's directory"), "{refused}");
     Ok(())
 }

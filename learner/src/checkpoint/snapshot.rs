@@ -11,6 +11,8 @@ use crate::error::{Error, Result};
 
 /// The file of a checkpoint that holds the SHA-256 of each part.
 pub(super) const MANIFEST: &str = "MANIFEST.json";
+/// What the path of a checkpoint has to name.
+const WANTED: &str = "name a run's directory, its `checkpoints`, or one of them";
 
 /// Everything that changes the future, on the host: file names and their bytes.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -49,10 +51,16 @@ pub(super) fn checksum(bytes: &[u8]) -> String {
 /// changed.
 ///
 /// # Errors
-/// When there is none, or the one that was named is damaged.
+/// [`Error::Configuration`] when there is none, or the one that was named is damaged; otherwise when the directory cannot be
+/// listed.
 pub fn find(path: &Path) -> Result<(PathBuf, Snapshot)> {
+    let refused = |reason: &str| Error::configuration(format!("checkpoint {}: {reason}; {WANTED}", path.display()));
     if path.join(MANIFEST).is_file() {
-        return Ok((path.to_path_buf(), read(path)?));
+        let snapshot = read(path).map_err(|error| refused(&comic_proto::chain(&error)))?;
+        return Ok((path.to_path_buf(), snapshot));
+    }
+    if !path.is_dir() {
+        return Err(refused("no such directory"));
     }
     let below = path.join("checkpoints");
     let directory = if below.is_dir() { below } else { path.to_path_buf() };
@@ -65,8 +73,7 @@ pub fn find(path: &Path) -> Result<(PathBuf, Snapshot)> {
             }
         }
     }
-    let remedy = "name a run's directory, its `checkpoints`, or one of them";
-    Err(Error::Checkpoint(format!("no complete checkpoint in {}: {remedy}", path.display())))
+    Err(refused("no complete checkpoint here"))
 }
 
 /// Reads one checkpoint directory, verifying every part.

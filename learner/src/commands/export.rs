@@ -19,7 +19,8 @@ enum Format {
 /// Writes `part` of the newest checkpoint at `path` to `out`. It is a part of the online policy, as in evaluations.
 ///
 /// # Errors
-/// No checkpoint, no such part in it, an extension other than `.safetensors` and `.pt`, or a disk that fails.
+/// [`Error::Configuration`] when `path` names no whole checkpoint; no such part in it, an extension other than `.safetensors`
+/// and `.pt`, or a disk that fails.
 pub fn run(path: &Path, part: Part, out: &Path) -> Result<()> {
     let format = format_of(out)?;
     let (place, snapshot) = checkpoint::find(path)?;

@@ -89,8 +89,21 @@ fn a_reader_skips_a_damaged_checkpoint_and_leaves_it_in_place() {
         assert_eq!(find(path).unwrap(), (older.clone(), snapshot("one")));
     }
     assert!(find(&newest).is_err() && newest.is_dir());
-    let empty = tempfile::tempdir().unwrap();
-    assert!(format!("{:#}", find(empty.path()).unwrap_err()).contains("name a run's directory"));
+}
+
+#[test]
+fn a_path_without_a_whole_checkpoint_is_refused_and_the_error_names_the_remedy() {
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 3).unwrap();
+    let damaged = store.write(Name::Updates(1), &snapshot("one")).unwrap();
+    std::fs::write(damaged.join("part"), "øne").unwrap();
+    let absent = run.path().join("absent");
+    for path in [run.path(), &damaged, &damaged.join("part"), &absent] {
+        let refused = find(path).unwrap_err();
+        assert_eq!(refused.exit_code(), 2, "{refused}");
+        let said = refused.to_string();
+        assert!(said.contains(&path.display().to_string()) && said.contains("name a run's directory"), "{said}");
+    }
 }
 
 #[test]
