@@ -176,6 +176,16 @@ const DISTRUST: [AlertDescription; 9] = [
     AlertDescription::UnsupportedCertificate,
 ];
 
+/// The error of a connection that could not be made, as one line. If TLS failed, the peer has answered. Otherwise the
+/// line names the remedy.
+pub fn no_connection(error: &(dyn Error + 'static)) -> String {
+    let reason = chain(error);
+    if links(error).any(|link| tls_error(link).is_some()) {
+        return reason;
+    }
+    format!("nothing answers; is the learner running, and is the address right? ({reason})")
+}
+
 /// An error and its sources as one line. The sources are needed because the transport's own message is `transport
 /// error`. A gRPC status is represented by its message.
 pub fn chain(error: &(dyn Error + 'static)) -> String {
@@ -237,5 +247,14 @@ mod tests {
         assert!(!distrusted(&failed(rustls::Error::InvalidCertificate(CertificateError::Expired))));
         assert!(!distrusted(&failed(rustls::Error::AlertReceived(AlertDescription::CertificateExpired))));
         assert!(!distrusted(&io::Error::from(io::ErrorKind::ConnectionRefused)));
+    }
+
+    #[test]
+    fn the_error_of_a_connection_names_the_remedy_unless_tls_failed() {
+        let refused = no_connection(&io::Error::from(io::ErrorKind::ConnectionRefused));
+        assert!(refused.contains("is the learner running") && refused.contains("connection refused"), "{refused}");
+        let expired = rustls::Error::InvalidCertificate(CertificateError::Expired);
+        let expired = no_connection(&io::Error::new(io::ErrorKind::InvalidData, expired));
+        assert!(!expired.contains("is the learner running"), "{expired}");
     }
 }

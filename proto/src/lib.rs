@@ -37,7 +37,7 @@ pub mod v1 {
     tonic::include_proto!("comic.v1");
 }
 
-pub use access::{Access, Authorised, Bearer, Client, FRAME_BYTES, chain, distrusted};
+pub use access::{Access, Authorised, Bearer, Client, FRAME_BYTES, chain, distrusted, no_connection};
 pub use access_error::AccessError;
 pub use buffer::UnrollBuffer;
 pub use field::{Field, UnrollShape};

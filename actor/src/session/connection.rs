@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{JoinReply, JoinRequest};
-use comic_proto::{Access, AccessError, Client, PROTOCOL_VERSION, chain, distrusted};
+use comic_proto::{Access, AccessError, Client, PROTOCOL_VERSION, chain, distrusted, no_connection};
 use tonic::transport::Endpoint;
 use tonic::{Code, Request, Status};
 
@@ -125,7 +125,7 @@ impl Connector {
         let (endpoint, bearer) = (self.endpoint().map_err(renewed)?, self.access.bearer().map_err(renewed)?);
         let channel = endpoint.connect().await.map_err(|error| match self.is_barred(&error) {
             true => Failure::Fatal(self.unwelcome(chain(&error))),
-            false => Failure::Lost(chain(&error)),
+            false => Failure::Lost(no_connection(&error)),
         })?;
         Ok(LearnerClient::with_interceptor(channel, bearer))
     }

@@ -200,6 +200,14 @@ async fn an_actor_waits_for_a_learner_that_starts_later() {
 }
 
 #[tokio::test]
+async fn the_reason_that_an_actor_logs_without_a_learner_names_the_remedy() {
+    // No server listens at port 1.
+    let mut connector = Connector::new(&options_for("http://127.0.0.1:1")).unwrap();
+    let failure = connector.connect(0).await.unwrap_err();
+    assert!(matches!(&failure, Failure::Lost(reason) if reason.contains("is the learner running")), "{failure:?}");
+}
+
+#[tokio::test]
 async fn a_refusal_is_a_configuration_error_and_stopping_ends_the_wait() {
     let refused = |script| async {
         let learner = FakeLearner::start(script).await;

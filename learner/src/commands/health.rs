@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
-use comic_proto::{Access, chain};
+use comic_proto::{Access, chain, no_connection};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
@@ -55,7 +55,8 @@ impl Health {
 
     async fn check(&self) -> Result<()> {
         let channel = self.access.endpoint(&self.learner)?.connect().await;
-        let channel = channel.map_err(|error| Error::NoAnswer(chain(&error)))?;
+        let channel =
+            channel.map_err(|error| Error::NoAnswer(format!("{}: {}", self.learner, no_connection(&error))))?;
         let request = HealthCheckRequest { service: "comic.v1.Learner".into() };
         let answer = HealthClient::new(channel).check(request).await;
         let answer = answer.map_err(|status| Error::NoAnswer(chain(&status)))?.into_inner();

@@ -7,7 +7,7 @@ use std::time::Duration;
 use clap::Args;
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{self, StatusRequest};
-use comic_proto::{Access, chain, distrusted};
+use comic_proto::{Access, chain, distrusted, no_connection};
 use serde_json::{Value, json};
 use tonic::Code;
 
@@ -64,19 +64,26 @@ impl Status {
     async fn ask(&self) -> Result<v1::Status> {
         let (endpoint, bearer) = (self.access.endpoint(&self.learner)?, self.access.bearer()?);
         let call = async {
-            let channel = endpoint.connect().await.map_err(|error| self.classify(&error, false))?;
+            let channel = endpoint.connect().await;
+            let channel = channel.map_err(|error| self.classify(&error, &no_connection(&error), false))?;
             let mut client = LearnerClient::with_interceptor(channel, bearer);
             let answer = client.get_status(StatusRequest {}).await;
-            answer.map_err(|status| self.classify(&status, status.code() == Code::Unauthenticated))
+            answer.map_err(|status| {
+                let refused = status.code() == Code::Unauthenticated;
+                self.classify(&status, &chain(&status), refused)
+            })
         };
         let answer = tokio::time::timeout(TIME_LIMIT, call).await;
-        let late = |_| Error::NoAnswer(format!("{} does not answer within {TIME_LIMIT:?}", self.learner));
+        let late = |_| {
+            let remedy = "is the address right, and is the learner overloaded?";
+            Error::NoAnswer(format!("{} does not answer within {TIME_LIMIT:?}; {remedy}", self.learner))
+        };
         Ok(answer.map_err(late)??.into_inner())
     }
 
-    /// An error of a call. A `refused` token and a certificate that is not trusted are wrong configurations.
-    fn classify(&self, error: &(dyn std::error::Error + 'static), refused: bool) -> Error {
-        let message = format!("{}: {}", self.learner, chain(error));
+    /// An error of a call, and its reason. A `refused` token and a certificate that is not trusted are wrong configurations.
+    fn classify(&self, error: &(dyn std::error::Error + 'static), reason: &str, refused: bool) -> Error {
+        let message = format!("{}: {reason}", self.learner);
         if refused || distrusted(error) { Error::Configuration(message) } else { Error::NoAnswer(message) }
     }
 
@@ -201,6 +208,16 @@ fn grouped(number: u64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn without_a_learner_the_error_names_the_address_and_the_remedy() {
+        // No server listens at port 1.
+        let learner = String::from("http://127.0.0.1:1");
+        let error = Status { learner, json: false, watch: false, access: Access::default() }.run().unwrap_err();
+        assert_eq!(error.exit_code(), 1, "the learner may come: {error}");
+        let said = error.to_string();
+        assert!(said.contains("http://127.0.0.1:1: nothing answers; is the learner running"), "{said}");
+    }
 
     #[test]
     fn numbers_are_grouped() {
