@@ -29,9 +29,14 @@ impl Store {
     /// Opens (and makes) `RUN/checkpoints`.
     ///
     /// # Errors
-    /// When the directory cannot be made.
+    /// [`Error::Configuration`] when a file is in its place; otherwise when it cannot be made.
     pub fn open(run: &Path, kept: usize) -> Result<Self> {
         let directory = run.join("checkpoints");
+        let mut places = directory.ancestors();
+        if let Some(file) = places.find(|place| place.symlink_metadata().is_ok() && !place.is_dir()) {
+            let remedy = "choose a directory with --run";
+            return Err(Error::configuration(format!("{} is not a directory: {remedy}", file.display())));
+        }
         carry_out(&making(&directory))?;
         Ok(Self { directory, kept: kept.max(1) })
     }
@@ -258,6 +263,17 @@ mod tests {
         let state = crate::algorithm::error::Error::from(crate::adam::StateError::from(torch()));
         assert_eq!(failed(state.into()).exit_code(), 1);
         assert_eq!(failed(Error::Checkpoint("the checkpoint does not fit".into())).exit_code(), 2);
+    }
+
+    #[test]
+    fn a_run_in_the_place_of_a_file_is_refused_and_the_error_names_the_remedy() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        for run in [file.path(), &file.path().join("below")] {
+            let refused = Store::open(run, 1).unwrap_err();
+            assert_eq!(refused.exit_code(), 2, "{refused}");
+            let said = refused.to_string();
+            assert!(said.contains(&file.path().display().to_string()) && said.contains("--run"), "{said}");
+        }
     }
 
     #[test]
