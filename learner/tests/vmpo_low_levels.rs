@@ -124,7 +124,7 @@ fn the_acting_policy_is_the_one_that_is_learnt_from() {
         let mut learner = learner(&experiment, 1);
         let losses = learner.step(&minibatch(&learner, &experiment, 2)).unwrap().to_values();
         // Nothing has changed since the policy acted, so every KL is 0.
-        for kl in [losses.get("kl_mean"), losses.get("kl_std"), losses.get("kl_weights")] {
+        for kl in ["kl_mean", "kl_std", "kl_weights"].map(|kl| losses.get(kl).unwrap()) {
             assert!(kl.abs() < 1e-5, "{name}: {losses:?}");
         }
     }
@@ -137,7 +137,7 @@ fn a_wrong_recurrent_state_is_noticed() {
     let mut unrolls = unrolls(&learner, &experiment, 2);
     unrolls.state.iter_mut().for_each(|number| *number = -*number);
     let losses = learner.step(&unrolls.minibatch()).unwrap().to_values();
-    assert!(losses.get("kl_mean") > 1e-5, "{losses:?}");
+    assert!(losses.get("kl_mean").unwrap() > 1e-5, "{losses:?}");
 }
 
 #[test]
@@ -148,9 +148,9 @@ fn a_changed_policy_has_a_kl_in_every_part_and_multipliers_that_move() {
         let before = learner.multipliers().parameter().copy();
         learner.step(&minibatch).unwrap();
         let losses = learner.step(&minibatch).unwrap().to_values();
-        assert!(losses.get("kl_mean") > 0.0 && losses.get("kl_std") > 0.0, "{name}: {losses:?}");
+        assert!(losses.get("kl_mean").unwrap() > 0.0 && losses.get("kl_std").unwrap() > 0.0, "{name}: {losses:?}");
         let mixture = name.starts_with("mixture");
-        assert_eq!(losses.get("kl_weights") > 0.0, mixture, "{name}: {losses:?}");
+        assert_eq!(losses.get("kl_weights").unwrap() > 0.0, mixture, "{name}: {losses:?}");
         let moved = (learner.multipliers().parameter() - before).abs().min().double_value(&[]);
         assert_eq!(learner.multipliers().parameter().size(), [if mixture { 4 } else { 3 }]);
         assert!(moved > 0.0, "{name}");
@@ -288,8 +288,9 @@ fn a_warm_start_moves_every_low_level_to_the_demonstration() {
             unrolls.mean.chunks_exact(components * actions).map(spread).fold(0.0, f32::max)
         };
         let before = target(&learner);
-        let losses: Vec<f32> =
-            (0..150).map(|_| learner.regress(&minibatch).unwrap().0.to_values().get("regression_loss")).collect();
+        let losses: Vec<f32> = (0..150)
+            .map(|_| learner.regress(&minibatch).unwrap().0.to_values().get("regression_loss").unwrap())
+            .collect();
         assert!(losses[149] < 0.5 * losses[0], "{name}: {} to {}", losses[0], losses[149]);
         // Fixed biases separate a mixture's components; regression moves each of them to the demonstration.
         assert!(!name.starts_with("mixture") || target(&learner) < 0.7 * before, "{name}: {before}");

@@ -82,9 +82,9 @@ impl LossValues {
         &self.named
     }
 
-    /// The loss of this name; NaN if the algorithm reports none.
-    pub fn get(&self, name: &str) -> f32 {
-        self.named.iter().find(|(found, _)| *found == name).map_or(f32::NAN, |(_, value)| *value)
+    /// The loss of this name; `None` if the algorithm reports none.
+    pub fn get(&self, name: &str) -> Option<f32> {
+        self.named.iter().find(|(found, _)| *found == name).map(|(_, value)| *value)
     }
 
     /// Whether every loss is finite.
@@ -103,8 +103,8 @@ mod tests {
         let (temperatures, taken) = (Tensor::from_slice(&[3.0f32, 4.0]), Tensor::from(true));
         let losses = Losses::pack([("kl_mean", &mean), ("kl_std", &std)], &temperatures, &taken);
         let values = Losses::mean(&[losses]).unwrap().to_values();
-        assert_eq!([values.get("kl_mean"), values.get("kl_std")], [1.0, 2.0]);
+        assert_eq!([values.get("kl_mean"), values.get("kl_std")], [Some(1.0), Some(2.0)]);
         assert_eq!((values.temperatures.as_slice(), values.skipped), (&[3.0, 4.0][..], 0));
-        assert!(values.get("another").is_nan());
+        assert_eq!(values.get("another"), None);
     }
 }
