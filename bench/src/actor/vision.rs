@@ -29,9 +29,10 @@ pub(super) fn vision(subject: &Subject) -> Result<Figure> {
     Ok(Figure::new("actor.vision", "ms", Medians { value, floor: medians.value }, note))
 }
 
+/// Environments of the subject's task, or of gaps if that task has no images.
 fn environments(subject: &Subject, vision: Vision) -> Result<Vec<Box<dyn Simulated>>> {
     let mut experiment = Experiment { task: subject.experiment.task, ..Experiment::default() };
-    if !matches!(experiment.task, TaskName::Gaps | TaskName::Walls) {
+    if subject.task.spec().image == 0 {
         experiment.task = TaskName::Gaps;
     }
     experiment.gaps.corridor.vision = vision;
