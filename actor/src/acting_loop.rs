@@ -9,7 +9,7 @@ use comic_proto::{Field, UnrollShape};
 use comic_tasks::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Step};
 
 use crate::Error;
-use crate::acting::{ActingBatch, ActingRow, ForwardPass, clip_action};
+use crate::forward_pass::{ActingBatch, ActingRow, ForwardPass, clip_action};
 
 /// What decides on the distribution of actions.
 #[derive(Debug)]

@@ -21,8 +21,8 @@ use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 
 use crate::Error;
-use crate::acting::ForwardPass;
 use crate::acting_loop::Controller;
+use crate::forward_pass::ForwardPass;
 
 pub use report::{ClipReport, Finished, Report};
 pub use rollout::{Audience, Start};

@@ -3,7 +3,7 @@
 //! # Layout
 //! - [`worker`] is the hot path: one thread, its environments, one batched forward pass a step, full unrolls out.
 //! - [`acting_loop`] is the loop that the worker and the evaluation share.
-//! - [`acting`] holds the arrays of a forward pass; [`policy`] is the forward pass through libtorch.
+//! - [`forward_pass`] is what a forward pass reads and writes; [`policy`] is the forward pass through libtorch.
 //! - [`mailbox`] gives the newest parameters to the workers, which take them at unroll boundaries only.
 //! - [`round`] lets a worker wait until the learner has answered for its last unrolls.
 //! - [`session`] is the connection to the learner. It joins, fetches assets, receives parameters, sends each unroll until
@@ -18,13 +18,13 @@
 //! No loss is computed here. All memory is bounded: full unrolls wait in a bounded channel, unrolls without
 //! acknowledgement in a bounded window. When the window is full, the environments wait.
 
-pub mod acting;
 pub mod acting_loop;
 pub mod checkpoint;
 pub mod clips;
 pub mod dump;
 mod error;
 pub mod evaluate;
+pub mod forward_pass;
 pub mod liveness;
 pub mod mailbox;
 pub mod policy;

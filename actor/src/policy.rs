@@ -7,7 +7,7 @@ use tch::nn::VarStore;
 use tch::{Device, Tensor};
 
 use crate::Error;
-use crate::acting::{ActingBatch, ForwardPass};
+use crate::forward_pass::{ActingBatch, ForwardPass};
 
 /// The behaviour policy: its networks and their parameters, on the CPU.
 #[derive(Debug)]

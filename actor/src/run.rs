@@ -14,8 +14,8 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{mpsc, watch};
 
 use crate::Error;
-use crate::acting::{ForwardPass, OneByOne};
 use crate::dump::{Dumps, Watched};
+use crate::forward_pass::{ForwardPass, OneByOne};
 use crate::liveness::Liveness;
 use crate::mailbox::Mailbox;
 use crate::policy::TorchPolicy;

@@ -25,8 +25,8 @@ use comic_tasks::Environment;
 use tokio::sync::mpsc;
 
 use crate::Error;
-use crate::acting::ForwardPass;
 use crate::acting_loop::{ActingLoop, Controller};
+use crate::forward_pass::ForwardPass;
 use crate::mailbox::{Directive, Mailbox};
 use crate::round::{Round, Ticket};
 use recorder::{RecordedUnroll, UnrollRecorder};

@@ -5,7 +5,7 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use comic_actor::acting::{ActingBatch, ForwardPass as _};
+use comic_actor::forward_pass::{ActingBatch, ForwardPass as _};
 use comic_actor::mailbox::Directive;
 use comic_actor::policy::TorchPolicy;
 use comic_actor::worker::{FinishedUnroll, Progress, Worker};

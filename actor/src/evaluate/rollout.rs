@@ -12,8 +12,8 @@ use rand_pcg::Pcg64;
 use super::report::Finished;
 use super::settings::RolloutSettings;
 use crate::Error;
-use crate::acting::{ActingRow, ForwardPass};
 use crate::acting_loop::{ActingLoop, Controller, Recorder, Rollout};
+use crate::forward_pass::{ActingRow, ForwardPass};
 
 /// Watches a rollout, to show its progress or to film it.
 pub trait Audience<E> {
@@ -185,7 +185,7 @@ mod tests {
     use comic_tasks::{Episode, MAX_REWARD_TERMS, Step};
 
     use super::*;
-    use crate::acting::ActingBatch;
+    use crate::forward_pass::ActingBatch;
 
     const SHAPE: UnrollShape = UnrollShape {
         length: 1,

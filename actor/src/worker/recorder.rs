@@ -11,8 +11,8 @@ use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
 
 use crate::Error;
-use crate::acting::ActingRow;
 use crate::acting_loop::{Recorder, Rollout};
+use crate::forward_pass::ActingRow;
 use crate::seeds::EnvironmentSeeds;
 
 /// The unrolls of all environments of a worker, filled row by row.

@@ -5,7 +5,7 @@ use comic_tasks::{Episode, MAX_REWARD_TERMS, Outcome, Step};
 use proptest::prelude::*;
 
 use super::*;
-use crate::acting::ActingBatch;
+use crate::forward_pass::ActingBatch;
 
 mod running;
 

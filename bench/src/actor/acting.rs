@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use anyhow::{Result, anyhow};
 use bytes::Bytes;
-use comic_actor::acting::ForwardPass;
+use comic_actor::forward_pass::ForwardPass;
 use comic_actor::mailbox::Directive;
 use comic_actor::policy::TorchPolicy;
 use comic_actor::worker::{Progress, Worker};
