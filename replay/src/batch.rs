@@ -6,8 +6,8 @@ use std::sync::Arc;
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, Invalid, Pieces, UnrollLayout};
 
+use crate::accounting::Reason;
 use crate::buffer::Buffer;
-use crate::counts::Reason;
 
 /// Takes the memory of a batch back, and accounts for its unrolls.
 pub(crate) trait TakeBack: Send + Sync {

@@ -9,10 +9,10 @@ use comic_proto::{Pieces, UnrollLayout};
 use parking_lot::{Condvar, Mutex, MutexGuard};
 use tokio::sync::Semaphore;
 
+use crate::accounting::{Accounting, AccountingByTask, Reason};
 use crate::batch::{Batch, TakeBack};
 use crate::buffer::Buffer;
 use crate::config::{BatchOrder, Config};
-use crate::counts::{Accounting, AccountingByTask, Reason};
 use crate::ledger::{JoinError, Joined, Ledger, SequenceStatus};
 use crate::phase::Phase;
 use crate::snapshot::LedgerSnapshot;

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashMap};
 use comic_proto::MAX_SEQUENCE;
 use thiserror::Error;
 
-use crate::counts::{Accounting, AccountingByTask, Reason, TaskAccounting};
+use crate::accounting::{Accounting, AccountingByTask, Reason, TaskAccounting};
 use crate::tasks::Tasks;
 
 /// The account of an actor that joined.

@@ -43,21 +43,21 @@
 //! - Memory is one batch for the trainer and [`Config::ahead`] more, for any number of actors.
 //! - No unroll is in two batches, or twice in one batch.
 
+mod accounting;
 mod batch;
 mod batcher;
 mod buffer;
 mod config;
-mod counts;
 mod ledger;
 mod phase;
 mod snapshot;
 mod streaming;
 mod tasks;
 
+pub use accounting::{Accounting, AccountingByTask, Dropped, Reason, TaskAccounting};
 pub use batch::Batch;
 pub use batcher::{Batcher, Next, Outcome};
 pub use config::{BatchOrder, Config};
-pub use counts::{Accounting, AccountingByTask, Dropped, Reason, TaskAccounting};
 pub use ledger::{JoinError, Joined, Ledger};
 pub use phase::Phase;
 pub use snapshot::{Account, Error, LedgerSnapshot};

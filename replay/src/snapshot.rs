@@ -6,7 +6,7 @@ use comic_proto::MAX_SEQUENCE;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::counts::{Accounting, AccountingByTask, Reason, TaskAccounting};
+use crate::accounting::{Accounting, AccountingByTask, Reason, TaskAccounting};
 use crate::ledger::{Entry, Ledger};
 
 /// One open account.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::counts::TaskAccounting;
+use crate::accounting::TaskAccounting;
 
 /// The tasks of a run with their accounting, in the order of the task indices in the headers of unrolls.
 #[derive(Clone, Debug, Default)]
