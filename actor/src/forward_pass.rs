@@ -57,7 +57,7 @@ pub struct ActingRow<'a> {
 impl ActingBatch {
     /// Zeros for `environments` environments whose unrolls have this shape.
     pub fn new(environments: usize, shape: &UnrollShape) -> Self {
-        let widths = PerField::from_fn(|field| if FIELDS.contains(&field) { shape.width(field) } else { 0 });
+        let widths = PerField::from_fn(|field| if FIELDS.contains(&field) { field.width(shape) } else { 0 });
         Self {
             environments,
             widths,

@@ -5,8 +5,9 @@ use std::ops::Range;
 
 use sha2::{Digest, Sha256};
 
-use crate::field::{ELEMENT, Field, UnrollShape};
+use crate::field::Field;
 use crate::per_field::PerField;
+use crate::shape::{ELEMENT, UnrollShape};
 
 /// Bytes in a message for everything except payload and episode statistics.
 const HEADER_SLACK: usize = 4096;

@@ -28,6 +28,7 @@ mod frame;
 mod layout;
 mod per_field;
 mod pieces;
+mod shape;
 mod token;
 mod validate;
 
@@ -40,11 +41,12 @@ pub mod v1 {
 pub use access::{Access, Authorised, Bearer, Client, FRAME_BYTES, chain, distrusted, no_connection};
 pub use access_error::AccessError;
 pub use buffer::UnrollBuffer;
-pub use field::{Field, UnrollShape};
+pub use field::Field;
 pub use frame::frame;
 pub use layout::UnrollLayout;
 pub use per_field::PerField;
 pub use pieces::{Malformed, Pieces, ReceivedUnroll};
+pub use shape::UnrollShape;
 pub use token::{TOKEN_VARIABLE, Token};
 pub use validate::{Expected, Invalid, MAX_SEQUENCE, validate};
 
