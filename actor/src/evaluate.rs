@@ -11,6 +11,7 @@ mod rewards;
 mod rollout;
 mod settings;
 mod table;
+mod tracking_errors;
 
 use std::sync::Arc;
 
@@ -24,9 +25,10 @@ use crate::Error;
 use crate::acting_loop::Controller;
 use crate::forward_pass::ForwardPass;
 
-pub use report::{ClipReport, Finished, Report};
+pub use report::{ClipReport, Finished, Report, TrackingError};
 pub use rollout::{Audience, Start};
 pub use settings::RolloutSettings;
+pub use tracking_errors::TrackingSums;
 
 /// Rolls out the starts of the clips of `task` that the options choose; `shape` is the shape of its experiment's
 /// unrolls.

@@ -160,6 +160,17 @@ impl ActingRow<'_> {
         &mean[component * actions..(component + 1) * actions]
     }
 
+    /// The action without noise plus Gaussian noise with this standard deviation. Nothing is drawn for a deviation of 0.
+    pub fn mode_with_noise(&self, std: f32, action: &mut [f32], rng: &mut impl Rng) {
+        action.copy_from_slice(self.mode());
+        if std > 0.0 {
+            for value in action {
+                let noise: f32 = StandardNormal.sample(rng);
+                *value += std * noise;
+            }
+        }
+    }
+
     /// Makes the action distribution N(mean, std²): every component has these values, and all weights are equal. `mean`
     /// fills `[A]`.
     pub fn set_gaussian(&mut self, mean: impl Fn(&mut [f32]), std: f32) {
@@ -305,6 +316,7 @@ mod tests {
         image: 0,
         components: 3,
         state: 4,
+        action_gradient: 0,
     };
 
     /// Components whose samples cannot be confused, with these weights.

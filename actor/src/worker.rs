@@ -98,10 +98,13 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         first: u32,
         seed: u64,
     ) -> Self {
-        let length = layout.shape().length;
+        let (length, records) = (layout.shape().length, layout.shape().action_gradient > 0);
         let mut acting = ActingLoop::new(environments, layout.shape());
         let recorder = UnrollRecorder::new(layout, (first..).take(acting.rollouts.len()), seed);
         for (index, rollout) in acting.rollouts.iter_mut().enumerate() {
+            if records {
+                rollout.environment.record_gradients();
+            }
             rollout.environment.reset();
             rollout.begin_episode(&mut acting.batch.row(index));
         }
@@ -200,6 +203,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         let ActingLoop { rollouts, batch } = &mut self.acting;
         let mut unrolls = Vec::with_capacity(rollouts.len());
         for ((index, rollout), environment) in rollouts.iter_mut().enumerate().zip(self.first..) {
+            self.recorder.write_gradients(index, &rollout.environment.take_gradients());
             let RecordedUnroll { payload, episodes, task } = self.recorder.take(index);
             if rollout.ended {
                 rollout.environment.reset();

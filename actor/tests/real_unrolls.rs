@@ -105,3 +105,19 @@ fn rewards_are_the_tracking_tasks() {
     }
     assert!(best > 0.3, "the servo action tracks a little, at least at an episode's start: {best}");
 }
+
+#[test]
+fn every_transition_has_the_derivative_of_its_action() {
+    let setup = setup();
+    let mut transitions = 0;
+    for unroll in record(&setup, Behaviour::Policy).into_iter().flatten() {
+        let buffer = UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap();
+        for t in 0..setup.layout.shape().length {
+            let is_transition = buffer.row(Field::Valid, t) == [1.0];
+            let has_one = buffer.row(Field::ActionGradient, t).iter().any(|value| *value != 0.0);
+            assert_eq!(has_one, is_transition, "row {t}");
+            transitions += usize::from(is_transition);
+        }
+    }
+    assert!(transitions > 100, "{transitions}");
+}

@@ -5,7 +5,7 @@ use crate::document::Experiment;
 use crate::fault::{AT_LEAST_ONE, Fault, NOT_NEGATIVE, POSITIVE, ensure, not_negative, positive};
 use crate::network::{Network, Prior};
 use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
-use crate::tasks::{TaskName, Vision};
+use crate::tasks::{TaskName, TerminationError, Vision};
 
 /// The squared ratio of two float32 numbers overflows with a smaller deviation. The wire refuses a smaller one, too.
 const SMALLEST_STD: f64 = 1e-6;
@@ -103,6 +103,10 @@ fn network(network: &Network) -> Result<(), Fault> {
     let holds = positive(*initial_std) && initial_std > min_std;
     ensure("network.initial_std", initial_std, holds, "must exceed network.min_std")?;
     ensure("network.initial_std", initial_std, *initial_std <= LARGEST_STD, AT_MOST_STD)?;
+    let final_std = network.final_std;
+    let holds = final_std == 0.0 || (*min_std..=*initial_std).contains(&final_std);
+    let remedy = "must be 0, which is off, or from network.min_std to network.initial_std";
+    ensure("network.final_std", final_std, holds, remedy)?;
     ensure("network.policy_head_scale", policy_head_scale, not_negative(*policy_head_scale), NOT_NEGATIVE)?;
     let bare = network.low_level.acts_without_bottleneck();
     let (least, remedy) = if bare { (0, "must be at most 4096") } else { (1, "must be 1 to 4096") };
@@ -142,6 +146,10 @@ fn vmpo(vmpo: &Vmpo, unroll: &Unroll) -> Result<(), Fault> {
     ensure("vmpo.minibatch_unrolls", vmpo.minibatch_unrolls, holds, format!("must divide unroll.batch, {batch}"))?;
     ensure("vmpo.lambda", vmpo.lambda, (0.0..=1.0).contains(&vmpo.lambda), "must be in [0, 1]")?;
     ensure("vmpo.entropy", vmpo.entropy, not_negative(vmpo.entropy), NOT_NEGATIVE)?;
+    let weight = vmpo.action_gradient;
+    ensure("vmpo.action_gradient", weight, not_negative(weight), NOT_NEGATIVE)?;
+    let weight = vmpo.control_variate;
+    ensure("vmpo.control_variate", weight, not_negative(weight), NOT_NEGATIVE)?;
     ensure("vmpo.value_weight", vmpo.value_weight, not_negative(vmpo.value_weight), NOT_NEGATIVE)?;
     let burn_in = vmpo.value_burn_in;
     ensure("vmpo.value_burn_in", burn_in, burn_in == 0 || burn_in < unroll.length, "must be less than unroll.length")
@@ -199,6 +207,14 @@ fn together(experiment: &Experiment) -> Result<(), Fault> {
     let holds = warm_start.steps == 0 || network.low_level.imitates();
     let remedy = format!("must be 0 with network.low_level = \"{}\"", network.low_level);
     ensure("warm_start.steps", warm_start.steps, holds, &remedy)?;
+    let tracks = experiment.tasks().iter().any(|(task, _)| *task == TaskName::Tracking);
+    let differentiable = tracks && experiment.tracking.termination_error == TerminationError::DmControl;
+    let holds = vmpo.action_gradient == 0.0 || differentiable;
+    let remedy = "must be 0 without tracking, and with another tracking.termination_error than dm-control";
+    ensure("vmpo.action_gradient", vmpo.action_gradient, holds, remedy)?;
+    let holds = vmpo.control_variate == 0.0 || network.components() == 1;
+    let remedy = "must be 0 with network.low_level = \"mixture\", whose KL has no closed form";
+    ensure("vmpo.control_variate", vmpo.control_variate, holds, remedy)?;
     let holds = !unroll.lockstep || unroll.ahead == 0;
     ensure("unroll.ahead", unroll.ahead, holds, "must be 0 with unroll.lockstep")?;
     let holds = !unroll.lockstep || budget.minutes == 0.0;

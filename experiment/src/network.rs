@@ -32,6 +32,10 @@ pub struct Network {
     pub latent: Latent,
     /// The policy's standard deviation before learning (D: softplus of 0, ln 2).
     pub initial_std: f64,
+    /// The policy's standard deviation at the budget's end (D). It is then not learned: it falls geometrically from
+    /// `initial_std` with the budget, and is the same for every action, so `vmpo.epsilon_std` and `vmpo.entropy` have no
+    /// effect. 0 is off: the standard deviation is learned (S).
+    pub final_std: f64,
     /// Smallest standard deviation of the policy (D).
     pub min_std: f64,
     /// Scale of the policy head's initial weights, relative to the other layers' (D).
@@ -58,6 +62,7 @@ impl Default for Network {
             image_features: 64,
             latent: Latent::default(),
             initial_std: std::f64::consts::LN_2,
+            final_std: 0.0,
             min_std: 1e-3,
             policy_head_scale: 1.0,
             initial_pose: InitialPose::MidRange,

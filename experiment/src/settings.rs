@@ -41,6 +41,14 @@ pub struct Vmpo {
     pub lambda: f64,
     /// Entropy bonus (V: none).
     pub entropy: f64,
+    /// κ: weight of a term of the policy loss whose expected gradient is 0 in the first gradient step on a batch (D). It
+    /// cancels the part of the gradient that only imitates exploration noise, so an estimate from the same steps has less
+    /// variance. 0 is off (V). A mixture has none.
+    pub control_variate: f64,
+    /// Weight w of the simulator's derivative of the reward with respect to the actions (D): the policy loss has the term
+    /// −w/η · mean over valid steps of derivative · mean action. The actors compute the derivative, as `tracking.gradient`
+    /// says; only tracking has one. 0 is off.
+    pub action_gradient: f64,
     /// Weight of the value loss (D).
     pub value_weight: f64,
     /// Rows at the start of an unroll that only build up the recurrent state of the value function. No loss uses them (D).
@@ -66,6 +74,8 @@ impl Default for Vmpo {
             minibatch_unrolls: 128,
             lambda: 1.0,
             entropy: 0.0,
+            control_variate: 0.0,
+            action_gradient: 0.0,
             value_weight: 1.0,
             value_burn_in: 0,
         }

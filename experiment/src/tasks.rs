@@ -23,8 +23,8 @@ pub use get_up::{GetUp, LyingPose};
 pub use go_to_target::GoToTarget;
 pub use shared::{StartPose, Vision};
 pub use tracking::{
-    TRACKING_MAX_REWARD, TRACKING_OBSERVATIONS, TRACKING_REWARD_TERMS, TerminationError, Tracking,
-    tracking_observation_size,
+    GradientOfReward, TRACKING_MAX_REWARD, TRACKING_OBSERVATIONS, TRACKING_REWARD_TERMS, TRACKING_TERM_LIMITS,
+    TerminationError, Tracking, tracking_observation_size,
 };
 pub use walls::{WallSide, Walls};
 

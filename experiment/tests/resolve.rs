@@ -97,7 +97,12 @@ fn contradictory_fields_are_refused() {
     assert!(error.contains("unroll.ahead = 1: must be 0"), "{error}");
     resolve("quickstart", &["unroll.lockstep=true".into(), "budget.minutes=0".into()]).unwrap();
     resolve("quickstart", &["vmpo.value_burn_in=2".into(), "network.value_lstm=[8]".into()]).unwrap();
-    resolve("quickstart", &["network.low_level=mixture".into(), "network.latent.size=0".into()]).unwrap();
+    let error = refused(&["network.low_level=mixture"]);
+    assert!(error.contains("vmpo.control_variate = 1.0: must be 0") && error.contains("mixture"), "{error}");
+    let error = refused(&["tracking.termination_error=supplement"]);
+    assert!(error.contains("vmpo.action_gradient = 15.0: must be 0"), "{error}");
+    let mixture = ["network.low_level=mixture", "network.latent.size=0", "vmpo.control_variate=0"];
+    resolve("quickstart", &mixture.map(String::from)).unwrap();
 }
 
 #[test]
@@ -306,8 +311,13 @@ fn meaningless_values_are_refused_with_field_and_remedy() {
         ("clips.0.weight=-1.0", "must be 0 or more"),
         ("clips.0.subset=\"walk\"", "must be one of walk_tiny, run_jump_tiny, get_up, locomotion_small, all"),
         ("clips.0.end_step=0", "must exceed start_step"),
-        ("tracking.reference_steps=[]", "must be 1 to 64 numbers of frames ahead, each 1 to 1000"),
-        ("tracking.reference_steps=[0]", "must be 1 to 64 numbers of frames ahead, each 1 to 1000"),
+        ("tracking.reference_steps=[]", "must be 1 to 64 numbers of frames ahead, each 0 to 1000"),
+        ("tracking.reference_steps=[1001]", "must be 1 to 64 numbers of frames ahead, each 0 to 1000"),
+        ("tracking.gradient.appendages=0.0", "must be in (0, 1]"),
+        ("tracking.gradient.decay=1.5", "must be in [0, 1]"),
+        ("tracking.gradient.root_velocity=-1.0", "must be 0 or more"),
+        ("network.final_std=0.0001", "must be 0, which is off, or from network.min_std to network.initial_std"),
+        ("vmpo.control_variate=-1.0", "must be 0 or more"),
         ("tracking.min_steps=0", "must be 1 to 100000"),
         ("tracking.termination_threshold=0.0", "must be positive"),
         ("tracking.time_limit=-30.0", "must be positive seconds"),

@@ -51,6 +51,10 @@ pub trait Algorithm: Debug {
     /// [`Error::Networks`] when they do not fit the task.
     fn set_normaliser(&mut self, statistics: &NormaliserStatistics) -> Result<(), Error>;
 
+    /// Sets everything that follows a schedule, when the share `used` of the budget is used, 0 to 1. The learning rate of
+    /// the networks is part of it.
+    fn set_progress(&mut self, used: f64);
+
     /// Sets the learning rate of the networks, until it is set again. Rates of other parameters are the algorithm's own.
     fn set_learning_rate(&mut self, rate: f64);
 

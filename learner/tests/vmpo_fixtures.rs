@@ -97,6 +97,7 @@ fn losses_and_gradients_equal_rlax() {
             epsilon_std: fixture.scalar("epsilon_std"),
             epsilon_discrete: 1e-3,
             top_fraction: fixture.scalar("top_fraction"),
+            control_variate: 0.0,
         };
         let valid = advantage.ones_like();
         let groups = [valid.to_kind(Kind::Bool)];
@@ -106,6 +107,7 @@ fn losses_and_gradients_equal_rlax() {
             kl_mean,
             kl_std,
             kl_weights: None,
+            kl: None,
             valid: &valid,
             groups: &groups,
         };

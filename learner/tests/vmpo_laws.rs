@@ -133,6 +133,28 @@ fn a_batch_without_a_transition_gives_finite_losses() {
 }
 
 #[test]
+fn the_mean_action_follows_the_simulators_derivative() {
+    let mut experiment = experiment();
+    experiment.vmpo.action_gradient = 100.0;
+    let mut unrolls = unrolls(2);
+    unrolls.behave(&learner(&experiment, 1), UNROLLS * LENGTH);
+    // One entry of the action pays, and another one costs.
+    let mean_change = |gradient: [f32; 3]| {
+        let mut unrolls = unrolls.clone();
+        unrolls.action_gradient = gradient.repeat(UNROLLS * LENGTH);
+        let mut learner = learner(&experiment, 1);
+        learner.step(&unrolls.minibatch()).unwrap();
+        let mut after = unrolls.clone();
+        after.behave(&learner, UNROLLS * LENGTH);
+        let rows = after.mean.chunks_exact(3).zip(unrolls.mean.chunks_exact(3));
+        let change = |entry: usize| rows.clone().map(|(after, before)| after[entry] - before[entry]).sum::<f32>();
+        [change(0), change(1)]
+    };
+    let [without, with] = [mean_change([0.0; 3]), mean_change([1.0, -1.0, 0.0])];
+    assert!(with[0] > without[0] && with[1] < without[1], "{without:?} {with:?}");
+}
+
+#[test]
 fn a_clipped_action_would_be_scored_differently() {
     // The policy is trained on the action that was sampled, without clipping. Only the simulator gets the clipped one.
     let base = unrolls(7);

@@ -3,11 +3,18 @@
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
 use comic_learner::vmpo::{Evidence, Improvement, KlLimits, Multipliers, masked_mean, policy_improvement};
+use comic_networks::DiagonalGaussian;
 use proptest::prelude::*;
 use tch::{Device, Kind, Tensor};
 
-const LIMITS: KlLimits =
-    KlLimits { epsilon_eta: 0.1, epsilon_mean: 0.2, epsilon_std: 0.3, epsilon_discrete: 0.4, top_fraction: 0.5 };
+const LIMITS: KlLimits = KlLimits {
+    epsilon_eta: 0.1,
+    epsilon_mean: 0.2,
+    epsilon_std: 0.3,
+    epsilon_discrete: 0.4,
+    top_fraction: 0.5,
+    control_variate: 0.0,
+};
 
 /// Four steps, all valid by default. Every tensor can be differentiated.
 struct Case {
@@ -40,16 +47,21 @@ impl Case {
     }
 
     fn losses(&self) -> Improvement {
+        self.losses_with(&LIMITS, None)
+    }
+
+    fn losses_with(&self, limits: &KlLimits, kl: Option<&Tensor>) -> Improvement {
         let evidence = Evidence {
             log_prob: &self.log_prob,
             advantage: &self.advantage,
             kl_mean: &self.kl_mean,
             kl_std: &self.kl_std,
             kl_weights: None,
+            kl,
             valid: &self.valid,
             groups: &[self.valid.ones_like().to_kind(Kind::Bool)],
         };
-        policy_improvement(&evidence, &self.multipliers, &LIMITS)
+        policy_improvement(&evidence, &self.multipliers, limits)
     }
 
     fn gradient(&self, loss: &Tensor, input: &Tensor) -> Vec<f32> {
@@ -206,6 +218,7 @@ fn each_group_has_its_own_e_step_and_its_losses_are_weighted_by_its_steps() {
             kl_mean: &case.kl_mean,
             kl_std: &case.kl_std,
             kl_weights: None,
+            kl: None,
             valid,
             groups,
         };
@@ -227,4 +240,35 @@ fn each_group_has_its_own_e_step_and_its_losses_are_weighted_by_its_steps() {
     assert_close(both.2[1], second.2[0] * 2.0 / 6.0);
     // A group without a step does not change its temperature.
     assert_eq!(losses(&groups, &[1.0, 50.0], &groups[0].to_kind(Kind::Float)).2[1], 0.0);
+}
+
+proptest! {
+    /// ln π is quadratic in the action, so its mean over μ_old ± σ_old is its mean under the behaviour policy.
+    #[test]
+    fn the_control_variates_expected_gradient_is_zero(
+        old in prop::collection::vec((-0.2f32..0.2, 0.2f32..0.5), 4),
+        new in prop::collection::vec((-0.2f32..0.2, 0.2f32..0.5), 4),
+    ) {
+        let split = |pairs: &[(f32, f32)]| {
+            let (mean, std): (Vec<f32>, Vec<f32>) = pairs.iter().copied().unzip();
+            DiagonalGaussian { mean: Tensor::from_slice(&mean), std: Tensor::from_slice(&std) }
+        };
+        let (old, mut new) = (split(&old), split(&new));
+        new.mean = new.mean.set_requires_grad(true);
+        new.std = new.std.set_requires_grad(true);
+        let actions = Tensor::stack(&[&old.mean + &old.std, &old.mean - &old.std], 0);
+        let kl = old.kl(&new).expand([2], false);
+        let log_prob = new.log_prob(&actions);
+        let loss = |control_variate: f64| {
+            let mut case = Case::new(&[0.0, 0.0]);
+            case.log_prob = log_prob.shallow_clone();
+            case.losses_with(&KlLimits { control_variate, ..LIMITS }, Some(&kl)).policy
+        };
+        let variate = loss(1.0) - loss(0.0);
+        for gradient in Tensor::run_backward(&[&variate], &[&new.mean, &new.std], false, false) {
+            for (index, found) in values(&gradient).into_iter().enumerate() {
+                prop_assert!(found.abs() < 1e-3, "{}: {}", index, found);
+            }
+        }
+    }
 }

@@ -127,6 +127,24 @@ impl ActionDistribution {
         }
     }
 
+    /// The same means with the standard deviation `std`, `[1]`.
+    #[must_use]
+    pub(crate) fn with_std(self, std: &Tensor) -> Self {
+        let spread = |gaussian: DiagonalGaussian| DiagonalGaussian { std: std.expand_as(&gaussian.mean), ..gaussian };
+        match self {
+            Self::Gaussian(gaussian) => Self::Gaussian(spread(gaussian)),
+            Self::Mixture { log_weights, components } => Self::Mixture { log_weights, components: spread(components) },
+        }
+    }
+
+    /// KL(behaviour ‖ self), `[N]`; `None` for a mixture, which has no closed form.
+    pub fn kl_from(&self, behaviour: &Self) -> Option<Tensor> {
+        match (self, behaviour) {
+            (Self::Gaussian(new), Self::Gaussian(old)) => Some(old.kl(new)),
+            _ => None,
+        }
+    }
+
     /// The standard deviation, `[N, A]`; for a mixture, the mean of the components' standard deviations with their
     /// weights.
     pub fn std(&self) -> Tensor {

@@ -14,6 +14,9 @@ use crate::lstm::RecurrentState;
 use crate::normaliser::{NormalisedObservation, Normaliser, NormaliserStatistics};
 use crate::routing::Routing;
 
+/// Largest standard deviation that a schedule can set, as the experiment's check has it.
+const LARGEST_STD: f64 = 1e3;
+
 /// The output of the policy for N rows.
 #[derive(Debug)]
 pub struct Acting {
@@ -35,6 +38,10 @@ pub struct Policy {
     image_encoder: Option<ImageEncoder>,
     encoder: Encoder,
     low_level: Box<dyn LowLevel>,
+    /// σ of every action, `[1]`, if a schedule sets it. It is published with the parameters, and is not trained.
+    scheduled_std: Option<Tensor>,
+    /// Least standard deviation of an action, also of one that a file brings.
+    min_std: f64,
 }
 
 impl Policy {
@@ -56,7 +63,11 @@ impl Policy {
         let low_level = low_level::Config { latent, proprioception, pose, network: config };
         let low_level = low_level::build(&(store / "low_level"), &low_level);
         let normaliser = Normaliser::new(&(store / "normaliser"), spec, config.normaliser_steps > 0);
-        Ok(Self { normaliser, image_encoder, encoder, low_level })
+        let scheduled_std =
+            (config.final_std > 0.0).then(|| (store / "low_level").zeros_no_train("scheduled_std", &[1]));
+        let policy = Self { normaliser, image_encoder, encoder, low_level, scheduled_std, min_std: config.min_std };
+        policy.set_scheduled_std(config.initial_std);
+        Ok(policy)
     }
 
     /// Normalises observations: proprioception `[.., P]`, task observation `[.., X]`, image `[.., I]` uint8. The
@@ -91,7 +102,22 @@ impl Policy {
         let encoded = self.encoder.forward(&input, &rows(latent_noise), routing);
         let input = low_level::Input { intent: &encoded.intent, proprioception: &rows(proprioception), recurrent };
         let low_level::Output { action, state } = self.low_level.act(&input);
+        let action = match &self.scheduled_std {
+            Some(std) => action.with_std(&std.clamp(self.min_std, LARGEST_STD)),
+            None => action,
+        };
         Acting { latent: encoded.latent, action, latent_posterior: encoded.posterior, state }
+    }
+
+    /// Sets the standard deviation of every action, if the experiment schedules it (`final_std`); otherwise nothing
+    /// changes.
+    pub fn set_scheduled_std(&self, std: f64) {
+        if let Some(scheduled) = &self.scheduled_std {
+            tch::no_grad(|| {
+                // Data, not a constant: XLA would compile a program for each constant.
+                scheduled.shallow_clone().copy_(&Tensor::from_slice(&[std as f32]));
+            });
+        }
     }
 
     /// Sets the statistics of the normaliser. They are published with the parameters, and are not trained.

@@ -283,3 +283,19 @@ fn an_image_gives_the_same_numbers_in_unrolls_and_in_rows() {
     };
     assert_eq!(acted(&[1]), acted(&[1, 1]));
 }
+
+#[test]
+fn a_scheduled_standard_deviation_is_a_parameter_and_is_not_trained() {
+    let network = Network { final_std: 0.01, ..network() };
+    let (store, policy) = self::policy(&network, 1, &[0.0; 3]);
+    assert_eq!(act(&policy).action.std.double_value(&[0, 0]) as f32, network.initial_std as f32, "it starts there");
+    policy.set_scheduled_std(0.25);
+    let action = act(&policy).action;
+    assert_eq!(Vec::<f32>::try_from(action.std.flatten(0, -1)).unwrap(), vec![0.25; 3 * ROWS as usize]);
+    let scheduled = &store.variables()["low_level.scheduled_std"];
+    assert_eq!((scheduled.double_value(&[0]), scheduled.requires_grad()), (0.25, false));
+    let (learned, policy) = self::policy(&self::network(), 1, &[0.0; 3]);
+    policy.set_scheduled_std(0.25);
+    assert!(!learned.variables().contains_key("low_level.scheduled_std"));
+    assert!(act(&policy).action.std.double_value(&[0, 0]) > 0.5, "a learned one has no schedule");
+}

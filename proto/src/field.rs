@@ -23,6 +23,9 @@ pub enum Field {
     Std,
     /// `[T, K]` f32: ln of the weights of the components, which add up to 1; empty for one component.
     LogWeights,
+    /// `[T, A]` f32: the derivative of the coming rewards with respect to the action, by the simulator; empty if the
+    /// experiment does not use it.
+    ActionGradient,
     /// `[T, R]` f32: one column per reward term.
     Reward,
     /// `[T]` f32 in [0, 1]: 0 if the step terminated the episode, else 1.
@@ -41,7 +44,7 @@ pub enum Field {
 
 impl Field {
     /// All fields in payload order.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::Proprioception,
         Self::Task,
         Self::PreviousLatent,
@@ -50,6 +53,7 @@ impl Field {
         Self::Mean,
         Self::Std,
         Self::LogWeights,
+        Self::ActionGradient,
         Self::Reward,
         Self::Discount,
         Self::Valid,
@@ -70,6 +74,7 @@ impl Field {
             Self::Mean => "mean",
             Self::Std => "std",
             Self::LogWeights => "log_weights",
+            Self::ActionGradient => "action_gradient",
             Self::Reward => "reward",
             Self::Discount => "discount",
             Self::Valid => "valid",
@@ -99,6 +104,7 @@ impl Field {
             Self::Mean | Self::Std => shape.components.saturating_mul(shape.action),
             Self::LogWeights if shape.components > 1 => shape.components,
             Self::LogWeights => 0,
+            Self::ActionGradient => shape.action_gradient,
             Self::State => shape.state,
             Self::Reward => shape.reward_terms,
             Self::Discount | Self::Valid | Self::First | Self::Clip => 1,
@@ -110,7 +116,12 @@ impl Field {
     /// `None` where such a row has a meaning of its own, as its observation has.
     pub fn blank(self, shape: &UnrollShape) -> Option<f64> {
         match self {
-            Self::PreviousLatent | Self::LatentNoise | Self::Action | Self::Mean | Self::Reward => Some(0.0),
+            Self::PreviousLatent
+            | Self::LatentNoise
+            | Self::Action
+            | Self::Mean
+            | Self::ActionGradient
+            | Self::Reward => Some(0.0),
             Self::Std => Some(1.0),
             Self::LogWeights => Some(-(shape.components as f64).ln()),
             Self::Proprioception

@@ -27,7 +27,7 @@ impl UnrollLayout {
     /// The layout of unrolls of this shape.
     pub fn new(shape: UnrollShape) -> Self {
         let mut ranges = PerField::default();
-        let mut description = format!("comic unroll layout 3, little-endian, T={}\n", shape.length);
+        let mut description = format!("comic unroll layout 4, little-endian, T={}\n", shape.length);
         let mut start = 0usize;
         for (field, range) in ranges.iter_mut() {
             let (rows, width) = (field.rows(shape.length), field.width(&shape));

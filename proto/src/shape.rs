@@ -26,6 +26,8 @@ pub struct UnrollShape {
     pub components: usize,
     /// S, the size of the policy's recurrent state; 0 if it is not recurrent.
     pub state: usize,
+    /// A if every transition has the derivative of the coming rewards with respect to its action, else 0.
+    pub action_gradient: usize,
 }
 
 impl UnrollShape {
@@ -42,6 +44,7 @@ impl UnrollShape {
             image: spec.image.next_multiple_of(ELEMENT),
             components: experiment.network.components(),
             state: experiment.network.state_size(),
+            action_gradient: if experiment.vmpo.action_gradient > 0.0 { spec.action } else { 0 },
         }
     }
 }

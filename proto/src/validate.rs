@@ -178,6 +178,7 @@ pub fn validate(
         (Field::Action, LARGEST_NUMBER, "within ±1e6"),
         (Field::Mean, LARGEST_NUMBER, "within ±1e6"),
         (Field::LogWeights, LARGEST_NUMBER, "within ±1e6"),
+        (Field::ActionGradient, LARGEST_NUMBER, "within ±1e6"),
         (Field::Reward, LARGEST_NUMBER, "within ±1e6"),
         (Field::State, LARGEST_NUMBER, "within ±1e6"),
     ] {

@@ -18,6 +18,7 @@ fn shape() -> impl Strategy<Value = UnrollShape> {
             image: 0,
             components,
             state,
+            action_gradient: action,
         },
     )
 }
@@ -51,9 +52,10 @@ fn the_hash_is_the_same_on_every_machine_and_in_every_build() {
         image: 0,
         components: 3,
         state: 9,
+        action_gradient: 0,
     };
     let hash = hex::encode(UnrollLayout::new(shape).hash());
-    assert_eq!(hash, "f75490a1d054879dc7fd0d707c74c54b18eb452a9e839e0c4c36c5f3e07090b0");
+    assert_eq!(hash, "cb53603309f4c91140ca1e6101c03680e15cd78f883a6498a824aa6419d255ec");
 }
 
 #[test]
@@ -109,6 +111,7 @@ proptest! {
         let shape = UnrollShape {
             length, proprioception: width, task: width, action: width, latent: width, reward_terms: width, image: 0, components: width,
             state: width,
+            action_gradient: width,
         };
         let layout = UnrollLayout::new(shape);
         prop_assert!(layout.message_limit() >= layout.size());

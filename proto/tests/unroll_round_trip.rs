@@ -16,6 +16,7 @@ fn layout() -> UnrollLayout {
         image: 0,
         components: 2,
         state: 3,
+        action_gradient: 0,
     })
 }
 

@@ -21,6 +21,7 @@ fn layout() -> UnrollLayout {
         image: 0,
         components: 3,
         state: 2,
+        action_gradient: 5,
     })
 }
 

@@ -74,6 +74,22 @@ pub trait Environment: Debug + Send {
     /// The start of the current episode.
     fn episode(&self) -> Episode;
 
+    /// From now on records what [`take_gradients`](Self::take_gradients) needs, about 40 kB a step. Only tracking does.
+    fn record_gradients(&mut self) {}
+
+    /// For each control step since the last call, oldest first: the derivative of the rewards of that step and the later ones
+    /// with respect to the action; 0 for a step that diverged. Steps before [`record_gradients`](Self::record_gradients) have none.
+    fn take_gradients(&mut self) -> Vec<[f32; 56]> {
+        Vec::new()
+    }
+
+    /// Replaces `errors` by the differences between the bodies' positions and the reference's, m, world: the root's first,
+    /// then those of the bodies that tracking compares. Empty in a task without a reference, and after a divergence. Only
+    /// evaluations ask for it.
+    fn position_errors(&self, errors: &mut Vec<[f64; 3]>) {
+        errors.clear();
+    }
+
     /// Writes the servo action: the action whose servos aim at the pose of the next reference frame. It is a demonstration
     /// and a baseline. In a task without a reference the servos aim at the current pose.
     fn servo_action(&self, action: &mut [f32]);
@@ -102,6 +118,18 @@ impl<E: Environment + ?Sized> Environment for Box<E> {
 
     fn episode(&self) -> Episode {
         (**self).episode()
+    }
+
+    fn record_gradients(&mut self) {
+        (**self).record_gradients();
+    }
+
+    fn take_gradients(&mut self) -> Vec<[f32; 56]> {
+        (**self).take_gradients()
+    }
+
+    fn position_errors(&self, errors: &mut Vec<[f64; 3]>) {
+        (**self).position_errors(errors);
     }
 
     fn servo_action(&self, action: &mut [f32]) {

@@ -139,6 +139,21 @@ impl Environment for JointEnvironment {
         Episode { clip: first + episode.clip, task: self.current, ..episode }
     }
 
+    fn record_gradients(&mut self) {
+        for environment in &mut self.environments {
+            environment.record_gradients();
+        }
+    }
+
+    /// All steps of an unroll belong to one task, so at most one environment has any.
+    fn take_gradients(&mut self) -> Vec<[f32; 56]> {
+        self.environments.iter_mut().flat_map(Environment::take_gradients).collect()
+    }
+
+    fn position_errors(&self, errors: &mut Vec<[f64; 3]>) {
+        self.environment().position_errors(errors);
+    }
+
     fn servo_action(&self, action: &mut [f32]) {
         self.environment().servo_action(action);
     }

@@ -39,6 +39,11 @@ impl Models {
         self.substeps as f64 * self.active.opt().timestep
     }
 
+    /// Physics steps in a control step.
+    pub(crate) fn substeps(&self) -> usize {
+        self.substeps
+    }
+
     /// A new simulation state. It reserves 18 MB, of which the operating system commits only the used part.
     pub(crate) fn data(&self) -> Data {
         Data::new(Arc::clone(&self.active))

@@ -14,7 +14,7 @@ pub const ALL: u32 = 8;
 /// Updates of a run.
 pub const UPDATES: u64 = 6;
 /// At this rate a version of the small policy takes seconds, so a fault can come in the middle of the run.
-pub const SLOW_BYTES_PER_SECOND: f64 = 500_000.0;
+pub const SLOW_BYTES_PER_SECOND: f64 = 650_000.0;
 
 /// A run in lockstep with a warm start, a normaliser that is set twice, and updates that publish no new version.
 ///

@@ -32,6 +32,8 @@ async fn trained_run(low_level: &str) -> Result<System> {
     let low_level = format!("network.low_level={low_level}");
     let more = [
         low_level.as_str(),
+        // A mixture has none.
+        "vmpo.control_variate=0",
         "network.lstm.units=[32]",
         "network.primitives.torso=[32]",
         "network.primitives.hidden=16",

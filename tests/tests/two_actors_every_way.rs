@@ -41,7 +41,7 @@ async fn with_an_lstm_and_a_recurrent_value_function() -> Result<()> {
 
 #[tokio::test]
 async fn with_a_mixture_of_primitives() -> Result<()> {
-    let sizes = ["network.primitives.torso=[32]", "network.primitives.hidden=16"];
+    let sizes = ["network.primitives.torso=[32]", "network.primitives.hidden=16", "vmpo.control_variate=0"];
     two_actors_learn(&[&["network.low_level=mixture"][..], &sizes].concat(), |_| Some(())).await
 }
 

@@ -23,6 +23,7 @@ use crate::render::recorder::{Look, Recorder};
 const JSON_HELP: &str = "\
 With --json one object goes to standard output:
   deterministic  whether means were taken instead of samples
+  noise          standard deviation of the noise on mean actions
   seed           the seed
   clips          one object for each clip, in the clips' order:
     clip               name
@@ -33,6 +34,11 @@ With --json one object goes to standard output:
     normalised_reward  mean of return / (most a step pays x steps left at the episode's start)
     reward_per_step    reward per survived step / most a step pays, 1.45 in tracking
     fraction_survived  mean of steps / steps left in the clip at the episode's start
+    success_rate       share of the episodes that lasted to the end of their clip, or of their time
+    tracking_error     in tracking, means over all steps and the bodies, as PHC defines them:
+      position_mm           distance in the world, mm
+      local_position_mm     distance when both roots are at the same place, mm
+      velocity_mm_per_step  difference of the velocities, mm a step
     head_height        mean over all steps of the head's height, m; 0 in a step that diverged
     reward_terms       each reward term's mean per step, by name
   tasks          in joint training the same for each task, over the episodes of all its clips
@@ -64,6 +70,10 @@ pub struct Evaluate {
     /// The mean action and the latent's mean instead of samples.
     #[arg(long)]
     deterministic: bool,
+    /// Adds Gaussian noise with this standard deviation to each entry of the mean action, before it is clipped, as
+    /// MoCapAct's evaluation does with 0.1.
+    #[arg(long, value_name = "STD", default_value_t = 0.0, requires = "deterministic", value_parser = noise)]
+    noise: f32,
     /// Episodes of each clip from random starts, instead of every start once.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     episodes: Option<u32>,
@@ -132,6 +142,7 @@ impl Evaluate {
         let options = RolloutSettings {
             episodes: self.episodes.map(|episodes| episodes as usize),
             deterministic: self.deterministic,
+            noise: self.noise,
             seed: self.seed,
             ..RolloutSettings::default()
         };
@@ -208,6 +219,13 @@ impl Audience<Box<dyn Simulated>> for Follower {
 
     fn count(&mut self, done: usize, all: usize) {
         show_progress(done, all);
+    }
+}
+
+fn noise(text: &str) -> Result<f32, String> {
+    match text.parse() {
+        Ok(noise) if (0.0..=1e3).contains(&noise) => Ok(noise),
+        _ => Err("must be a number from 0 to 1000".into()),
     }
 }
 

@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 
 use comic_experiment::{TaskPart, TaskSpec};
-use comic_tasks::MAX_REWARD_TERMS;
+use comic_tasks::{MAX_REWARD_TERMS, Outcome};
 use serde::{Deserialize, Serialize};
 
 use super::settings::RolloutSettings;
+use super::tracking_errors::TrackingSums;
 
 /// An episode that is over.
 #[derive(Clone, Debug, PartialEq)]
@@ -23,8 +24,10 @@ pub struct Finished {
     pub returns: [f64; MAX_REWARD_TERMS],
     /// Sum of the head's heights after each step, m.
     pub head_heights: f64,
-    /// The simulation diverged.
-    pub diverged: bool,
+    /// Sums of the distances to the reference.
+    pub tracking: TrackingSums,
+    /// Why the episode ended.
+    pub outcome: Outcome,
 }
 
 impl Finished {
@@ -40,6 +43,9 @@ impl Finished {
 pub struct Report {
     /// Whether actions and latents were the means instead of samples.
     pub deterministic: bool,
+    /// Standard deviation of the noise that was added to mean actions.
+    #[serde(default)]
+    pub noise: f32,
     /// Seed of random starts and noise.
     pub seed: u64,
     /// One for each clip that has a start, in the clips' order.
@@ -71,10 +77,43 @@ pub struct ClipReport {
     pub reward_per_step: f64,
     /// Mean of steps / steps left in the clip at the start.
     pub fraction_survived: f64,
+    /// Share of the episodes that did not end in the task's own failure: in tracking they lasted to the clip's end. (PHC has
+    /// another rule for a failure: a mean distance above 0.5 m.)
+    pub success_rate: f64,
+    /// Mean distances to the reference; absent in a task without a reference.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tracking_error: Option<TrackingError>,
     /// Mean over all steps of the head's height, m; 0 in a step that diverged.
     pub head_height: f64,
     /// Mean over all steps of each reward term.
     pub reward_terms: BTreeMap<String, f64>,
+}
+
+/// Means over all steps of the distances between the bodies and the reference's, as PHC (Luo et al., 2023) defines them.
+/// The bodies are the root and those that tracking compares.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrackingError {
+    /// Distance in the world, mm (E_g-mpjpe).
+    pub position_mm: f64,
+    /// Distance when both roots are at the same place, mm (E_mpjpe).
+    pub local_position_mm: f64,
+    /// Difference of the velocities, mm per control step (E_vel).
+    pub velocity_mm_per_step: f64,
+}
+
+impl TrackingError {
+    fn of(finished: &[&Finished]) -> Option<Self> {
+        let steps: usize = finished.iter().map(|episode| episode.tracking.steps).sum();
+        let mean = |sum: &dyn Fn(&TrackingSums) -> f64| {
+            1e3 * ratio(finished.iter().map(|episode| sum(&episode.tracking)).sum(), steps as f64)
+        };
+        (steps > 0).then(|| Self {
+            position_mm: mean(&|sums| sums.position),
+            local_position_mm: mean(&|sums| sums.local_position),
+            velocity_mm_per_step: mean(&|sums| sums.velocity),
+        })
+    }
 }
 
 impl Report {
@@ -97,7 +136,7 @@ impl Report {
         let several = spec.tasks.len() > 1;
         let tasks = spec.tasks.iter().enumerate().filter(|_| several).map(of_task).collect();
         let overall = ClipReport::new("overall", spec, &finished.iter().collect::<Vec<_>>());
-        Self { deterministic: options.deterministic, seed: options.seed, clips, tasks, overall }
+        Self { deterministic: options.deterministic, noise: options.noise, seed: options.seed, clips, tasks, overall }
     }
 }
 
@@ -112,12 +151,14 @@ impl ClipReport {
         Self {
             clip: clip.to_string(),
             episodes: finished.len(),
-            diverged: finished.iter().filter(|episode| episode.diverged).count(),
+            diverged: finished.iter().filter(|episode| episode.outcome == Outcome::Diverged).count(),
             length_mean: mean(&|episode| episode.steps() as f64),
             return_mean: mean(&total),
             normalised_reward: mean(&|episode| ratio(total(episode), most(episode) * episode.steps_left as f64)),
             reward_per_step: per_step(&|episode| ratio(total(episode), most(episode))),
             fraction_survived: mean(&|episode| ratio(episode.steps() as f64, episode.steps_left as f64)),
+            success_rate: mean(&|episode| if episode.outcome == Outcome::Truncated { 1.0 } else { 0.0 }),
+            tracking_error: TrackingError::of(finished),
             head_height: per_step(&|episode| episode.head_heights),
             reward_terms: spec
                 .reward_terms
@@ -161,7 +202,12 @@ mod tests {
         returns[..2].copy_from_slice(&[pose, velocity]);
         // 1 m in a short episode and 2 m in a long one.
         let head_heights = if steps < 10 { 1.0 } else { 2.0 } * steps as f64;
-        Finished { clip, start: 0, steps_left, rewards: vec![0.0; steps], returns, head_heights, diverged: false }
+        let outcome = if steps == steps_left { Outcome::Truncated } else { Outcome::Terminated };
+        // 2 cm a step, of which 1 cm is the root's, and equal velocities.
+        let (position, local_position) = (0.02 * steps as f64, 0.01 * steps as f64);
+        let tracking = TrackingSums { position, local_position, velocity: 0.0, steps };
+        let rewards = vec![0.0; steps];
+        Finished { clip, start: 0, steps_left, rewards, returns, head_heights, tracking, outcome }
     }
 
     #[test]
@@ -181,6 +227,11 @@ mod tests {
         close(walk.length_mean, 12.5);
         // (5 × 1 m + 20 × 2 m) / 25: over steps, not episodes.
         close(walk.head_height, 1.8);
+        close(walk.success_rate, 0.5);
+        let error = walk.tracking_error.unwrap();
+        close(error.position_mm, 20.0);
+        close(error.local_position_mm, 10.0);
+        close(error.velocity_mm_per_step, 0.0);
         close(walk.reward_terms["pose"], (2.9 + 14.5) / 25.0);
         close(walk.reward_terms["velocity"], (1.45 + 14.5) / 25.0);
 

@@ -11,6 +11,7 @@ use rand_pcg::Pcg64;
 
 use super::report::Finished;
 use super::settings::RolloutSettings;
+use super::tracking_errors::TrackingErrors;
 use crate::Error;
 use crate::acting_loop::{ActingLoop, Controller, Recorder, Rollout};
 use crate::forward_pass::{ActingRow, ForwardPass};
@@ -63,6 +64,8 @@ pub(super) fn run<E: Environment, F: ForwardPass>(
         all: starts.len(),
         finished: Vec::with_capacity(starts.len()),
         deterministic: options.deterministic,
+        noise: options.noise,
+        errors: Vec::new(),
         rng: Pcg64::seed_from_u64(options.seed),
         action: vec![0.0; shape.action],
         audience,
@@ -87,6 +90,10 @@ struct EpisodeRecorder<'a, E> {
     all: usize,
     finished: Vec<Finished>,
     deterministic: bool,
+    /// Standard deviation of the noise on mean actions.
+    noise: f32,
+    /// Scratch: the bodies' position errors after a step.
+    errors: Vec<[f64; 3]>,
     /// The noise of all environments.
     rng: Pcg64,
     /// Scratch: the sampled action.
@@ -102,6 +109,7 @@ struct Running {
     start: Start,
     /// The reward of each step so far.
     rewards: Vec<f64>,
+    tracking: TrackingErrors,
 }
 
 impl<E: Environment> EpisodeRecorder<'_, E> {
@@ -113,14 +121,16 @@ impl<E: Environment> EpisodeRecorder<'_, E> {
         row: &mut ActingRow<'_>,
     ) -> Result<ControlFlow<()>, Error> {
         let Some((number, start)) = self.queue.next() else { return Ok(ControlFlow::Continue(())) };
-        self.running[index] = Running { number, start: *start, rewards: Vec::new() };
         rollout.environment.reset_to(start.clip, start.start)?;
+        rollout.environment.position_errors(&mut self.errors);
+        let tracking = TrackingErrors::at_start(&self.errors);
+        self.running[index] = Running { number, start: *start, rewards: Vec::new(), tracking };
         rollout.begin_episode(row);
         self.audience.watch(number, &mut rollout.environment)
     }
 
     fn finish(&mut self, index: usize, rollout: &Rollout<E>, outcome: Outcome) {
-        let Running { start, rewards, .. } = std::mem::take(&mut self.running[index]);
+        let Running { start, rewards, tracking, .. } = std::mem::take(&mut self.running[index]);
         self.finished.push(Finished {
             clip: start.clip,
             start: start.start,
@@ -128,7 +138,8 @@ impl<E: Environment> EpisodeRecorder<'_, E> {
             rewards,
             returns: rollout.returns,
             head_heights: rollout.head_heights,
-            diverged: outcome == Outcome::Diverged,
+            tracking: tracking.sums(),
+            outcome,
         });
         self.audience.count(self.finished.len(), self.all);
     }
@@ -159,12 +170,14 @@ impl<E: Environment> Recorder<E> for EpisodeRecorder<'_, E> {
             return Ok(ControlFlow::Continue(()));
         }
         match self.deterministic {
-            true => self.action.copy_from_slice(row.mode()),
+            true => row.mode_with_noise(self.noise, &mut self.action, &mut self.rng),
             false => row.sample(&mut self.action, &mut self.rng),
         }
         let step = rollout.step(&self.action, row);
-        let Running { number, rewards, .. } = &mut self.running[index];
+        rollout.environment.position_errors(&mut self.errors);
+        let Running { number, rewards, tracking, .. } = &mut self.running[index];
         rewards.push(step.reward_terms.iter().sum());
+        tracking.add(&self.errors);
         let mut flow = ControlFlow::Continue(());
         if step.outcome != Outcome::Diverged {
             flow = self.audience.watch(*number, &mut rollout.environment)?;
@@ -197,6 +210,7 @@ mod tests {
         image: 0,
         components: 1,
         state: 0,
+        action_gradient: 0,
     };
 
     /// Falls after three steps when it starts at an odd frame; pays 1 a step for an action of exactly 0.25.

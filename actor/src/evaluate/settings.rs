@@ -7,6 +7,8 @@ pub struct RolloutSettings {
     pub episodes: Option<usize>,
     /// The mean action and the latent's mean instead of samples.
     pub deterministic: bool,
+    /// Standard deviation of Gaussian noise that is added to each entry of a mean action, before clipping.
+    pub noise: f32,
     /// Seed of random starts and of the noise.
     pub seed: u64,
     /// Environments in one forward pass.
@@ -15,6 +17,6 @@ pub struct RolloutSettings {
 
 impl Default for RolloutSettings {
     fn default() -> Self {
-        Self { episodes: None, deterministic: false, seed: 1, environments: 16 }
+        Self { episodes: None, deterministic: false, noise: 0.0, seed: 1, environments: 16 }
     }
 }

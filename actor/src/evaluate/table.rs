@@ -4,7 +4,8 @@ use std::fmt;
 
 use super::{ClipReport, Report};
 
-const FIXED: [&str; 7] = ["episodes", "return", "normalised", "per step", "survived", "length", "head"];
+const FIXED: [&str; 9] =
+    ["episodes", "return", "normalised", "per step", "survived", "success", "length", "error", "head"];
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -45,7 +46,9 @@ fn row(clip: &ClipReport) -> Vec<String> {
         format!("{:.3}", clip.normalised_reward),
         format!("{:.3}", clip.reward_per_step),
         format!("{:.3}", clip.fraction_survived),
+        format!("{:.3}", clip.success_rate),
         format!("{:.1}", clip.length_mean),
+        clip.tracking_error.map_or("–".into(), |error| format!("{:.0} mm", error.position_mm)),
         format!("{:.2} m", clip.head_height),
     ];
     cells.extend(clip.reward_terms.values().map(|value| format!("{value:.3}")));

@@ -59,6 +59,19 @@ impl UnrollRecorder {
         Self { unrolls: numbers.map(open).collect(), layout, t: 0, steps: 0, episodes: 0 }
     }
 
+    /// Writes the derivatives of the transitions of an environment's unroll, in their order. A task without derivatives has
+    /// none, and the rows stay 0.
+    pub(super) fn write_gradients(&mut self, index: usize, gradients: &[[f32; 56]]) {
+        let buffer = &mut self.unrolls[index].buffer;
+        let length = buffer.layout().shape().length;
+        let transitions: Vec<usize> = (0..length).filter(|t| buffer.row(Field::Valid, *t)[0] == 1.0).collect();
+        if transitions.len() == gradients.len() {
+            for (t, gradient) in transitions.into_iter().zip(gradients) {
+                buffer.row_mut(Field::ActionGradient, t).copy_from_slice(gradient);
+            }
+        }
+    }
+
     /// The full unroll of an environment. An empty one replaces it.
     pub(super) fn take(&mut self, index: usize) -> RecordedUnroll {
         let unroll = &mut self.unrolls[index];

@@ -109,6 +109,7 @@ fn layout(length: usize) -> Arc<UnrollLayout> {
         image: 0,
         components: 1,
         state: 3,
+        action_gradient: 0,
     }))
 }
 

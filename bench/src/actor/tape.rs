@@ -87,6 +87,15 @@ impl Environment for Recorded {
     fn episode(&self) -> Episode {
         self.environment.episode()
     }
+    fn position_errors(&self, errors: &mut Vec<[f64; 3]>) {
+        self.environment.position_errors(errors);
+    }
+    fn record_gradients(&mut self) {
+        self.environment.record_gradients();
+    }
+    fn take_gradients(&mut self) -> Vec<[f32; 56]> {
+        self.environment.take_gradients()
+    }
     fn servo_action(&self, action: &mut [f32]) {
         self.environment.servo_action(action);
     }

@@ -34,6 +34,7 @@ impl Recorded {
                 | Field::LatentNoise
                 | Field::Action
                 | Field::Mean
+                | Field::ActionGradient
                 | Field::Reward => Vec::try_from(Tensor::randn([count as i64], (Kind::Float, Device::Cpu)))
                     .context("cannot copy random numbers")?,
             };

@@ -10,7 +10,8 @@ use crate::fault::{Fault, POSITIVE, Section};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Tracking {
-    /// The reference frames in the observation, counted from the current frame (S: the next five).
+    /// The reference frames in the observation, counted from the current frame (S: the next five). 0 is the current frame:
+    /// with it, frames 1 and 2 tell the reference's velocity exactly (D).
     pub reference_steps: Vec<usize>,
     /// Smallest number of frames from an episode's start to the clip's end (dm_control: 10). No episode starts in the last
     /// `max(reference_steps) + min_steps` frames. 5 gives the supplement's "last 10 frames".
@@ -28,6 +29,52 @@ pub struct Tracking {
     /// Task observations, by dm_control's names without `walker/`, in this order
     /// (MoCapAct's choice: the supplement's "relative target positions and orientations in the local frame").
     pub observations: Vec<String>,
+    /// The derivative of the reward that actors compute if `vmpo.action_gradient` is not 0.
+    pub gradient: GradientOfReward,
+}
+
+/// What the simulator's derivative of `vmpo.action_gradient` is the derivative of (D): the rewards of the coming steps, with
+/// softer exponents and a term for the root's velocity.
+///
+/// A reward term w exp(−c Δ²) counts as w exp(−c p Δ²). A power p below 1 gives it a slope where the error is so large that
+/// the term itself is flat.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GradientOfReward {
+    /// δ: each later step counts this much less. The approximation of the dynamics is good for a few steps only.
+    pub decay: f64,
+    /// p of the term `appendages`.
+    pub appendages: f64,
+    /// p of `body_quaternions`.
+    pub body_quaternions: f64,
+    /// p of `center_of_mass`.
+    pub center_of_mass: f64,
+    /// p of `joints_velocity`.
+    pub joints_velocity: f64,
+    /// Weight w of w exp(−½ Σ (Δ / scale)²) for the root's velocity. The reward has no such term, but a body that loses its
+    /// balance differs there first. The scales are 0.3 m/s and 1.5 rad/s.
+    pub root_velocity: f64,
+}
+
+impl Default for GradientOfReward {
+    fn default() -> Self {
+        Self {
+            decay: 0.8,
+            appendages: 0.25,
+            body_quaternions: 1.0,
+            center_of_mass: 1.0,
+            joints_velocity: 0.2,
+            root_velocity: 0.03,
+        }
+    }
+}
+
+impl GradientOfReward {
+    /// p of every term, in the order of [`TRACKING_REWARD_TERMS`]. The term `termination` is linear.
+    pub fn powers(&self) -> [f64; TRACKING_REWARD_TERMS.len()] {
+        let Self { appendages, body_quaternions, center_of_mass, joints_velocity, .. } = self;
+        [*appendages, *body_quaternions, *center_of_mass, *joints_velocity, 1.0]
+    }
 }
 
 impl Default for Tracking {
@@ -43,6 +90,7 @@ impl Default for Tracking {
             observations: ["body_height", "reference_rel_bodies_pos_local", "reference_rel_bodies_quats"]
                 .map(String::from)
                 .to_vec(),
+            gradient: GradientOfReward::default(),
         }
     }
 }
@@ -63,12 +111,19 @@ impl TaskParameters for Tracking {
         section.ensure(
             "reference_steps",
             reference_steps,
-            (1..=64).contains(&reference_steps.len()) && reference_steps.iter().all(|step| (1..=1000).contains(step)),
-            "must be 1 to 64 numbers of frames ahead, each 1 to 1000",
+            (1..=64).contains(&reference_steps.len()) && reference_steps.iter().all(|step| *step <= 1000),
+            "must be 1 to 64 numbers of frames ahead, each 0 to 1000",
         )?;
         section.ensure("min_steps", min_steps, (1..=100_000).contains(min_steps), "must be 1 to 100000")?;
         section.ensure("termination_threshold", termination_threshold, *termination_threshold > 0.0, POSITIVE)?;
         section.ensure("time_limit", time_limit, *time_limit > 0.0, "must be positive seconds")?;
+        let GradientOfReward { decay, root_velocity, .. } = self.gradient;
+        section.ensure("gradient.decay", decay, (0.0..=1.0).contains(&decay), "must be in [0, 1]")?;
+        for (name, power) in TRACKING_REWARD_TERMS.iter().zip(self.gradient.powers()) {
+            section.ensure(&format!("gradient.{name}"), power, power > 0.0 && power <= 1.0, "must be in (0, 1]")?;
+        }
+        let holds = root_velocity >= 0.0 && root_velocity.is_finite();
+        section.ensure("gradient.root_velocity", root_velocity, holds, "must be 0 or more")?;
         for (index, name) in observations.iter().enumerate() {
             let known = tracking_observation_size(name, 1).is_some();
             let remedy = format!("must be one of {}", TRACKING_OBSERVATIONS.join(", "));
@@ -99,6 +154,8 @@ impl TaskParameters for Tracking {
 /// Reward terms of the tracking task, in the order of dm_control's sorted reward channels.
 pub const TRACKING_REWARD_TERMS: [&str; 5] =
     ["appendages", "body_quaternions", "center_of_mass", "joints_velocity", "termination"];
+/// The largest value of each term, in the same order (`reference_pose/rewards.py`: `comic_reward_fn`).
+pub const TRACKING_TERM_LIMITS: [f64; 5] = [0.075, 0.325, 0.05, 0.5, 0.5];
 /// The largest reward of a tracking step: 0.5 + 0.5·(0.1 + 1 + 0.15 + 0.65).
 pub const TRACKING_MAX_REWARD: f64 = 1.45;
 
@@ -135,4 +192,14 @@ pub fn tracking_observation_size(name: &str, steps: usize) -> Option<usize> {
         "reference_appendages_pos" => steps * 15,
         _ => return None,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_terms_largest_values_add_up_to_the_largest_reward() {
+        assert!((TRACKING_TERM_LIMITS.iter().sum::<f64>() - TRACKING_MAX_REWARD).abs() < 1e-12);
+    }
 }

@@ -166,10 +166,7 @@ impl Trainer {
 
     /// The gradient steps on a batch, and the mean of their losses.
     fn take_gradient_steps(&mut self, tensors: MinibatchTensors) -> Result<Option<Losses>> {
-        let optimiser = &self.experiment.optimiser;
-        let used = self.budget.used(&self.state.progress).min(1.0);
-        let decay = 1.0 - (1.0 - optimiser.final_learning_rate_share) * used;
-        self.state.algorithm.set_learning_rate(optimiser.learning_rate * decay);
+        self.state.algorithm.set_progress(self.budget.used(&self.state.progress));
         let mut losses = Vec::new();
         for unrolls in draw(&self.experiment, &mut self.state.progress.random) {
             let minibatch = tensors.select(&unrolls);

@@ -18,6 +18,8 @@ pub struct Evidence<'a> {
     pub kl_std: &'a Tensor,
     /// KL of a mixture's weights to the behaviour policy's.
     pub kl_weights: Option<&'a Tensor>,
+    /// The whole KL(behaviour ‖ π), if there is a control variate.
+    pub kl: Option<&'a Tensor>,
     /// 1 where the step is a transition; a step with 0 has no influence, whatever its other numbers are.
     pub valid: &'a Tensor,
     /// The steps that each E-step ranks, booleans: one group for each η, and no step is in two groups.
@@ -37,6 +39,8 @@ pub struct KlLimits {
     pub epsilon_discrete: f64,
     /// Fraction of the valid steps in D̃.
     pub top_fraction: f64,
+    /// κ: weight of the control variate.
+    pub control_variate: f64,
 }
 
 impl From<&Vmpo> for KlLimits {
@@ -47,6 +51,7 @@ impl From<&Vmpo> for KlLimits {
             epsilon_std: config.epsilon_std,
             epsilon_discrete: config.epsilon_discrete,
             top_fraction: config.top_fraction,
+            control_variate: config.control_variate,
         }
     }
 }
@@ -80,6 +85,10 @@ impl Improvement {
 /// - D̃ holds the ⌊`top_fraction` · valid steps⌋ (at least one) largest advantages of the valid steps, and steps that tie
 ///   with the smallest of them, so that the order of the batch does not matter.
 /// - L_π = −Σ_{D̃} ψ ln π(a|s), ψ = softmax over D̃ of A/η, without gradient.
+///   With the control variate, L_π has the term κ · mean over valid steps of ln π(a|s) + KL(behaviour ‖ π). Its expected
+///   gradient is 0 for a policy that does not depend on the sampled actions, which is exact in the first gradient step on a
+///   batch, because E_behaviour[ln π] = −KL − (the behaviour's entropy). Without it, imitating the best half of the actions
+///   also imitates noise that has nothing to do with their advantages.
 /// - L_η = η ε_η + η ln(1/|D̃| Σ_{D̃} exp(A/η)).
 /// - L_α = Σ_k α_k (ε_k − sg KL_k) + sg(α_k) KL_k, KL_k the mean over all valid steps.
 ///
@@ -87,7 +96,10 @@ impl Improvement {
 /// valid steps (D). So a step counts the same whatever its group, and a group without a step has no influence.
 pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits: &KlLimits) -> Improvement {
     let mask = evidence.valid.gt(0.5);
-    let (policy, temperature) = expectation_steps(evidence, &mask, multipliers, limits);
+    let (mut policy, temperature) = expectation_steps(evidence, &mask, multipliers, limits);
+    if let Some(kl) = evidence.kl {
+        policy = policy + masked_mean(&(evidence.log_prob + kl), evidence.valid) * limits.control_variate;
+    }
     let kl_mean = masked_mean(evidence.kl_mean, evidence.valid);
     let kl_std = masked_mean(evidence.kl_std, evidence.valid);
     let gaussian = constraint(&kl_mean, &multipliers.alpha_mean(), limits.epsilon_mean)

@@ -1,6 +1,6 @@
 //! Networks, multipliers and optimiser, stepped together.
 
-use comic_experiment::{Experiment, Prior, TaskSpec};
+use comic_experiment::{Experiment, Prior, TaskName, TaskSpec};
 use comic_networks::{ActionDistribution, NormaliserStatistics, Policy, RecurrentState, Value, to_safetensors};
 use comic_proto::{Field, UnrollShape};
 use tch::{Device, Kind, Tensor, nn};
@@ -65,7 +65,7 @@ impl VmpoLearner {
         let networks_group = adam.add_group("networks", parameters, optimiser.learning_rate);
         let multiplier = vec![("multipliers".to_string(), multipliers.parameter().shallow_clone())];
         let multipliers_group = adam.add_group("multipliers", multiplier, optimiser.multiplier_learning_rate);
-        Ok(Self {
+        let mut learner = Self {
             spec: spec.clone(),
             experiment: experiment.clone(),
             policy_store,
@@ -76,7 +76,9 @@ impl VmpoLearner {
             adam,
             networks_group,
             multipliers_group,
-        })
+        };
+        learner.set_progress(0.0);
+        Ok(learner)
     }
 
     /// The online policy's parameters: what actors need.
@@ -132,6 +134,7 @@ impl VmpoLearner {
             image: self.spec.image,
             components: self.experiment.network.components(),
             state: self.experiment.network.state_size(),
+            action_gradient: if self.experiment.vmpo.action_gradient > 0.0 { self.spec.action } else { 0 },
         };
         let expected = MinibatchShape { unrolls: found.unrolls, tasks: self.spec.tasks.len(), unroll };
         let known = self.spec.clips.len();
@@ -234,14 +237,18 @@ impl VmpoLearner {
 }
 
 impl Algorithm for VmpoLearner {
-    /// L = L_π + L_η + L_α + w · value loss + β · the latent's KL − the entropy bonus.
+    /// L = L_π + L_η + L_α + w · value loss + β · the latent's KL − the simulator's derivative times the mean action − the
+    /// entropy bonus.
     fn step(&mut self, minibatch: &MinibatchTensors) -> Result<Losses, Error> {
         self.check(minibatch)?;
         let pass = self.forward(minibatch);
         let advantage = (&pass.targets - pass.values.detach()).sum_dim_intlist(-1i64, false, Kind::Float);
         let policy = &pass.acting.action;
         let kl_weights = policy.kl_weights(&pass.behaviour);
+        let Experiment { network, vmpo, .. } = &self.experiment;
+        let kl = if vmpo.control_variate == 0.0 { None } else { policy.kl_from(&pass.behaviour) };
         let evidence = Evidence {
+            kl: kl.as_ref(),
             log_prob: &policy.log_prob(&rows(&minibatch[Field::Action])),
             advantage: &advantage,
             kl_mean: &policy.kl_mean(&pass.behaviour),
@@ -250,10 +257,19 @@ impl Algorithm for VmpoLearner {
             valid: &pass.valid,
             groups: &pass.groups,
         };
-        let Experiment { network, vmpo, .. } = &self.experiment;
         let improvement = policy_improvement(&evidence, &self.multipliers, &KlLimits::from(vmpo));
         let mut total =
             improvement.total() + &pass.value_loss * vmpo.value_weight + &pass.latent_kl * network.latent.beta;
+        if vmpo.action_gradient != 0.0 {
+            // Divided by η, as the advantages are: L_π is about the reward divided by η. Only tracking has a derivative.
+            let temperatures = self.multipliers.temperatures().detach();
+            let tracking = self.spec.tasks.iter().position(|task| task.name == TaskName::Tracking.name());
+            let own = tracking.unwrap_or(0).min(temperatures.numel().saturating_sub(1));
+            let eta = temperatures.select(0, own as i64);
+            let gain =
+                (rows(&minibatch[Field::ActionGradient]) * policy.mean()).sum_dim_intlist(-1i64, false, Kind::Float);
+            total = &total - masked_mean(&gain, &pass.valid) / eta * vmpo.action_gradient;
+        }
         if vmpo.entropy != 0.0 {
             // A new tensor: an in-place sum would write over what the graph holds.
             let bonus = masked_mean(&policy.entropy(), &pass.valid) * vmpo.entropy;
@@ -303,6 +319,15 @@ impl Algorithm for VmpoLearner {
     /// The multipliers keep the experiment's rate.
     fn set_learning_rate(&mut self, rate: f64) {
         self.set_learning_rates(rate, self.experiment.optimiser.multiplier_learning_rate);
+    }
+
+    /// The learning rate of the networks, and the standard deviation of the actions.
+    fn set_progress(&mut self, used: f64) {
+        let Experiment { network, optimiser, .. } = &self.experiment;
+        let used = used.clamp(0.0, 1.0);
+        let rate = optimiser.learning_rate * (1.0 - (1.0 - optimiser.final_learning_rate_share) * used);
+        self.policy.set_scheduled_std(network.initial_std * (network.final_std / network.initial_std).powf(used));
+        self.set_learning_rate(rate);
     }
 
     fn reset_optimiser(&mut self) {

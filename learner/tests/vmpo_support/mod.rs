@@ -107,6 +107,8 @@ pub(crate) struct Unrolls {
     pub(crate) action: Vec<f32>,
     pub(crate) mean: Vec<f32>,
     pub(crate) std: Vec<f32>,
+    /// Empty if the experiment does not use it.
+    pub(crate) action_gradient: Vec<f32>,
     pub(crate) reward: Vec<f32>,
     pub(crate) discount: Vec<f32>,
     pub(crate) valid: Vec<f32>,
@@ -151,6 +153,7 @@ impl Unrolls {
             action: numbers.take(rows * WIDTHS.action),
             mean: numbers.take(rows * WIDTHS.action),
             std: numbers.take(rows * WIDTHS.action).iter().map(|value| 0.6 + 0.3 * value).collect(),
+            action_gradient: Vec::new(),
             reward: numbers.take(rows * WIDTHS.reward_terms),
             discount: vec![1.0; rows],
             valid: vec![1.0; rows],
@@ -226,6 +229,7 @@ impl Unrolls {
             image: 0,
             components: self.mean.len() / self.action.len(),
             state: self.state.len() / self.count,
+            action_gradient: self.action_gradient.len() / (self.count * LENGTH),
         };
         MinibatchShape { unrolls: self.count, tasks: self.task_count, unroll }
     }
@@ -245,6 +249,7 @@ impl Unrolls {
             Field::Valid => &self.valid,
             Field::First => &self.first,
             Field::State => &self.state,
+            Field::ActionGradient => &self.action_gradient,
             Field::Clip | Field::Image => &[],
         };
         MinibatchSource { floats: PerField::from_fn(floats), clip: &self.clip, image: &[], tasks: &self.tasks }

@@ -26,6 +26,7 @@ pub(crate) fn layout() -> Arc<UnrollLayout> {
         image: 0,
         components: 1,
         state: 0,
+        action_gradient: 0,
     };
     Arc::new(UnrollLayout::new(shape))
 }

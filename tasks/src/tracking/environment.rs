@@ -3,11 +3,13 @@
 use std::sync::Arc;
 
 use comic_clips::pose_to_action;
+use comic_clips::spatial::subtract;
 use comic_experiment::{TaskSpec, Tracking};
 use mujoco_rs::prelude::MjModel;
 use rand::SeedableRng;
 use rand_pcg::Pcg64;
 
+use super::gradient::GradientTape;
 use super::observation::{Observation, View};
 use super::reference::Reference;
 use super::reward;
@@ -64,14 +66,26 @@ pub struct TrackingEnvironment {
     previous: [f64; 63],
     error: f64,
     diverged: bool,
+    /// Records steps for the derivative of the reward, if somebody wants it.
+    tape: Option<GradientTape>,
 }
 
 impl TrackingEnvironment {
     fn new(task: Arc<TrackingTask>, seed: u64) -> Self {
         let data = task.models.data();
         let random = Pcg64::seed_from_u64(seed);
-        let mut environment =
-            Self { task, data, random, clip: 0, start: 0, frame: 0, previous: [0.0; 63], error: 0.0, diverged: false };
+        let mut environment = Self {
+            task,
+            data,
+            random,
+            clip: 0,
+            start: 0,
+            frame: 0,
+            previous: [0.0; 63],
+            error: 0.0,
+            diverged: false,
+            tape: None,
+        };
         environment.reset();
         environment
     }
@@ -98,6 +112,9 @@ impl TrackingEnvironment {
     }
 
     fn place(&mut self, clip: usize, frame: usize) {
+        if let Some(tape) = &mut self.tape {
+            tape.end_episode();
+        }
         let Self { task, data, .. } = self;
         let reference = &task.references[clip];
         let preset = task.config.preset_actuators.then(|| pose_to_action(reference.joints(frame)));
@@ -108,8 +125,12 @@ impl TrackingEnvironment {
         (self.clip, self.start, self.frame, self.diverged) = (clip, frame, frame, false);
     }
 
-    fn diverge(&mut self) -> Step {
+    /// `began` says whether the step was recorded.
+    fn diverge(&mut self, began: bool) -> Step {
         self.diverged = true;
+        if let Some(tape) = &mut self.tape {
+            tape.diverge(began);
+        }
         Step::DIVERGED
     }
 
@@ -182,6 +203,28 @@ impl Environment for TrackingEnvironment {
         Episode { clip: self.clip, start: reference.first + self.start, steps_left, task: 0 }
     }
 
+    fn record_gradients(&mut self) {
+        let TrackingTask { models, config, .. } = self.task.as_ref();
+        self.tape = GradientTape::new(&models.shared(), models.substeps(), &config.gradient);
+    }
+
+    fn take_gradients(&mut self) -> Vec<[f32; 56]> {
+        self.tape.as_mut().map_or_else(Vec::new, GradientTape::take)
+    }
+
+    fn position_errors(&self, errors: &mut Vec<[f64; 3]>) {
+        errors.clear();
+        if self.diverged {
+            return;
+        }
+        let (data, reference) = (&self.data, self.reference());
+        let root = std::array::from_fn(|axis| data.qpos()[axis]);
+        errors.push(subtract(root, *reference.position(self.frame)));
+        let targets = reference.body_positions(self.frame).as_chunks::<3>().0;
+        let bodies = &data.xpos()[self.task.walker.tracked.clone()];
+        errors.extend(bodies.iter().zip(targets).map(|(body, target)| subtract(*body, *target)));
+    }
+
     fn servo_action(&self, action: &mut [f32]) {
         let target = pose_to_action(self.reference().joints(self.frame + 1));
         for (place, value) in action.iter_mut().zip(target) {
@@ -194,15 +237,18 @@ impl Simulated for TrackingEnvironment {
     /// References stay at the clip's last frame when a caller steps after the clip's end.
     fn step_control(&mut self, control: &[f64; 56]) -> Step {
         if self.diverged || !control.iter().all(|value| value.is_finite()) {
-            return self.diverge();
+            return self.diverge(false);
         }
         self.previous.copy_from_slice(self.data.qpos());
+        if let Some(tape) = &mut self.tape {
+            tape.begin_step(&self.data, control);
+        }
         self.task.models.step(&mut self.data, control);
         self.frame += 1;
         if !is_healthy(&self.data) {
-            return self.diverge();
+            return self.diverge(true);
         }
-        let Self { task, data, frame, .. } = self;
+        let Self { task, data, frame, tape, .. } = self;
         let (reference, config) = (&task.references[self.clip], &task.config);
         self.error = reward::termination_error(config.termination_error, &task.walker, data, reference, *frame);
         let reward_terms =
@@ -214,6 +260,10 @@ impl Simulated for TrackingEnvironment {
         } else {
             Outcome::Running
         };
+        if let Some(tape) = tape {
+            let ended = outcome != Outcome::Running;
+            tape.end_step(&task.walker, data, reference, *frame, config.termination_threshold, ended);
+        }
         let discount = if outcome == Outcome::Terminated { 0.0 } else { 1.0 };
         Step { reward_terms, discount, outcome, head_height: task.walker.head_height(data) }
     }

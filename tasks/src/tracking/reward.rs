@@ -28,6 +28,9 @@ pub(crate) fn termination_error(
     }
 }
 
+/// c of each term w exp(−c Δ²), in the order of `TRACKING_REWARD_TERMS`; the last term is linear.
+pub(crate) const EXPONENTS: [f64; MAX_REWARD_TERMS] = [40.0, 2.0, 10.0, 0.1, 0.0];
+
 /// The reward's terms with their weights, in the order of `TRACKING_REWARD_TERMS`. The weights of the pose terms add up to
 /// 0.45; joint velocities and termination have 0.5 each. The termination term is negative in a step that terminates.
 pub(crate) fn terms(
@@ -47,10 +50,10 @@ pub(crate) fn terms(
     let center_of_mass = squared(&data.subtree_com()[walker.frame], reference.center_of_mass(frame));
     let velocities = squared(&data.qvel()[ROOT_VELOCITIES..], reference.joints_velocity(frame));
     [
-        0.5 * 0.15 * (-40.0 * appendages).exp(),
-        0.5 * 0.65 * (-2.0 * orientations).exp(),
-        0.5 * 0.1 * (-10.0 * center_of_mass).exp(),
-        0.5 * (-0.1 * velocities).exp(),
+        0.5 * 0.15 * (-EXPONENTS[0] * appendages).exp(),
+        0.5 * 0.65 * (-EXPONENTS[1] * orientations).exp(),
+        0.5 * 0.1 * (-EXPONENTS[2] * center_of_mass).exp(),
+        0.5 * (-EXPONENTS[3] * velocities).exp(),
         0.5 * (1.0 - error / threshold),
     ]
 }

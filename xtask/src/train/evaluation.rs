@@ -36,11 +36,24 @@ pub(crate) struct ClipEvaluation {
     /// Reward per survived step / the largest reward of a step.
     pub(crate) reward_per_step: f64,
     fraction_survived: f64,
+    /// Absent in evaluations of earlier releases, as the two below.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    success_rate: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    tracking_error: Option<TrackingError>,
     /// m; absent in evaluations of earlier releases.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     head_height: Option<f64>,
     /// Per survived step.
     reward_terms: BTreeMap<String, f64>,
+}
+
+/// Mean distances to the reference.
+#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
+struct TrackingError {
+    position_mm: f64,
+    local_position_mm: f64,
+    velocity_mm_per_step: f64,
 }
 
 /// The file with the evaluations in a run's directory.
@@ -126,6 +139,10 @@ pub(super) fn table(columns: &[(String, Evaluation)]) -> String {
         row("normalised reward", &|clip| Some(clip.normalised_reward));
         row("reward per step / most", &|clip| Some(clip.reward_per_step));
         row("fraction survived", &|clip| Some(clip.fraction_survived));
+        row("success rate", &|clip| clip.success_rate);
+        row("position error, mm", &|clip| clip.tracking_error.map(|error| error.position_mm));
+        row("the same from the root, mm", &|clip| clip.tracking_error.map(|error| error.local_position_mm));
+        row("velocity error, mm/step", &|clip| clip.tracking_error.map(|error| error.velocity_mm_per_step));
         row("head's height, m", &|clip| clip.head_height);
         for term in clip.reward_terms.keys() {
             row(&format!("{term}, per step"), &|clip| clip.reward_terms.get(term).copied());
@@ -147,6 +164,8 @@ mod tests {
             normalised_reward,
             reward_per_step: 0.5,
             fraction_survived: 0.25,
+            success_rate: Some(0.5),
+            tracking_error: None,
             head_height: Some(1.5),
             reward_terms: [("com".to_owned(), 0.01)].into(),
         }

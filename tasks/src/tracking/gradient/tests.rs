@@ -1,0 +1,172 @@
+//! The derivative against finite differences.
+
+use std::sync::Arc;
+
+use comic_clips::Catalogue;
+use comic_clips::spatial::{about_vector, multiply, norm};
+use comic_experiment::{ClipSource, TRACKING_TERM_LIMITS, Tracking};
+
+use super::reward_derivative::{ROOT_VELOCITY_SCALES, squares};
+use super::*;
+use crate::environment::{Environment as _, Simulated as _};
+use crate::tracking::environment::TrackingEnvironment;
+use crate::tracking::reward;
+use crate::tracking::task::TrackingTask;
+
+const DECAY: f64 = 0.7;
+
+fn task() -> Arc<TrackingTask> {
+    let gradient = GradientOfReward { decay: DECAY, ..GradientOfReward::default() };
+    let config = Tracking { gradient, ..Tracking::default() };
+    let catalogue = Catalogue::open(&[ClipSource::whole("builtin:CMU_007_01")]).unwrap();
+    Arc::new(TrackingTask::new(&config, &catalogue).unwrap())
+}
+
+/// R of the current state.
+fn softened(task: &TrackingTask, data: &Data, frame: usize) -> f64 {
+    let (config, reference) = (&task.config, &task.references[0]);
+    let error = reward::termination_error(config.termination_error, &task.walker, data, reference, frame);
+    let terms = reward::terms(&task.walker, data, reference, frame, error, config.termination_threshold);
+    let softened = terms.iter().zip(TRACKING_TERM_LIMITS).zip(config.gradient.powers());
+    let rewards: f64 = softened
+        .map(|((term, limit), power)| if power == 1.0 { *term } else { limit * (term / limit).powf(power) })
+        .sum();
+    let difference = |index: usize| data.qvel()[index] - reference.qvel(frame)[index];
+    let size: f64 = (0..6).map(|index| (difference(index) / ROOT_VELOCITY_SCALES[index]).powi(2)).sum();
+    rewards + config.gradient.root_velocity * (-0.5 * size).exp()
+}
+
+fn cosine(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / (squares(a) * squares(b)).sqrt()
+}
+
+/// After a few steps of the servo action from frame 20.
+fn walking(task: &Arc<TrackingTask>) -> TrackingEnvironment {
+    let mut environment = task.tracking_environment(1);
+    environment.reset_to(0, 20).unwrap();
+    let mut action = [0.0; 56];
+    for _ in 0..4 {
+        environment.servo_action(&mut action);
+        environment.step(&action);
+    }
+    environment
+}
+
+#[test]
+fn the_rewards_derivative_equals_finite_differences() {
+    let task = task();
+    let mut environment = walking(&task);
+    let frame = environment.frame();
+    let data = environment.simulation_mut();
+    let derivative = differentiate(&task.walker, data, &task.references[0], frame, 0.3, &task.config.gradient);
+    let (qpos, qvel) = (data.qpos().to_vec(), data.qvel().to_vec());
+    let mut at = |index: usize, change: f64| {
+        let (mut qpos, mut qvel) = (qpos.clone(), qvel.clone());
+        match index {
+            0..3 => qpos[index] += change,
+            // MuJoCo turns the root by velocities in its own frame.
+            3..6 => {
+                let axis = std::array::from_fn(|axis| f64::from(u8::from(axis == index - 3)));
+                let turned = multiply([qpos[3], qpos[4], qpos[5], qpos[6]], about_vector(axis, change));
+                qpos[3..7].copy_from_slice(&turned);
+            }
+            6..VELOCITIES => qpos[index + 1] += change,
+            _ => qvel[index - VELOCITIES] += change,
+        }
+        data.qpos_mut().copy_from_slice(&qpos);
+        data.qvel_mut().copy_from_slice(&qvel);
+        data.forward();
+        softened(&task, data, frame)
+    };
+    for (index, found) in derivative.position.iter().chain(&derivative.velocity).enumerate() {
+        let expected = (at(index, 1e-5) - at(index, -1e-5)) / 2e-5;
+        assert!((found - expected).abs() < 1e-6 * norm(&[1.0, expected]), "{index}: {found} is not {expected}");
+    }
+}
+
+/// The discounted softened rewards of these actions, from a state above the floor.
+fn in_the_air(task: &Arc<TrackingTask>, actions: &[[f32; 56]]) -> (f64, Vec<[f32; 56]>) {
+    let mut environment = walking(task);
+    environment.record_gradients();
+    environment.simulation_mut().qpos_mut()[2] += 0.05;
+    environment.simulation_mut().forward();
+    let mut sum = 0.0;
+    for (index, action) in actions.iter().enumerate() {
+        environment.step(action);
+        let frame = environment.frame();
+        sum += DECAY.powi(index as i32) * softened(task, environment.simulation_mut(), frame);
+    }
+    (sum, environment.take_gradients())
+}
+
+#[test]
+fn in_the_air_the_actions_derivative_has_the_direction_of_finite_differences() {
+    let task = task();
+    let environment = walking(&task);
+    let mut action = [0.0; 56];
+    environment.servo_action(&mut action);
+    let actions = [action.map(|value| value * 0.9); 3];
+    let (_, found) = in_the_air(&task, &actions);
+    assert_eq!(found.len(), actions.len());
+    let expected: Vec<f64> = (0..ACTIONS)
+        .map(|servo| {
+            let at = |change: f32| {
+                let mut actions = actions;
+                actions[0][servo] += change;
+                in_the_air(&task, &actions).0
+            };
+            (at(1e-3) - at(-1e-3)) / 2e-3
+        })
+        .collect();
+    let found = found[0].map(f64::from);
+    let (cosine, ratio) = (cosine(&found, &expected), (squares(&found) / squares(&expected)).sqrt());
+    assert!(cosine > 0.9 && (0.7..1.4).contains(&ratio), "cosine {cosine}, ratio {ratio}");
+}
+
+#[test]
+fn a_reward_after_the_episodes_end_does_not_count() {
+    let task = task();
+    let last = task.references[0].last_step(task.look_ahead);
+    let gradients = |after: usize| {
+        let mut environment = task.tracking_environment(1);
+        environment.record_gradients();
+        environment.reset_to(0, last - 2).unwrap();
+        let mut action = [0.0; 56];
+        for _ in 0..2 {
+            environment.servo_action(&mut action);
+            environment.step(&action);
+        }
+        environment.reset_to(0, 20).unwrap();
+        for _ in 0..after {
+            environment.step(&action);
+        }
+        environment.take_gradients()
+    };
+    assert_eq!(gradients(0)[..2], gradients(3)[..2]);
+    assert_eq!(gradients(3).len(), 5);
+}
+
+#[test]
+fn an_action_beyond_its_bounds_is_not_pushed_further_out() {
+    let task = task();
+    let mut environment = walking(&task);
+    environment.record_gradients();
+    let action: [f32; 56] = std::array::from_fn(|index| if index % 2 == 0 { 1.0 } else { -1.0 });
+    environment.step(&action);
+    let gradients = environment.take_gradients();
+    assert!(gradients[0].iter().zip(action).all(|(derivative, action)| derivative * action <= 0.0), "{gradients:?}");
+    assert!(gradients[0].iter().any(|derivative| *derivative != 0.0), "some point back");
+}
+
+#[test]
+fn every_step_has_a_row_also_one_that_diverged() {
+    let task = task();
+    let mut environment = walking(&task);
+    environment.record_gradients();
+    environment.step(&[0.0; 56]);
+    environment.step(&[f32::NAN; 56]);
+    environment.step(&[0.0; 56]);
+    let gradients = environment.take_gradients();
+    assert_eq!(gradients.len(), 3);
+    assert!(gradients[0] != [0.0; 56] && gradients[1..] == [[0.0; 56]; 2]);
+}
