@@ -98,7 +98,7 @@ pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits
     let mask = evidence.valid.gt(0.5);
     let (mut policy, temperature) = expectation_steps(evidence, &mask, multipliers, limits);
     if let Some(kl) = evidence.kl {
-        policy = policy + masked_mean(&(evidence.log_prob + kl), evidence.valid) * limits.control_variate;
+        policy = &policy + masked_mean(&(evidence.log_prob + kl), evidence.valid) * limits.control_variate;
     }
     let kl_mean = masked_mean(evidence.kl_mean, evidence.valid);
     let kl_std = masked_mean(evidence.kl_std, evidence.valid);
