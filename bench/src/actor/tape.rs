@@ -87,9 +87,6 @@ impl Environment for Recorded {
     fn episode(&self) -> Episode {
         self.environment.episode()
     }
-    fn position_errors(&self, errors: &mut Vec<[f64; 3]>) {
-        self.environment.position_errors(errors);
-    }
     fn record_gradients(&mut self) {
         self.environment.record_gradients();
     }
