@@ -207,10 +207,11 @@ fn together(experiment: &Experiment) -> Result<(), Fault> {
     let holds = warm_start.steps == 0 || network.low_level.imitates();
     let remedy = format!("must be 0 with network.low_level = \"{}\"", network.low_level);
     ensure("warm_start.steps", warm_start.steps, holds, &remedy)?;
-    let tracks = experiment.tasks().iter().any(|(task, _)| *task == TaskName::Tracking);
-    let differentiable = tracks && experiment.tracking.termination_error == TerminationError::DmControl;
+    let has = |wanted| experiment.tasks().iter().any(|(task, _)| *task == wanted);
+    let linear = experiment.tracking.termination_error == TerminationError::DmControl;
+    let differentiable = if has(TaskName::Tracking) { linear } else { has(TaskName::GetUp) };
     let holds = vmpo.action_gradient == 0.0 || differentiable;
-    let remedy = "must be 0 without tracking, and with another tracking.termination_error than dm-control";
+    let remedy = "must be 0 without tracking and get-up, and with another tracking.termination_error than dm-control";
     ensure("vmpo.action_gradient", vmpo.action_gradient, holds, remedy)?;
     let holds = vmpo.control_variate == 0.0 || network.components() == 1;
     let remedy = "must be 0 with network.low_level = \"mixture\", whose KL has no closed form";

@@ -47,7 +47,7 @@ pub struct Vmpo {
     pub control_variate: f64,
     /// Weight w of the simulator's derivative of the reward with respect to the actions (D): the policy loss has the term
     /// −w/η · mean over valid steps of derivative · mean action. The actors compute the derivative, as `tracking.gradient`
-    /// says; only tracking has one. 0 is off.
+    /// and `get_up.gradient_decay` say; other tasks have none. 0 is off.
     pub action_gradient: f64,
     /// Weight of the value loss (D).
     pub value_weight: f64,

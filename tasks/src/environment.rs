@@ -74,7 +74,8 @@ pub trait Environment: Debug + Send {
     /// The start of the current episode.
     fn episode(&self) -> Episode;
 
-    /// From now on records what [`take_gradients`](Self::take_gradients) needs, about 40 kB a step. Only tracking does.
+    /// From now on records what [`take_gradients`](Self::take_gradients) needs, about 40 kB a step. Only tracking and
+    /// get-up do.
     fn record_gradients(&mut self) {}
 
     /// For each control step since the last call, oldest first: the derivative of the rewards of that step and the later ones

@@ -6,6 +6,7 @@
 //! - `tracking/` follows clips: [`TrackingTask`] and [`TrackingEnvironment`].
 //! - `rules/` has all other tasks. Each is one file of rules: how an episode begins, the reward of a step, and when the
 //!   humanoid fails. One environment plays the rules of any task. [`comparison`] replays recorded episodes of dm_control.
+//! - `gradient.rs` differentiates the reward with respect to the actions, for tracking and get-up.
 //! - `joint.rs` plays several tasks, one in each episode.
 //! - [`humanoid`] makes the compiled model from dm_control's XML, and `arenas/` makes what surrounds the humanoid.
 //! - `rendering/` draws: [`film`] and `viewer` for people, [`vision`] for the policy.
@@ -19,6 +20,7 @@ mod assets;
 mod build_task;
 mod environment;
 mod error;
+mod gradient;
 pub mod humanoid;
 mod joint;
 mod physics;

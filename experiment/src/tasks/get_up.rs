@@ -30,6 +30,8 @@ pub struct GetUp {
     pub start_pose: StartPose,
     /// Seconds an episode lasts (S).
     pub time_limit: f64,
+    /// δ of the simulator's derivative of the coming rewards (`vmpo.action_gradient`): each later step counts this much less.
+    pub gradient_decay: f64,
 }
 
 impl Default for GetUp {
@@ -45,6 +47,7 @@ impl Default for GetUp {
             angular_velocity_noise: 0.5,
             start_pose: StartPose::Upright,
             time_limit: 8.0,
+            gradient_decay: 0.9,
         }
     }
 }
@@ -69,7 +72,9 @@ impl TaskParameters for GetUp {
         section.deviation("joint_noise", self.joint_noise)?;
         section.deviation("velocity_noise", self.velocity_noise)?;
         section.deviation("angular_velocity_noise", self.angular_velocity_noise)?;
-        section.seconds("time_limit", self.time_limit)
+        section.seconds("time_limit", self.time_limit)?;
+        let decay = self.gradient_decay;
+        section.ensure("gradient_decay", decay, (0.0..=1.0).contains(&decay), "must be in [0, 1]")
     }
 
     fn reward_terms(&self) -> &'static [&'static str] {

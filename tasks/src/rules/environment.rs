@@ -9,9 +9,10 @@ use rand_pcg::Pcg64;
 
 use super::interface::{Rules, Verdict};
 use super::poses::Pose;
-use super::stage::{CONTROL_TIMESTEP, Stage};
+use super::stage::{CONTROL_TIMESTEP, SUBSTEPS, Stage};
 use crate::environment::{ClipStarts, Environment, Episode, Outcome, Scenery, Simulated, Step, Task, control};
 use crate::error::Error;
+use crate::gradient::GradientTape;
 use crate::physics::{Simulation, is_healthy};
 use crate::rendering::vision;
 
@@ -62,14 +63,16 @@ pub(crate) struct RuledEnvironment<R: Rules> {
     /// Control steps since the last reset.
     steps: usize,
     diverged: bool,
+    /// Records steps for the derivative of the reward, if somebody wants it.
+    tape: Option<GradientTape>,
 }
 
 impl<R: Rules> RuledEnvironment<R> {
     fn new(task: Arc<RuledTask<R>>, seed: u64) -> Result<Self, Error> {
         let mut random = Pcg64::seed_from_u64(seed);
         let stage = task.rules.stage(&mut random)?;
-        let mut environment =
-            Self { task, stage, state: R::State::default(), random, start: 0, steps: 0, diverged: false };
+        let state = R::State::default();
+        let mut environment = Self { task, stage, state, random, start: 0, steps: 0, diverged: false, tape: None };
         environment.reset();
         Ok(environment)
     }
@@ -80,7 +83,7 @@ impl<R: Rules> RuledEnvironment<R> {
         let mut stage = rules.stage(&mut random)?;
         stage.place(&pose.qpos, &pose.qvel);
         let task = Arc::new(RuledTask::new(rules, TaskSpec::default()));
-        Ok(Self { task, stage, state, random, start: 0, steps: 0, diverged: false })
+        Ok(Self { task, stage, state, random, start: 0, steps: 0, diverged: false, tape: None })
     }
 
     pub(crate) fn stage(&self) -> &Stage {
@@ -102,8 +105,12 @@ impl<R: Rules> RuledEnvironment<R> {
         (steps - 1e-9).ceil().max(1.0) as usize
     }
 
-    fn diverge(&mut self) -> Step {
+    /// `began` says whether the step was recorded.
+    fn diverge(&mut self, began: bool) -> Step {
         self.diverged = true;
+        if let Some(tape) = &mut self.tape {
+            tape.diverge(began);
+        }
         Step::DIVERGED
     }
 }
@@ -111,6 +118,9 @@ impl<R: Rules> RuledEnvironment<R> {
 impl<R: Rules> Environment for RuledEnvironment<R> {
     fn reset(&mut self) {
         (self.steps, self.diverged) = (0, false);
+        if let Some(tape) = &mut self.tape {
+            tape.end_episode();
+        }
         self.task.rules.begin(&mut self.stage, &mut self.state, &mut self.random);
     }
 
@@ -153,6 +163,16 @@ impl<R: Rules> Environment for RuledEnvironment<R> {
         Episode { clip: 0, start: self.start, steps_left: self.max_steps(), task: 0 }
     }
 
+    fn record_gradients(&mut self) {
+        let model = self.stage.arena.models.shared();
+        let decay = self.task.rules.gradient_decay();
+        self.tape = decay.and_then(|decay| GradientTape::new(&model, SUBSTEPS, decay));
+    }
+
+    fn take_gradients(&mut self) -> Vec<[f32; 56]> {
+        self.tape.as_mut().map_or_else(Vec::new, GradientTape::take)
+    }
+
     fn servo_action(&self, action: &mut [f32]) {
         // The servos hold the joints in their current positions.
         let joints: [f64; 56] = std::array::from_fn(|joint| self.stage.data.qpos()[7 + joint]);
@@ -165,12 +185,15 @@ impl<R: Rules> Environment for RuledEnvironment<R> {
 impl<R: Rules> Simulated for RuledEnvironment<R> {
     fn step_control(&mut self, control: &[f64; 56]) -> Step {
         if self.diverged || !control.iter().all(|value| value.is_finite()) {
-            return self.diverge();
+            return self.diverge(false);
+        }
+        if let Some(tape) = &mut self.tape {
+            tape.begin_step(&self.stage.data, control);
         }
         self.stage.step(control);
         self.steps += 1;
         if !is_healthy(&self.stage.data) {
-            return self.diverge();
+            return self.diverge(true);
         }
         let Verdict { reward_terms, failed } =
             self.task.rules.judge(&mut self.stage, &mut self.state, &mut self.random);
@@ -181,6 +204,9 @@ impl<R: Rules> Simulated for RuledEnvironment<R> {
         } else {
             Outcome::Running
         };
+        if let Some(tape) = &mut self.tape {
+            tape.end_step(self.task.rules.differentiate(&mut self.stage), outcome != Outcome::Running);
+        }
         let discount = if failed { 0.0 } else { 1.0 };
         Step { reward_terms, discount, outcome, head_height: self.stage.head_height() }
     }

@@ -30,6 +30,7 @@ use crate::arenas::floor;
 use crate::build_task::{BuildTask, Context};
 use crate::environment::Task;
 use crate::error::Error;
+use crate::gradient::RewardDerivative;
 use crate::humanoid;
 use crate::humanoid::observation::{Number, fill};
 use crate::physics::is_healthy;
@@ -164,6 +165,22 @@ impl Rules for GetUpRules {
     fn time_limit(&self) -> f64 {
         self.config.time_limit
     }
+
+    fn gradient_decay(&self) -> Option<f64> {
+        Some(self.config.gradient_decay)
+    }
+
+    /// ∂R/∂h is −2 (h − h_target) R.
+    fn differentiate(&self, stage: &mut Stage) -> RewardDerivative {
+        let (height, target) = (stage.head_height(), self.config.target_height);
+        let slope = -2.0 * (height - target) * standing_reward(height, target);
+        let [.., head] = stage.arena.walker.appendages;
+        let point = stage.data.xpos()[head];
+        let mut derivative = RewardDerivative::ZERO;
+        // The body exists and the vector has a place for each velocity, so this cannot fail.
+        let _ = stage.data.apply_ft(&[0.0, 0.0, slope], &[0.0; 3], &point, head, &mut derivative.position);
+        derivative
+    }
 }
 
 #[cfg(test)]
@@ -195,6 +212,59 @@ mod tests {
         // Binomial with mean 50 and standard deviation 6.9.
         assert!((22..=78).contains(&lying), "{lying} of 1000 lie");
         assert!(heights.iter().all(|height| *height < 0.6 || *height > 1.5), "no other starts");
+    }
+
+    #[test]
+    fn the_rewards_derivative_equals_finite_differences() {
+        let (config, mut random) = (GetUp { lying_share: 0.0, ..GetUp::default() }, Pcg64::seed_from_u64(5));
+        let rules = rules(&config);
+        let mut stage = rules.stage(&mut random).unwrap();
+        rules.begin(&mut stage, &mut State, &mut random);
+        // Below the target, where the reward has a slope.
+        let mut qpos = stage.data.qpos().to_vec();
+        qpos[2] -= 0.5;
+        stage.place(&qpos, &[0.0; 62]);
+        let found = rules.differentiate(&mut stage);
+        assert_eq!(found.velocity, [0.0; 62]);
+        // The root's position and the joints; the root's rotation has other coordinates than velocities.
+        for (index, coordinate) in (0..3).map(|index| (index, index)).chain((6..62).map(|index| (index, index + 1))) {
+            let mut at = |change: f64| {
+                let mut qpos = qpos.clone();
+                qpos[coordinate] += change;
+                stage.place(&qpos, &[0.0; 62]);
+                standing_reward(stage.head_height(), config.target_height)
+            };
+            let expected = (at(1e-5) - at(-1e-5)) / 2e-5;
+            assert!(
+                (found.position[index] - expected).abs() < 1e-6,
+                "{index}: {} is not {expected}",
+                found.position[index]
+            );
+        }
+    }
+
+    #[test]
+    fn every_step_has_a_derivative_and_a_step_along_it_lifts_the_head() {
+        use crate::environment::Environment as _;
+        let config = GetUp { lying_share: 1.0, gradient_decay: 1.0, ..GetUp::default() };
+        let spec = comic_experiment::TaskSpec::default();
+        let task: Arc<dyn Task> = Arc::new(RuledTask::new(rules(&config), spec));
+        let mut environment = task.environment(3).unwrap();
+        environment.record_gradients();
+        // The sum of the rewards of five steps with this action.
+        let mut rewards = |action: &[f32; 56]| {
+            environment.reset_to(0, 7).unwrap();
+            let sum: f64 = (0..5).map(|_| environment.step(action).reward()).sum();
+            (sum, environment.take_gradients())
+        };
+        let action = [0.0; 56];
+        let (before, gradients) = rewards(&action);
+        assert_eq!(gradients.len(), 5);
+        let length = gradients[0].iter().map(|entry| entry * entry).sum::<f32>().sqrt();
+        assert!(length > 0.0, "the first step has no derivative");
+        let moved = std::array::from_fn(|index| action[index] + 0.3 * gradients[0][index] / length);
+        let (after, _) = rewards(&moved);
+        assert!(after > before, "{after} is not above {before}");
     }
 
     #[test]

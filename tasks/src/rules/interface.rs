@@ -8,6 +8,7 @@ use rand_pcg::Pcg64;
 use super::stage::Stage;
 use crate::environment::MAX_REWARD_TERMS;
 use crate::error::Error;
+use crate::gradient::RewardDerivative;
 use crate::humanoid::observation::Number;
 
 /// How an episode begins, the reward of a step, and when the humanoid fails. All environments share the rules.
@@ -32,6 +33,16 @@ pub(crate) trait Rules: Debug + Send + Sync + 'static {
 
     /// Length of an episode, s.
     fn time_limit(&self) -> f64;
+
+    /// δ of the derivative of the coming rewards with respect to the actions; `None` in a task without one.
+    fn gradient_decay(&self) -> Option<f64> {
+        None
+    }
+
+    /// The derivative of the reward of the control step that was just simulated with respect to the state after it.
+    fn differentiate(&self, _: &mut Stage) -> RewardDerivative {
+        RewardDerivative::ZERO
+    }
 
     /// Position of the target on the floor, x and y, m; `None` in a task without a marked target.
     fn target(&self, _: &Self::State) -> Option<[f64; 2]> {

@@ -9,7 +9,7 @@ use mujoco_rs::prelude::MjModel;
 use rand::SeedableRng;
 use rand_pcg::Pcg64;
 
-use super::gradient::GradientTape;
+use super::gradient::differentiate;
 use super::observation::{Observation, View};
 use super::reference::Reference;
 use super::reward;
@@ -17,6 +17,7 @@ use super::task::TrackingTask;
 use crate::build_task::{BuildTask, Context};
 use crate::environment::{ClipStarts, Environment, Episode, Outcome, Scenery, Simulated, Step, Task, control};
 use crate::error::Error;
+use crate::gradient::GradientTape;
 use crate::humanoid::observation::Body;
 use crate::physics::{Data, Simulation, is_healthy};
 
@@ -205,7 +206,7 @@ impl Environment for TrackingEnvironment {
 
     fn record_gradients(&mut self) {
         let TrackingTask { models, config, .. } = self.task.as_ref();
-        self.tape = GradientTape::new(&models.shared(), models.substeps(), &config.gradient);
+        self.tape = GradientTape::new(&models.shared(), models.substeps(), config.gradient.decay);
     }
 
     fn take_gradients(&mut self) -> Vec<[f32; 56]> {
@@ -261,8 +262,9 @@ impl Simulated for TrackingEnvironment {
             Outcome::Running
         };
         if let Some(tape) = tape {
-            let ended = outcome != Outcome::Running;
-            tape.end_step(&task.walker, data, reference, *frame, config.termination_threshold, ended);
+            let (threshold, gradient) = (config.termination_threshold, &config.gradient);
+            let reward = differentiate(&task.walker, data, reference, *frame, threshold, gradient);
+            tape.end_step(reward, outcome != Outcome::Running);
         }
         let discount = if outcome == Outcome::Terminated { 0.0 } else { 1.0 };
         Step { reward_terms, discount, outcome, head_height: task.walker.head_height(data) }

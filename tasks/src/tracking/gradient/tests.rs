@@ -6,7 +6,6 @@ use comic_clips::Catalogue;
 use comic_clips::spatial::{about_vector, multiply, norm};
 use comic_experiment::{ClipSource, TRACKING_TERM_LIMITS, Tracking};
 
-use super::reward_derivative::{ROOT_VELOCITY_SCALES, squares};
 use super::*;
 use crate::environment::{Environment as _, Simulated as _};
 use crate::tracking::environment::TrackingEnvironment;
