@@ -129,7 +129,8 @@ fn the_error_of_an_unknown_document_lists_the_presets() {
     assert!(
         message.ends_with(
             "presets are ball-catch, gaps, get-up, go-to-target, joint-ball, joint-get-up, quickstart, \
-             quickstart-from-zero, tracking-lstm, tracking-mixture, tracking-mlp, tracking-product, walls"
+             quickstart-from-zero, tracking-lstm, tracking-mixture, tracking-mlp, tracking-product, walks-and-more, \
+             walls"
         ),
         "{message}"
     );
