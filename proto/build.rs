@@ -17,6 +17,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         .bytes(".comic.v1.UnrollMessage.payload")
         .bytes(".comic.v1.ParametersChunk.data")
         .bytes(".comic.v1.AssetChunk.data")
+        .bytes(".comic.v1.EvaluationReport.film")
         .compile_fds(descriptors)?;
     Ok(())
 }

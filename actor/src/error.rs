@@ -11,7 +11,7 @@ pub enum Error {
     #[error(transparent)]
     Access(#[from] comic_proto::AccessError),
     /// One side does not accept the other's token or certificate.
-    #[error("the learner at {url} does not accept this actor: {message}")]
+    #[error("the learner at {url} does not accept this process: {message}")]
     Unwelcome {
         /// The learner's address.
         url: String,
@@ -27,7 +27,7 @@ pub enum Error {
         message: String,
     },
     /// The learner answers and refuses this actor.
-    #[error("the learner at {url} refused this actor: {message} (do both programs come from the same release?)")]
+    #[error("the learner at {url} refused this process: {message} (do both programs come from the same release?)")]
     Refused {
         /// The learner's address.
         url: String,

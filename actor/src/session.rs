@@ -12,6 +12,7 @@ mod assets;
 mod backoff;
 mod connection;
 mod exchange;
+mod follower;
 mod outbox;
 mod parameters;
 
@@ -31,11 +32,13 @@ use crate::Error;
 use crate::mailbox::Mailbox;
 use crate::worker::FinishedUnroll;
 use backoff::Backoff;
-use connection::{Connector, Failure, Link};
+use connection::{Connector, Link};
 use exchange::{Ended, Exchange};
 use outbox::Outbox;
 
 pub use assets::default_cache;
+pub(crate) use connection::Failure;
+pub use follower::{Fetched, Follower};
 pub use outbox::Settled;
 pub use parameters::{Assembled, Assembler};
 
@@ -168,7 +171,7 @@ type Reply = (Link, CheckedReply, HashMap<String, PathBuf>);
 async fn attempt(options: &JoinSettings, connector: &mut Connector) -> Result<Reply, Failure> {
     let mut link = connector.connect(0).await?;
     let checked = read_reply(&link.reply).map_err(Failure::Fatal)?;
-    let assets = assets::fetch(&mut link, options.cache.as_deref()).await?;
+    let assets = assets::fetch(&mut link.client, &link.reply.assets, options.cache.as_deref()).await?;
     Ok((link, checked, assets))
 }
 

@@ -147,6 +147,11 @@ impl Publisher {
         self.newest().map_or(0, |published| published.version)
     }
 
+    /// Whether the last publication said that the run is over.
+    pub fn run_is_over(&self) -> bool {
+        self.newest().is_some_and(|published| published.run_over)
+    }
+
     /// The last publication.
     pub fn newest(&self) -> Option<Arc<Published>> {
         self.newest.borrow().clone()

@@ -5,8 +5,8 @@
 //!   [`serve()`] runs the server until its end, `shutdown` is the state of that end, [`http2`] the protocol's settings, and
 //!   [`process`] the threads and file descriptors.
 //! - Every connection passes `connections`, and every call `admission`: they alone check TLS, tokens and limits.
-//! - `calls` is the service that tonic decodes. `join` accepts actors, `assets` sends files, `evaluations` keeps reports for the
-//!   trainer, and `status` shows the learner's state.
+//! - `calls` is the service that tonic decodes. `join` accepts actors, `assets` sends files, `offer` is the checkpoint that
+//!   evaluators fetch, `evaluations` keeps reports for the trainer, and `status` shows the learner's state.
 //! - `framing` is the two calls that carry bytes past tonic's codec; `intake` validates unrolls and puts them into batches,
 //!   `room` bounds the messages that were read, and [`quarantine`] keeps invalid unrolls on disk.
 //! - `roster` knows which actors are present, `assignments` which environments they simulate in lockstep.
@@ -27,6 +27,7 @@ pub mod http2;
 mod intake;
 mod join;
 pub mod memory;
+pub mod offer;
 pub mod process;
 pub mod quarantine;
 mod room;

@@ -267,9 +267,18 @@ fn the_checkpoint_of_the_best_evaluation_outlives_the_newest_few() {
         let experiment = experiment("tracking-mlp", updates);
         // The first run of the learner is epoch 1.
         let number = Store::open(run.path(), 3).unwrap().run().unwrap();
-        let evaluation = Evaluation { run: Some(number), epoch: 1, version: 2, updates: 1, json: report.into() };
+        let evaluation = Evaluation {
+            run: Some(number),
+            epoch: 1,
+            version: 2,
+            updates: 1,
+            json: report.into(),
+            ..Evaluation::default()
+        };
+        let json = r#"{"overall": {"normalised_reward": 0.9}}"#.into();
+        let of_another_run = Evaluation { run: Some(number ^ 1), json, ..evaluation.clone() };
         let unrolls = (updates + 1) * BATCH;
-        live_evaluated(&experiment, run.path(), unrolls, |_, _| {}, &[evaluation]).ended.unwrap();
+        live_evaluated(&experiment, run.path(), unrolls, |_, _| {}, &[of_another_run, evaluation]).ended.unwrap();
     };
     epoch(1, "[]");
     assert!(!checkpoints.join("best.json").exists(), "that report has no mean");

@@ -56,6 +56,19 @@ fn a_saved_state_does_not_change_with_the_learner() {
     assert_eq!(before, after);
 }
 
+#[test]
+fn a_scheduled_deviation_falls_geometrically_with_the_budget() {
+    let mut experiment = training();
+    (experiment.network.initial_std, experiment.network.final_std) = (0.16, 0.04);
+    let mut learner = learner(&experiment, 1);
+    for (used, expected) in [(0.0, 0.16), (0.5, 0.08), (1.0, 0.04)] {
+        learner.set_progress(used);
+        let report = learner.step(&unrolls(1).minibatch()).unwrap().to_values();
+        let found = report.get("policy_std").unwrap();
+        assert!((found - expected).abs() < 1e-6, "{used}: {found} is not {expected}");
+    }
+}
+
 fn refused(alter: impl FnOnce(&mut Vec<(String, Tensor)>)) -> String {
     let mut learner = learner(&training(), 1);
     let before = state(&learner);

@@ -249,14 +249,14 @@ impl System {
         self.spawn("actor", command)
     }
 
-    /// Starts `comic-learner status --watch`.
+    /// Starts a program that is no actor with these arguments and the learner's address.
     ///
     /// # Errors
     /// When the program cannot be started.
-    pub fn start_watching(&mut self) -> Result<Process> {
-        let mut command = Command::new(program("comic-learner")?);
-        command.args(["status", "--watch", "--learner", &self.url()]).args(flags(&self.access));
-        self.spawn("watch", command)
+    pub fn start(&mut self, name: &str, arguments: &[&str]) -> Result<Process> {
+        let mut command = Command::new(program(name)?);
+        command.args(arguments).args(["--learner", &self.url()]).args(flags(&self.access));
+        self.spawn(arguments.first().copied().unwrap_or(name), command)
     }
 
     /// The metrics page, at the address that the learner logs.

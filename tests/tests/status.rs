@@ -68,7 +68,7 @@ async fn status_and_health_describe_a_running_learner() -> Result<()> {
 #[tokio::test]
 async fn status_watch_follows_a_run_and_waits_for_an_absent_learner() -> Result<()> {
     let mut system = System::new(&SMALL)?;
-    let mut watching = system.start_watching()?;
+    let mut watching = system.start("comic-learner", &["status", "--watch"])?;
     watching.until_log_holds(&system.address(), LIMIT).await?;
     ensure!(!watching.log().contains("accounting "), "no learner serves yet: {}", watching.log());
     system.start_learner(LIMIT).await?;

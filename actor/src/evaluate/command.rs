@@ -3,6 +3,7 @@
 use std::io::{IsTerminal as _, Write as _};
 use std::ops::ControlFlow;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::Args;
 use comic_clips::Catalogue;
@@ -12,7 +13,8 @@ use comic_proto::{Access, UnrollShape};
 use comic_tasks::{Simulated, Task};
 
 use super::delivery::deliver;
-use super::{Audience, Report, RolloutSettings, evaluate};
+use super::settings::{RolloutSettings, Starts};
+use super::{Audience, Report, evaluate, watch};
 use crate::Error;
 use crate::acting_loop::Controller;
 use crate::checkpoint::{self, Checkpoint, Position};
@@ -50,7 +52,7 @@ With --json one object goes to standard output:
 pub struct Evaluate {
     /// A run's directory, its `checkpoints`, or one checkpoint; the newest complete checkpoint is evaluated. Or a policy
     /// that `comic-learner export` wrote.
-    #[arg(long, value_name = "DIR|FILE", visible_alias = "policy", required_unless_present = "preset")]
+    #[arg(long, value_name = "DIR|FILE", visible_alias = "policy", required_unless_present_any = ["preset", "watch"])]
     checkpoint: Option<PathBuf>,
     /// The experiment to evaluate without a checkpoint: a preset's name or a TOML file.
     #[arg(long, value_name = "NAME|FILE", conflicts_with = "checkpoint")]
@@ -88,8 +90,24 @@ pub struct Evaluate {
     rewards: Option<PathBuf>,
     /// Report the evaluation of a checkpoint to this learner. The learner stores it in `evaluations.jsonl`, and the
     /// checkpoint as `checkpoints/best` if no other was better.
-    #[arg(long, value_name = "URL", requires = "checkpoint", conflicts_with_all = ["untrained", "servo"])]
+    #[arg(long, value_name = "URL", conflicts_with_all = ["untrained", "servo", "preset"])]
     learner: Option<String>,
+    /// Evaluates the newest checkpoint of the run of --learner without noise, on at most 64 starts that are always the
+    /// same, again and again until the run is over. The learner stores the evaluations with a short film each.
+    #[arg(long, requires = "learner", help_heading = "Watch")]
+    #[arg(conflicts_with_all = ["checkpoint", "noise", "episodes", "json", "rewards", "video", "camera", "ghost", "size", "fps"])]
+    watch: bool,
+    /// Minutes from one evaluation to the next.
+    #[arg(long, value_name = "MINUTES", default_value_t = 2.0, value_parser = minutes, help_heading = "Watch")]
+    #[arg(requires = "watch")]
+    every: f64,
+    /// Lowers the priority of the process, so that it takes little time from actors and learner.
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(i32).range(0..20))]
+    #[arg(requires = "watch", help_heading = "Watch")]
+    nice: i32,
+    /// Where files from the learner are kept; `comic` in the user's cache directory unless given.
+    #[arg(long, value_name = "DIR", env = "COMIC_CACHE", help_heading = "Watch")]
+    cache: Option<PathBuf>,
     #[command(flatten)]
     access: Access,
     /// Films the first episode: .gif, .webp, .mp4 (through ffmpeg) or .png (a contact sheet).
@@ -112,6 +130,9 @@ impl Evaluate {
     /// # Errors
     /// A wrong command line, a checkpoint that cannot be used, a failing evaluation, film or report.
     pub fn run(&self) -> Result<(), Error> {
+        if let (Some(learner), true) = (&self.learner, self.watch) {
+            return self.watch(learner);
+        }
         let subject = self.subject()?;
         let position = subject.position;
         let (report, film) = self.evaluate(subject)?;
@@ -122,9 +143,22 @@ impl Evaluate {
         std::io::stdout().write_all(text.as_bytes()).map_err(Error::file("standard output"))?;
         if let Some(learner) = &self.learner {
             let Position { run, epoch: learner_epoch, version, updates } = position;
-            deliver(learner, &self.access, EvaluationReport { run, learner_epoch, version, updates, json })?;
+            let report = EvaluationReport { run, learner_epoch, version, updates, json, ..EvaluationReport::default() };
+            deliver(learner, &self.access, report)?;
         }
         film
+    }
+
+    fn watch(&self, learner: &str) -> Result<(), Error> {
+        watch::run(&watch::WatchSettings {
+            learner: learner.to_owned(),
+            access: self.access.clone(),
+            cache: self.cache.clone(),
+            interval: Duration::from_secs_f64(self.every * 60.0),
+            clips: self.clips.clone(),
+            seed: self.seed,
+            nice: self.nice,
+        })
     }
 
     /// The report, and the result of the film.
@@ -140,7 +174,7 @@ impl Evaluate {
         let catalogue = Catalogue::open(&experiment.clips)?;
         let task = comic_tasks::build(&experiment, &catalogue)?;
         let options = RolloutSettings {
-            episodes: self.episodes.map(|episodes| episodes as usize),
+            starts: self.episodes.map_or(Starts::Every, |episodes| Starts::Random(episodes as usize)),
             deterministic: self.deterministic,
             noise: self.noise,
             seed: self.seed,
@@ -226,6 +260,13 @@ fn noise(text: &str) -> Result<f32, String> {
     match text.parse() {
         Ok(noise) if (0.0..=1e3).contains(&noise) => Ok(noise),
         _ => Err("must be a number from 0 to 1000".into()),
+    }
+}
+
+fn minutes(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(minutes) if (0.0..=1e6).contains(&minutes) => Ok(minutes),
+        _ => Err("must be a number from 0 to 1000000".into()),
     }
 }
 

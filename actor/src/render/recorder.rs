@@ -59,6 +59,12 @@ pub struct Recorder {
 }
 
 impl Look {
+    /// For a film of some hundred KB: 160 × 120 pixels, 11 pictures a second, beside the reference if there is one.
+    pub(crate) fn small(task: TaskName) -> Self {
+        let ghost = (task == TaskName::Tracking).then_some(Ghost::Beside);
+        Self { camera: Place::Tracking, ghost, size: Size::new(160, 120), fps: Some(12) }
+    }
+
     /// Checks whether a film of this task can look like this.
     ///
     /// # Errors

@@ -4,11 +4,12 @@ use std::collections::HashMap;
 use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};
 
+use comic_proto::Client;
 use comic_proto::v1::{Asset, AssetRequest};
 use sha2::{Digest as _, Sha256};
 use tempfile::NamedTempFile;
 
-use super::connection::{Failure, Link};
+use super::connection::Failure;
 use crate::Error;
 
 /// The default directory of the asset cache: `comic` under `XDG_CACHE_HOME` or `~/.cache`.
@@ -18,9 +19,12 @@ pub fn default_cache() -> Option<PathBuf> {
     Some(base.join("comic"))
 }
 
-/// Makes every asset of the reply a verified file on this machine; returns the file of each source.
-pub(super) async fn fetch(link: &mut Link, cache: Option<&Path>) -> Result<HashMap<String, PathBuf>, Failure> {
-    let assets = link.reply.assets.clone();
+/// Makes every asset a verified file on this machine; returns the file of each source.
+pub(crate) async fn fetch(
+    client: &mut Client,
+    assets: &[Asset],
+    cache: Option<&Path>,
+) -> Result<HashMap<String, PathBuf>, Failure> {
     if assets.is_empty() {
         return Ok(HashMap::new());
     }
@@ -29,14 +33,14 @@ pub(super) async fn fetch(link: &mut Link, cache: Option<&Path>) -> Result<HashM
     std::fs::create_dir_all(&directory).map_err(|error| Failure::Fatal(Error::file(&directory)(error)))?;
     let mut located = HashMap::new();
     for asset in assets {
-        let path = directory.join(file_name(&asset)?);
-        if is_whole(&path, &asset).map_err(Failure::Fatal)? {
+        let path = directory.join(file_name(asset)?);
+        if is_whole(&path, asset).map_err(Failure::Fatal)? {
             tracing::debug!(source = asset.source, "asset is in the cache");
         } else {
             tracing::info!(source = asset.source, bytes = asset.size, "fetching an asset");
-            download(link, &asset, &directory, &path).await?;
+            download(client, asset, &directory, &path).await?;
         }
-        located.insert(asset.source, path);
+        located.insert(asset.source.clone(), path);
     }
     Ok(located)
 }
@@ -73,10 +77,36 @@ fn is_whole(path: &Path, asset: &Asset) -> Result<bool, Error> {
 }
 
 /// Writes to a temporary file and renames it, so that another actor on this machine sees the whole file or none.
-async fn download(link: &mut Link, asset: &Asset, directory: &Path, path: &Path) -> Result<(), Failure> {
+async fn download(client: &mut Client, asset: &Asset, directory: &Path, path: &Path) -> Result<(), Failure> {
     let local = |error| Failure::Fatal(Error::file(path)(error));
     let mut file = NamedTempFile::new_in(directory).map_err(local)?;
-    let mut stream = link.client.fetch_asset(AssetRequest { sha256: asset.sha256.clone() }).await?.into_inner();
+    receive(client, asset, |data| file.write_all(data).map_err(local)).await?;
+    file.as_file().sync_all().map_err(local)?;
+    file.persist(path).map_err(|error| local(error.error))?;
+    Ok(())
+}
+
+/// Receives an asset of at most `limit` bytes into memory, and verifies it.
+pub(crate) async fn read(client: &mut Client, asset: &Asset, limit: u64) -> Result<Vec<u8>, Failure> {
+    if asset.size > limit {
+        return Err(broken(asset, format!("it has {} bytes, more than {limit}", asset.size)));
+    }
+    let mut bytes = Vec::new();
+    receive(client, asset, |data| {
+        bytes.extend_from_slice(data);
+        Ok(())
+    })
+    .await?;
+    Ok(bytes)
+}
+
+/// Gives the bytes of an asset to `keep`. It is whole and verified if the result is `Ok`.
+async fn receive(
+    client: &mut Client,
+    asset: &Asset,
+    mut keep: impl FnMut(&[u8]) -> Result<(), Failure>,
+) -> Result<(), Failure> {
+    let mut stream = client.fetch_asset(AssetRequest { sha256: asset.sha256.clone() }).await?.into_inner();
     let mut hash = Sha256::new();
     let mut received = 0_u64;
     while let Some(chunk) = stream.message().await? {
@@ -85,7 +115,7 @@ async fn download(link: &mut Link, asset: &Asset, directory: &Path, path: &Path)
             return Err(broken(asset, format!("more than the {} bytes announced", asset.size)));
         }
         hash.update(&chunk.data);
-        file.write_all(&chunk.data).map_err(local)?;
+        keep(&chunk.data)?;
     }
     if received < asset.size {
         // The connection was lost; the asset may be correct.
@@ -94,7 +124,5 @@ async fn download(link: &mut Link, asset: &Asset, directory: &Path, path: &Path)
     if hash.finalize()[..] != asset.sha256[..] {
         return Err(broken(asset, "its SHA-256 differs".to_string()));
     }
-    file.as_file().sync_all().map_err(local)?;
-    file.persist(path).map_err(|error| local(error.error))?;
     Ok(())
 }

@@ -5,20 +5,19 @@ use std::time::Duration;
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{JoinReply, JoinRequest};
 use comic_proto::{Access, AccessError, Client, PROTOCOL_VERSION, chain, distrusted, no_connection};
-use tonic::transport::Endpoint;
 use tonic::{Code, Request, Status};
 
 use super::{JoinSettings, Terms};
 use crate::Error;
 
 /// Deadline of a unary call.
-const CALL: Duration = Duration::from_secs(10);
+pub(super) const CALL: Duration = Duration::from_secs(10);
 /// Room for the experiment with the names of some thousand clips. Pieces of parameters and assets are far smaller.
 const MESSAGE_LIMIT: usize = 16 << 20;
 
 /// Why there is no connection.
 #[derive(Debug)]
-pub(super) enum Failure {
+pub(crate) enum Failure {
     /// Retry.
     Lost(String),
     /// A retry cannot help.
@@ -29,6 +28,40 @@ impl From<Status> for Failure {
     fn from(status: Status) -> Self {
         Self::Lost(describe(&status))
     }
+}
+
+impl Failure {
+    /// For a peer that was accepted before. Its configuration is correct, and it may be accepted again, for instance with a
+    /// renewed token.
+    pub(super) fn transient(self) -> Self {
+        match self {
+            Self::Fatal(error) => Self::Lost(chain(&error)),
+            lost => lost,
+        }
+    }
+}
+
+/// Checks address, certificates and token.
+pub(super) fn check(address: &str, access: &Access) -> Result<(), AccessError> {
+    access.lasting_endpoint(address)?;
+    access.bearer().map(drop)
+}
+
+/// Connects by TCP and HTTP/2. A certificate that is refused, on either side, is fatal.
+pub(super) async fn connect(address: &str, access: &Access) -> Result<Client, Failure> {
+    // The files matched at the start. During a renewal they may not match for a moment.
+    let renewed = |error: AccessError| Failure::Lost(chain(&error));
+    let endpoint = access.lasting_endpoint(address).map_err(renewed)?;
+    let bearer = access.bearer().map_err(renewed)?;
+    let channel = endpoint.connect().await.map_err(|error| match distrusted(&error) {
+        true => Failure::Fatal(unwelcome(address, chain(&error))),
+        false => Failure::Lost(no_connection(&error)),
+    })?;
+    Ok(LearnerClient::with_interceptor(channel, bearer).max_decoding_message_size(MESSAGE_LIMIT))
+}
+
+pub(super) fn unwelcome(address: &str, message: String) -> Error {
+    Error::Unwelcome { url: address.to_owned(), message }
 }
 
 /// A status with its causes and without its metadata.
@@ -73,13 +106,8 @@ impl Connector {
             learner_epoch: None,
             run: None,
         };
-        connector.endpoint()?;
-        connector.access.bearer()?;
+        check(&connector.address, &connector.access)?;
         Ok(connector)
-    }
-
-    fn endpoint(&self) -> Result<Endpoint, AccessError> {
-        self.access.lasting_endpoint(&self.address)
     }
 
     pub(super) fn address(&self) -> &str {
@@ -92,7 +120,7 @@ impl Connector {
 
     /// Connects and joins. `acknowledged` is the sequence number below which every unroll is acknowledged.
     pub(super) async fn connect(&mut self, acknowledged: u64) -> Result<Link, Failure> {
-        let mut client = self.client().await?.max_decoding_message_size(MESSAGE_LIMIT);
+        let mut client = self.client().await?;
         let mut request = Request::new(JoinRequest {
             incarnation: self.incarnation,
             actor: self.actor,
@@ -120,23 +148,13 @@ impl Connector {
     }
 
     async fn client(&self) -> Result<Client, Failure> {
-        // The files matched when this actor started. During a renewal they may not match for a moment.
-        let renewed = |error: AccessError| Failure::Lost(chain(&error));
-        let (endpoint, bearer) = (self.endpoint().map_err(renewed)?, self.access.bearer().map_err(renewed)?);
-        let channel = endpoint.connect().await.map_err(|error| match self.is_barred(&error) {
-            true => Failure::Fatal(self.unwelcome(chain(&error))),
-            false => Failure::Lost(no_connection(&error)),
-        })?;
-        Ok(LearnerClient::with_interceptor(channel, bearer))
+        let connected = connect(&self.address, &self.access).await;
+        connected.map_err(|failure| if self.actor.is_some() { failure.transient() } else { failure })
     }
 
     /// Whether a certificate is refused, and this actor has never joined.
     fn is_barred(&self, error: &(dyn std::error::Error + 'static)) -> bool {
         self.actor.is_none() && distrusted(error)
-    }
-
-    fn unwelcome(&self, message: String) -> Error {
-        Error::Unwelcome { url: self.address.clone(), message }
     }
 
     /// Connects and checks that the experiment is still `terms`.
@@ -150,7 +168,7 @@ impl Connector {
         // An actor that has joined before has a correct configuration. It may be accepted again, for instance with a
         // renewed token.
         match (status.code(), self.actor) {
-            (Code::Unauthenticated, None) => Failure::Fatal(self.unwelcome(status.message().to_string())),
+            (Code::Unauthenticated, None) => Failure::Fatal(unwelcome(&self.address, status.message().to_string())),
             (
                 Code::InvalidArgument | Code::FailedPrecondition | Code::Unimplemented | Code::PermissionDenied,
                 actor,
@@ -159,7 +177,7 @@ impl Connector {
                 None => Error::Refused { url: self.address.clone(), message },
             }),
             (Code::Aborted, _) => Failure::Fatal(Error::Superseded { message }),
-            _ if self.is_barred(status) => Failure::Fatal(self.unwelcome(chain(status))),
+            _ if self.is_barred(status) => Failure::Fatal(unwelcome(&self.address, chain(status))),
             _ => Failure::Lost(message),
         }
     }

@@ -299,3 +299,42 @@ mod assets {
         }
     }
 }
+
+/// A learner whose checkpoint has these bytes as experiment, as policy and as clips, and what follows it.
+async fn followed(asset: &[u8], sent: Option<&[u8]>) -> (FakeLearner, Follower, comic_proto::v1::Checkpoint) {
+    let script = Script { asset: Some(asset.to_vec()), asset_sent: sent.map(<[u8]>::to_vec), ..Script::default() };
+    let learner = FakeLearner::start(script).await;
+    let cache = tempfile::tempdir().unwrap().keep();
+    let follower = Follower::new(learner.address(), Access::default(), Some(cache)).unwrap();
+    let (sender, mut newest) = watch::channel(None);
+    let following = follower.clone();
+    let following = tokio::spawn(async move { following.follow(&sender).await });
+    let checkpoint = newest.wait_for(Option::is_some).await.unwrap().clone().unwrap();
+    following.abort();
+    (learner, follower, checkpoint)
+}
+
+#[tokio::test]
+async fn a_checkpoint_is_fetched_without_joining_and_its_clips_only_if_they_are_wanted() {
+    let text = Experiment::default().to_toml().unwrap().into_bytes();
+    let (learner, follower, checkpoint) = followed(&text, None).await;
+    for (wanted, files) in [(false, 0), (true, 1)] {
+        let fetched = follower.fetch(&checkpoint, |_| wanted).await.unwrap();
+        assert_eq!((fetched.experiment, fetched.policy), (Experiment::default(), text.clone()));
+        assert_eq!(fetched.assets.len(), files);
+        assert!(fetched.assets.values().all(|file| std::fs::read(file).unwrap() == text));
+    }
+    assert!(learner.seen().joins.is_empty());
+}
+
+#[tokio::test]
+async fn a_checkpoint_that_breaks_off_is_tried_again_and_a_damaged_one_is_refused() {
+    let text = Experiment::default().to_toml().unwrap().into_bytes();
+    let (_learner, follower, checkpoint) = followed(&text, Some(&text[1..])).await;
+    let failure = follower.fetch(&checkpoint, |_| true).await.unwrap_err();
+    assert!(matches!(&failure, Failure::Lost(_)), "{failure:?}");
+    let damaged: Vec<u8> = text.iter().map(|byte| byte ^ 1).collect();
+    let (_learner, follower, checkpoint) = followed(&text, Some(&damaged)).await;
+    let failure = follower.fetch(&checkpoint, |_| true).await.unwrap_err();
+    assert!(matches!(&failure, Failure::Fatal(Error::Asset { .. })), "{failure:?}");
+}

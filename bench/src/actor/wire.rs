@@ -216,6 +216,10 @@ impl Learner for Receiver {
         Err(Status::not_found("no assets here"))
     }
 
+    async fn get_checkpoint(&self, _request: Request<CheckpointRequest>) -> Reply<CheckpointReply> {
+        Err(Status::unimplemented("no checkpoints here"))
+    }
+
     async fn report_evaluation(&self, _request: Request<EvaluationReport>) -> Reply<EvaluationAck> {
         Ok(Response::new(EvaluationAck {}))
     }

@@ -263,6 +263,10 @@ impl Learner for Bare {
         Err(Status::unimplemented("watch_parameters"))
     }
 
+    async fn get_checkpoint(&self, _: Request<v1::CheckpointRequest>) -> Result<Response<v1::CheckpointReply>, Status> {
+        Err(Status::unimplemented("get_checkpoint"))
+    }
+
     async fn report_evaluation(&self, _: Request<v1::EvaluationReport>) -> Result<Response<v1::EvaluationAck>, Status> {
         Err(Status::unimplemented("report_evaluation"))
     }

@@ -1,9 +1,11 @@
 //! Evaluations that actors report.
 
+use bytes::Bytes;
+
 use crate::checkpoint::Evaluated;
 
 /// An evaluation that an actor reported.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Evaluation {
     /// The run whose parameters were evaluated, if the actor knows it.
     pub run: Option<u64>,
@@ -13,8 +15,14 @@ pub struct Evaluation {
     pub version: u64,
     /// Updates before the checkpoint that holds them.
     pub updates: u64,
+    /// Environment steps before that checkpoint; 0 if the actor does not know.
+    pub environment_steps: u64,
+    /// Wall-clock seconds from the run's first unroll to that checkpoint; 0 if the actor does not know.
+    pub seconds: f64,
     /// As `comic-actor evaluate --json` prints it.
     pub json: String,
+    /// A GIF of an episode; empty if there is none. Nobody has checked it.
+    pub film: Bytes,
 }
 
 impl Evaluation {

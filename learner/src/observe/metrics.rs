@@ -1,7 +1,7 @@
 //! The metrics of a run for people: one JSON line every few seconds in `RUN/metrics.jsonl` and for TensorBoard. The newest
 //! line is also the status.
 
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::Write as _;
 use std::ops::AddAssign;
 use std::path::{Path, PathBuf};
@@ -13,8 +13,10 @@ use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
 use comic_replay::{AccountingByTask, Batch};
 use serde_json::{Map, Value, json};
 
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::observe::append;
 use crate::observe::evaluation::Evaluation;
+use crate::observe::evaluation_writer::EvaluationWriter;
 use crate::observe::tensorboard::Events;
 
 /// Sums since the last line.
@@ -119,6 +121,7 @@ pub struct Metrics {
     file: File,
     /// `None` if the file could not be opened.
     events: Option<Events>,
+    evaluations: EvaluationWriter,
     window: Window,
     since: Instant,
     /// The accounting of the last line.
@@ -148,13 +151,12 @@ impl Metrics {
     /// # Errors
     /// When the file cannot be opened.
     pub fn open(run: &Path, spec: &TaskSpec) -> Result<Self> {
-        let path = run.join("metrics.jsonl");
-        let file = append(&path)?;
         Ok(Self {
             spec: spec.clone(),
             run: run.to_path_buf(),
-            file,
+            file: append(&run.join("metrics.jsonl"))?,
             events: None,
+            evaluations: EvaluationWriter::new(run),
             window: Window::default(),
             since: Instant::now(),
             accounting: AccountingByTask::default(),
@@ -184,22 +186,10 @@ impl Metrics {
             || self.accounting != *accounting
     }
 
-    /// Appends an actor's evaluation to `RUN/evaluations.jsonl`. If the disk refuses, the error is logged, and training
-    /// continues.
-    pub fn keep_evaluation(&self, evaluation: &Evaluation) {
-        if let Err(error) = self.append_evaluation(evaluation) {
-            let error = comic_proto::chain(&error);
-            tracing::error!(version = evaluation.version, "an evaluation is lost: {error}");
-        }
-    }
-
-    fn append_evaluation(&self, evaluation: &Evaluation) -> Result<()> {
-        let path = self.run.join("evaluations.jsonl");
-        let report: Value = serde_json::from_str(&evaluation.json).unwrap_or(Value::Null);
-        let line = json!({ "run": evaluation.run, "learner_epoch": evaluation.epoch, "version": evaluation.version,
-            "updates": evaluation.updates, "evaluation": report });
-        let mut file = append(&path)?;
-        writeln!(file, "{line}").map_err(Error::file("write", &path))
+    /// Appends an actor's evaluation to `RUN/evaluations.jsonl`, writes its film to `RUN/films/`, and shows both in
+    /// TensorBoard. If the disk refuses, the error is logged, and training continues.
+    pub fn keep_evaluation(&mut self, evaluation: &Evaluation) {
+        self.evaluations.keep(evaluation, self.events.as_mut());
     }
 
     /// Counts the rows of a batch and returns the counts of each task.
@@ -324,11 +314,6 @@ impl Metrics {
     }
 }
 
-fn append(path: &Path) -> Result<File> {
-    let file = OpenOptions::new().create(true).append(true).open(path);
-    file.map_err(Error::file("write", path))
-}
-
 #[cfg(test)]
 mod tests {
     use comic_experiment::Experiment;
@@ -360,6 +345,6 @@ mod tests {
             let line = metrics.write(position, AccountingByTask::default(), Map::new());
             assert!(line.contains("\"updates\":3"), "{line}");
         }
-        metrics.keep_evaluation(&Evaluation { run: None, epoch: 5, version: 4, updates: 3, json: "{}".into() });
+        metrics.keep_evaluation(&Evaluation { epoch: 5, updates: 3, json: "{}".into(), ..Evaluation::default() });
     }
 }

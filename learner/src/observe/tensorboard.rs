@@ -1,13 +1,14 @@
-//! The lines of `metrics.jsonl` for TensorBoard: `RUN/tensorboard/events.out.tfevents.…`, a file for each learner epoch.
+//! Curves and images for TensorBoard: `RUN/tensorboard/events.out.tfevents.…`, a file for each learner epoch.
 //!
 //! A file is a sequence of records. A record is a length, its checksum, a message and the message's checksum (TensorFlow's
-//! `record_writer.cc`). The messages are those of `event.proto` and `summary.proto`, of which four fields are used.
+//! `record_writer.cc`). The messages are those of `event.proto` and `summary.proto`, of which a few fields are used.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::Write as _;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use bytes::Bytes;
 use prost::Message as _;
 use serde_json::Value;
 
@@ -21,6 +22,11 @@ const START: i32 = 1;
 const MASK: u32 = 0xa282_ead8;
 /// The fields of a line that give its position, and are not curves.
 const POSITION: [&str; 3] = ["environment_steps", "seconds", "learner_epoch"];
+/// Most values of one record, and bytes of their tags. Reports come from the network, and nested names multiply.
+const MOST_VALUES: usize = 4096;
+const LONGEST_TAG: usize = 256;
+/// `Summary.Image.colorspace` of RGB.
+const RGB: i32 = 3;
 
 #[derive(Clone, PartialEq, prost::Message)]
 struct Event {
@@ -46,16 +52,56 @@ struct SessionLog {
 #[derive(Clone, PartialEq, prost::Message)]
 struct Summary {
     #[prost(message, repeated, tag = "1")]
-    values: Vec<Scalar>,
+    values: Vec<SummaryValue>,
 }
 
+/// A point of a curve, or an image: `Summary.Value`.
 #[derive(Clone, PartialEq, prost::Message)]
-struct Scalar {
+pub(super) struct SummaryValue {
     #[prost(string, tag = "1")]
-    tag: String,
+    pub(super) tag: String,
     /// Optional, so that 0 is written too.
     #[prost(float, optional, tag = "2")]
-    value: Option<f32>,
+    pub(super) simple_value: Option<f32>,
+    #[prost(message, optional, tag = "4")]
+    pub(super) image: Option<Image>,
+}
+
+/// An encoded image: `Summary.Image`.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct Image {
+    /// Pixels.
+    #[prost(int32, tag = "1")]
+    pub(super) height: i32,
+    /// Pixels.
+    #[prost(int32, tag = "2")]
+    pub(super) width: i32,
+    #[prost(int32, tag = "3")]
+    pub(super) colorspace: i32,
+    /// A PNG or GIF file.
+    #[prost(bytes = "bytes", tag = "4")]
+    pub(super) encoded_image_string: Bytes,
+}
+
+impl SummaryValue {
+    /// A point of the curve `tag`.
+    pub(super) fn scalar(tag: String, value: f64) -> Self {
+        Self { tag, simple_value: Some(value as f32), image: None }
+    }
+
+    /// An image in colour, a PNG or GIF file of this width and height in pixels.
+    pub(super) fn image(tag: &str, (width, height): (u16, u16), file: Bytes) -> Self {
+        let image = Image { height: height.into(), width: width.into(), colorspace: RGB, encoded_image_string: file };
+        Self { tag: tag.to_owned(), simple_value: None, image: Some(image) }
+    }
+
+    /// A point for each number below `value`, by its path within `value` below `tag`. Beyond 4,096 points, or 256 bytes of
+    /// a tag, there are none.
+    pub(super) fn scalars(tag: &str, value: &Value) -> Vec<Self> {
+        let mut values = Vec::new();
+        collect(tag, value, &mut values);
+        values
+    }
 }
 
 /// The file of one learner epoch.
@@ -75,8 +121,7 @@ impl Events {
         let directory = run.join("tensorboard");
         // TensorBoard reads the files of a directory in alphabetical order.
         let path = directory.join(format!("events.out.tfevents.{epoch:010}"));
-        // A checkpoint may claim any number of steps.
-        let first = i64::try_from(environment_steps).unwrap_or(i64::MAX).saturating_add(1);
+        let first = step(environment_steps).saturating_add(1);
         let open = || {
             fs::create_dir_all(&directory)?;
             let file = OpenOptions::new().create(true).append(true).open(&path)?;
@@ -93,6 +138,14 @@ impl Events {
     /// When the disk refuses.
     pub(crate) fn write(&mut self, line: &Value) -> std::io::Result<()> {
         self.append(&scalars(now(), line))
+    }
+
+    /// Writes points and images at this number of environment steps.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub(super) fn write_values(&mut self, environment_steps: u64, values: Vec<SummaryValue>) -> std::io::Result<()> {
+        self.append(&summary(now(), step(environment_steps), values))
     }
 
     /// Appends all of these bytes or none, because a reader stops at half a record.
@@ -115,25 +168,34 @@ fn opening(wall_time: f64, step: i64) -> Vec<u8> {
 
 fn scalars(wall_time: f64, line: &Value) -> Vec<u8> {
     let step = line["environment_steps"].as_i64().unwrap_or_default();
-    let mut values = Vec::new();
-    collect("", line, &mut values);
+    summary(wall_time, step, SummaryValue::scalars("", line))
+}
+
+fn summary(wall_time: f64, step: i64, values: Vec<SummaryValue>) -> Vec<u8> {
     record(&Event { wall_time, step, summary: Some(Summary { values }), ..Event::default() })
+}
+
+/// A checkpoint or a report may claim any number of steps.
+fn step(environment_steps: u64) -> i64 {
+    i64::try_from(environment_steps).unwrap_or(i64::MAX)
 }
 
 fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
 }
 
-fn collect(path: &str, value: &Value, scalars: &mut Vec<Scalar>) {
+fn collect(path: &str, value: &Value, values: &mut Vec<SummaryValue>) {
+    if path.len() > LONGEST_TAG || values.len() == MOST_VALUES {
+        return;
+    }
     match value {
         Value::Number(number) if !POSITION.contains(&path) => {
-            let value = number.as_f64().map(|number| number as f32);
-            scalars.push(Scalar { tag: path.to_owned(), value });
+            values.extend(number.as_f64().map(|number| SummaryValue::scalar(path.to_owned(), number)));
         }
         Value::Object(entries) => {
             for (name, value) in entries {
                 let path = if path.is_empty() { name.clone() } else { format!("{path}/{name}") };
-                collect(&path, value, scalars);
+                collect(&path, value, values);
             }
         }
         _ => {}
@@ -151,6 +213,13 @@ fn checksum(bytes: &[u8]) -> u32 {
     crc32c::crc32c(bytes).rotate_right(15).wrapping_add(MASK)
 }
 
+/// The steps and values of the file of learner epoch `epoch`, record by record.
+#[cfg(test)]
+pub(super) fn read(run: &Path, epoch: u64) -> Vec<(i64, Vec<SummaryValue>)> {
+    let values = |event: Event| (event.step, event.summary.unwrap_or_default().values);
+    tests::events(run, epoch).into_iter().map(values).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use serde_json::json;
@@ -163,6 +232,20 @@ mod tests {
         3e00000000000000d9d240e709000000000000f83f10402a310a1f0a187461736b732f6765742d75702f686561645f68656967687415\
         0000003f0a0e0a077570646174657315000000003ffbdbbf";
 
+    /// The messages of a file.
+    pub(super) fn events(run: &Path, epoch: u64) -> Vec<Event> {
+        let bytes = fs::read(run.join(format!("tensorboard/events.out.tfevents.{epoch:010}"))).unwrap();
+        let mut rest = bytes.as_slice();
+        let mut events = Vec::new();
+        // A record is eight bytes of length and four of checksum, the message, and four more.
+        while let Some((length, after)) = rest.split_first_chunk::<8>() {
+            let (message, after) = after[4..].split_at(u64::from_le_bytes(*length) as usize);
+            events.push(Event::decode(message).unwrap());
+            rest = &after[4..];
+        }
+        events
+    }
+
     #[test]
     fn every_number_of_a_line_is_a_curve_as_tensorboard_writes_it() {
         let line = json!({"environment_steps": 64, "seconds": 1.0, "updates": 0, "episode_return": null,
@@ -174,11 +257,28 @@ mod tests {
     fn an_epoch_begins_by_discarding_every_step_after_its_checkpoint() {
         let run = tempfile::tempdir().unwrap();
         Events::begin(run.path(), 2, 4096).unwrap();
-        let bytes = fs::read(run.path().join("tensorboard/events.out.tfevents.0000000002")).unwrap();
-        // A record is eight bytes of length and four of checksum, the message, and four more.
-        let length = |at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize;
-        let second = length(0) + 16;
-        let event = Event::decode(&bytes[second + 12..second + 12 + length(second)]).unwrap();
+        let [_, event]: [Event; 2] = events(run.path(), 2).try_into().unwrap();
         assert_eq!((event.step, event.session_log), (4097, Some(SessionLog { status: START })));
+    }
+
+    #[test]
+    fn an_image_is_written_with_its_size_beside_a_point() {
+        let run = tempfile::tempdir().unwrap();
+        let image = SummaryValue::image("film", (3, 2), Bytes::from_static(b"GIF89a"));
+        // The fields by hand: the tag; the image with height 2, width 3, colour space 3 and the file.
+        let bytes = *b"\x0a\x04film\x22\x0e\x08\x02\x10\x03\x18\x03\x22\x06GIF89a";
+        assert_eq!(image.encode_to_vec(), bytes);
+        let values = vec![SummaryValue::scalar("reward".into(), 0.5), image];
+        Events::begin(run.path(), 1, 0).unwrap().write_values(u64::MAX, values.clone()).unwrap();
+        assert_eq!(read(run.path(), 1).last(), Some(&(i64::MAX, values)));
+    }
+
+    #[test]
+    fn a_report_cannot_make_a_record_large() {
+        let wide: serde_json::Map<String, Value> =
+            (0..5000).map(|number| (number.to_string(), json!(number))).collect();
+        assert_eq!(SummaryValue::scalars("evaluation", &json!(wide)).len(), MOST_VALUES);
+        let deep = json!({ ("x".repeat(LONGEST_TAG)): wide, "reward": 1 });
+        assert_eq!(SummaryValue::scalars("", &deep), [SummaryValue::scalar("reward".into(), 1.0)]);
     }
 }

@@ -10,7 +10,7 @@ use comic_proto::UnrollShape;
 use comic_replay::Batcher;
 use parking_lot::Mutex;
 
-use super::assets::{Assets, description};
+use super::assets::Assets;
 use super::assignments::Assignments;
 use super::calls::Calls;
 use super::evaluations::Evaluations;
@@ -20,6 +20,7 @@ use super::http2::{connection_window, window};
 use super::intake::Intake;
 use super::join::{Join, JoinTerms};
 use super::memory::IngestLimits;
+use super::offer::{NewestCheckpoint, Offer, description};
 use super::quarantine::{Quarantine, QuarantineArguments};
 use super::room::Room;
 use super::roster::Roster;
@@ -134,7 +135,7 @@ impl Service {
         let terms = JoinTerms::new(id, &experiment, &spec, assets.iter().map(description).collect())?;
         let quarantine = Quarantine::start(&quarantine, &telemetry)?;
         let quarantines = quarantine.is_some();
-        let evaluations = Evaluations::default();
+        let (evaluations, checkpoint) = (Evaluations::default(), NewestCheckpoint::default());
         let status = Arc::new(common.status(run, &experiment));
         let gate = Gate {
             tls: security.tls.map(Arc::new),
@@ -146,7 +147,7 @@ impl Service {
         };
         let calls = Calls {
             join: common.join(terms),
-            assets: Assets::new(assets, shutdown.clone()),
+            assets: Assets::new(assets, checkpoint.clone(), shutdown.clone()),
             evaluations: evaluations.clone(),
             status: status.clone(),
             telemetry: telemetry.clone(),
@@ -159,7 +160,7 @@ impl Service {
             unrolls: Arc::new(Unrolls { intake, message_limit, room, shutdown: shutdown.clone() }),
             parameters: Arc::new(Parameters { publisher, roster, shutdown: shutdown.clone() }),
             shutdown,
-            trainer: TrainerHandle { run: id, telemetry, evaluations, status, ingest },
+            trainer: TrainerHandle { run: id, telemetry, evaluations, checkpoint, status, ingest },
         })
     }
 
@@ -264,6 +265,7 @@ pub struct TrainerHandle {
     /// Counts what the trainer does.
     pub telemetry: Arc<Telemetry>,
     evaluations: Evaluations,
+    checkpoint: NewestCheckpoint,
     status: Arc<StatusBoard>,
     ingest: IngestLimits,
 }
@@ -277,6 +279,11 @@ impl TrainerHandle {
     /// Replaces the metrics that `GetStatus` answers with, JSON.
     pub fn set_metrics(&self, json: String) {
         self.status.set_metrics(json);
+    }
+
+    /// From now on evaluators get this checkpoint.
+    pub fn offer(&self, checkpoint: Offer) {
+        self.checkpoint.replace(checkpoint);
     }
 
     /// Takes the evaluations that actors reported since the last call, oldest first.

@@ -10,6 +10,7 @@ use comic_proto::v1::{self, AssetChunk};
 use futures::stream::{self, Stream};
 use tonic::Status;
 
+use super::offer::NewestCheckpoint;
 use super::shutdown::{Shutdown, Signal};
 
 /// Bytes of a chunk.
@@ -17,16 +18,27 @@ const CHUNK: u64 = 256 * 1024;
 /// Bytes of a SHA-256. A request may hold more, which are not shown.
 const HASH: usize = 32;
 
-/// The files of the experiment.
+/// The files of the experiment and of the newest checkpoint.
 #[derive(Debug)]
 pub(super) struct Assets {
     assets: Vec<Asset>,
+    checkpoint: NewestCheckpoint,
     shutdown: Shutdown,
 }
 
 impl Assets {
-    pub(super) fn new(assets: Vec<Asset>, shutdown: Shutdown) -> Self {
-        Self { assets, shutdown }
+    pub(super) fn new(assets: Vec<Asset>, checkpoint: NewestCheckpoint, shutdown: Shutdown) -> Self {
+        Self { assets, checkpoint, shutdown }
+    }
+
+    /// The newest checkpoint, as `GetCheckpoint` answers; `None` until this learner epoch has written one.
+    pub(super) fn newest_checkpoint(&self) -> Option<v1::Checkpoint> {
+        Some(self.checkpoint.get()?.describe(&self.assets))
+    }
+
+    fn find(&self, sha256: &[u8]) -> Option<Asset> {
+        let of_experiment = self.assets.iter().find(|asset| asset.sha256 == sha256).cloned();
+        of_experiment.or_else(|| self.checkpoint.get()?.file(sha256).cloned())
     }
 
     /// The asset with this hash in chunks, which are read from disk as the actor takes them.
@@ -34,7 +46,7 @@ impl Assets {
         &self,
         sha256: &[u8],
     ) -> Result<impl Stream<Item = Result<AssetChunk, Status>> + use<>, Status> {
-        let Some(asset) = self.assets.iter().find(|asset| asset.sha256 == sha256).cloned() else {
+        let Some(asset) = self.find(sha256) else {
             let hash = hex::encode(&sha256[..sha256.len().min(HASH)]);
             return Err(Status::not_found(format!("this learner has no asset with the SHA-256 {hash}")));
         };
@@ -43,11 +55,6 @@ impl Assets {
         let reading = Reading { asset, file: Arc::new(file), offset: 0, closing: self.shutdown.closing() };
         Ok(stream::try_unfold(reading, Reading::next))
     }
-}
-
-/// An asset as `Join` describes it.
-pub(super) fn description(asset: &Asset) -> v1::Asset {
-    v1::Asset { source: asset.source.clone(), sha256: asset.sha256.to_vec(), size: asset.size }
 }
 
 struct Reading {

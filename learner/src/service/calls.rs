@@ -1,11 +1,11 @@
-//! The calls that tonic decodes: `Join`, `FetchAsset`, `ReportEvaluation` and `GetStatus`.
+//! The calls that tonic decodes: `Join`, `FetchAsset`, `GetCheckpoint`, `ReportEvaluation` and `GetStatus`.
 
 use std::sync::Arc;
 
 use comic_proto::v1::learner_server::Learner;
 use comic_proto::v1::{
-    self, AssetChunk, AssetRequest, EvaluationAck, EvaluationReport, JoinReply, JoinRequest, ParametersChunk,
-    StatusRequest, UnrollAck, UnrollMessage, WatchRequest,
+    self, AssetChunk, AssetRequest, CheckpointReply, CheckpointRequest, EvaluationAck, EvaluationReport, JoinReply,
+    JoinRequest, ParametersChunk, StatusRequest, UnrollAck, UnrollMessage, WatchRequest,
 };
 use futures::stream::{BoxStream, StreamExt as _};
 use serde::de::IgnoredAny;
@@ -44,12 +44,22 @@ impl Learner for Calls {
         Ok(Response::new(self.assets.read(&sha256).await?.boxed()))
     }
 
+    async fn get_checkpoint(&self, _: Request<CheckpointRequest>) -> Result<Response<CheckpointReply>, Status> {
+        let (checkpoint, run_over) = (self.assets.newest_checkpoint(), self.status.publisher.run_is_over());
+        Ok(Response::new(CheckpointReply { checkpoint, run_over }))
+    }
+
     async fn report_evaluation(&self, request: Request<EvaluationReport>) -> Result<Response<EvaluationAck>, Status> {
-        let EvaluationReport { learner_epoch: epoch, version, updates, json, run } = request.into_inner();
+        let EvaluationReport { learner_epoch: epoch, version, updates, json, run, environment_steps, seconds, film } =
+            request.into_inner();
         if let Err(error) = serde_json::from_str::<IgnoredAny>(&json) {
             return Err(Status::invalid_argument(format!("the report is no JSON: {error}")));
         }
-        if !self.evaluations.add(Evaluation { run, epoch, version, updates, json }) {
+        if self.status.publisher.run_is_over() {
+            return Err(Status::unavailable("the run is over, and the trainer takes no evaluations"));
+        }
+        let evaluation = Evaluation { run, epoch, version, updates, environment_steps, seconds, json, film };
+        if !self.evaluations.add(evaluation) {
             return Err(Status::resource_exhausted("too many evaluations wait for the trainer: report this one later"));
         }
         self.telemetry.evaluations.inc();

@@ -7,8 +7,8 @@ use parking_lot::Mutex;
 
 use crate::observe::evaluation::Evaluation;
 
-/// Evaluations that may wait for the trainer.
-const CAPACITY: usize = 16;
+/// Evaluations that may wait for the trainer. Each is at most as large as a message.
+const CAPACITY: usize = 4;
 
 /// A bounded queue of evaluations; a handle that can be cloned.
 #[derive(Clone, Debug, Default)]

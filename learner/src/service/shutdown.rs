@@ -45,8 +45,7 @@ impl Shutdown {
     /// The status with which a stream ends when the service closes: `None` when the run is over, because then the parameters
     /// have told the actor so.
     pub(super) fn status(&self) -> Option<Status> {
-        let over = self.publisher.newest().is_some_and(|newest| newest.run_over);
-        (!over).then(|| Status::unavailable("the learner is draining: reconnect"))
+        (!self.publisher.run_is_over()).then(|| Status::unavailable("the learner is draining: reconnect"))
     }
 }
 

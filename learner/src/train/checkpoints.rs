@@ -8,7 +8,7 @@ use comic_experiment::Learner;
 
 use crate::checkpoint::{Evaluated, Name, Snapshot, Store};
 use crate::error::Result;
-use crate::observe::telemetry::Telemetry;
+use crate::service::TrainerHandle;
 use crate::train::writer::Writer;
 
 /// The checkpoints of a run that trains.
@@ -27,8 +27,8 @@ impl Checkpoints {
     ///
     /// # Errors
     /// When the directory cannot be made, or the system gives no thread.
-    pub(super) fn start(run: &Path, learner: &Learner, telemetry: Arc<Telemetry>) -> Result<Self> {
-        let writer = Writer::start(Store::open(run, learner.checkpoints_kept)?, telemetry)?;
+    pub(super) fn start(run: &Path, learner: &Learner, service: TrainerHandle) -> Result<Self> {
+        let writer = Writer::start(Store::open(run, learner.checkpoints_kept)?, service)?;
         Ok(Self { writer, interval: learner.checkpoint_seconds, written: Instant::now(), good: Arc::default() })
     }
 

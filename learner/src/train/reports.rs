@@ -132,8 +132,16 @@ impl Reports {
     }
 
     /// Writes the evaluations that actors reported since the last time, and returns what they say of checkpoints.
-    pub(super) fn take_evaluations(&self) -> Vec<Evaluated> {
-        let evaluations = self.service.take_evaluations();
+    pub(super) fn take_evaluations(&mut self) -> Vec<Evaluated> {
+        let mut evaluations = self.service.take_evaluations();
+        let own = self.service.id();
+        evaluations.retain(|evaluation| {
+            let belongs = evaluation.run.is_none_or(|run| run == own);
+            if !belongs {
+                tracing::warn!(updates = evaluation.updates, "an evaluation of another run is ignored");
+            }
+            belongs
+        });
         evaluations.iter().for_each(|evaluation| self.metrics.keep_evaluation(evaluation));
         evaluations.iter().filter_map(|evaluation| evaluation.evaluated()).collect()
     }

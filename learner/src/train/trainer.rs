@@ -61,7 +61,7 @@ impl Trainer {
             skipped_steps: SkippedSteps::new(experiment.learner.restore_after),
             budget: BudgetClock::new(experiment.budget.clone(), state.progress.seconds),
             versions: Versions::new(batcher.clone(), publisher, experiment.unroll.lockstep),
-            checkpoints: Checkpoints::start(&run, &experiment.learner, service.telemetry.clone())?,
+            checkpoints: Checkpoints::start(&run, &experiment.learner, service.clone())?,
             experiment,
             spec,
             backend,
@@ -353,7 +353,7 @@ impl Trainer {
         Ok(())
     }
 
-    fn take_evaluations(&self) -> Result<()> {
+    fn take_evaluations(&mut self) -> Result<()> {
         self.reports.take_evaluations().into_iter().try_for_each(|evaluated| self.checkpoints.judge(evaluated))
     }
 

@@ -1,6 +1,7 @@
 //! Checkpoints are written by a separate thread, so that training continues. Only this thread changes the checkpoint
 //! directory while the trainer exists.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -8,7 +9,8 @@ use std::thread::JoinHandle;
 
 use crate::checkpoint::{Evaluated, Judgement, Name, Snapshot, Store};
 use crate::error::{Error, Result};
-use crate::observe::telemetry::Telemetry;
+use crate::service::TrainerHandle;
+use crate::service::offer::Offer;
 
 /// A request to the thread.
 #[derive(Debug)]
@@ -27,17 +29,17 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Starts the thread.
+    /// Starts the thread. Every checkpoint of updates that it has written is offered to evaluators.
     ///
     /// # Errors
     /// When the system gives no thread.
-    pub fn start(store: Store, telemetry: Arc<Telemetry>) -> Result<Self> {
+    pub fn start(store: Store, service: TrainerHandle) -> Result<Self> {
         let (queue, received) = sync_channel(1);
         let pending = Arc::<AtomicUsize>::default();
         let shared = Arc::clone(&pending);
         let thread = std::thread::Builder::new()
             .name("checkpoints".into())
-            .spawn(move || run_writer(&store, &received, &shared, &telemetry))
+            .spawn(move || run_writer(&store, &received, &shared, &service))
             .map_err(Error::system("cannot start the checkpoint thread"))?;
         Ok(Self { queue, pending, thread })
     }
@@ -84,14 +86,19 @@ fn run_writer(
     store: &Store,
     queue: &Receiver<WriteRequest>,
     pending: &AtomicUsize,
-    telemetry: &Telemetry,
+    service: &TrainerHandle,
 ) -> Result<()> {
     let mut last = Ok(());
     while let Ok(request) = queue.recv() {
         match request {
             WriteRequest::Write(name, snapshot) => {
-                last = store.write(name, &snapshot).map(|path| tracing::info!(checkpoint = %path.display(), "written"));
-                telemetry.checkpoints.of(if last.is_ok() { "written" } else { "failed" }).inc();
+                last = store.write(name, &snapshot).map(|path| {
+                    tracing::info!(checkpoint = %path.display(), "written");
+                    if matches!(name, Name::Updates(_)) {
+                        offer(service, &path, &snapshot);
+                    }
+                });
+                service.telemetry.checkpoints.of(if last.is_ok() { "written" } else { "failed" }).inc();
                 if let Err(error) = &last {
                     let error = comic_proto::chain(error);
                     tracing::error!(checkpoint = %name, "checkpoint not written: {error}");
@@ -102,6 +109,13 @@ fn run_writer(
         pending.fetch_sub(1, Ordering::AcqRel);
     }
     last
+}
+
+fn offer(service: &TrainerHandle, path: &Path, snapshot: &Snapshot) {
+    match Offer::new(path, snapshot) {
+        Ok(checkpoint) => service.offer(checkpoint),
+        Err(error) => tracing::error!("evaluators do not get this checkpoint: {}", comic_proto::chain(&error)),
+    }
 }
 
 fn judge(store: &Store, evaluated: Evaluated) {

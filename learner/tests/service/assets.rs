@@ -5,8 +5,13 @@
 use std::path::Path;
 
 use crate::support::World;
+use bytes::Bytes;
 use comic_clips::Asset;
-use comic_proto::v1::AssetRequest;
+use comic_learner::checkpoint::Snapshot;
+use comic_learner::service::offer::Offer;
+use comic_proto::v1::{AssetRequest, Behaviour, CheckpointReply, CheckpointRequest};
+use rand::SeedableRng as _;
+use rand_pcg::Pcg64;
 use sha2::{Digest as _, Sha256};
 use tonic::{Code, Status};
 
@@ -67,4 +72,41 @@ async fn an_asset_that_shrank_or_vanished_after_the_start_is_an_error() {
         assert_eq!(refused.code(), Code::DataLoss);
         assert!(refused.message().contains(&asset.source), "{}", refused.message());
     }
+}
+
+/// A checkpoint after so many updates, written to `folder`.
+fn offer(folder: &Path, updates: u64, policy: &str) -> Offer {
+    let random = serde_json::to_string(&Pcg64::seed_from_u64(1)).unwrap();
+    let progress = format!(
+        r#"{{"run": 7, "epoch": 3, "updates": {updates}, "environment_steps": 70, "seconds": 2.5, "version": 9,
+            "warm_started": true, "random": {random}}}"#
+    );
+    let mut snapshot = Snapshot::default();
+    for (name, text) in [("progress.json", progress.as_str()), ("experiment.toml", ""), ("policy.safetensors", policy)]
+    {
+        std::fs::write(folder.join(name), text).unwrap();
+        snapshot.parts.insert(name.into(), text.into());
+    }
+    Offer::new(folder, &snapshot).unwrap()
+}
+
+#[tokio::test]
+async fn an_evaluator_learns_of_the_newest_checkpoint_and_fetches_its_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let world = World::start_with(8, vec![asset(folder.path(), "walk.h5", 9)]).await;
+    let mut client = world.client().await;
+    let mut ask = async || client.get_checkpoint(CheckpointRequest {}).await.unwrap().into_inner();
+    assert_eq!(ask().await, CheckpointReply::default(), "before the first checkpoint");
+    world.service.trainer().offer(offer(folder.path(), 3, "older"));
+    let older = ask().await.checkpoint.unwrap();
+    world.service.trainer().offer(offer(folder.path(), 4, "newer"));
+    let newer = ask().await.checkpoint.unwrap();
+    assert_eq!((newer.run, newer.learner_epoch, newer.version, newer.updates), (7, 3, 9, 4));
+    assert_eq!((newer.environment_steps, newer.seconds, newer.assets.len()), (70, 2.5, 1));
+    assert_eq!(fetch(&world, newer.policy.unwrap().sha256).await.unwrap(), b"newer");
+    assert_eq!(fetch(&world, newer.experiment.unwrap().sha256).await.unwrap(), b"");
+    assert_eq!(fetch(&world, older.policy.unwrap().sha256).await.unwrap_err().code(), Code::NotFound);
+    world.publisher.publish(1, Behaviour::Policy, &Bytes::from_static(b"parameters"));
+    world.publisher.end_run();
+    assert!(ask().await.run_over);
 }

@@ -93,11 +93,9 @@ async fn bytes_of_a_message() {
         World::limited(ConnectionLimits { max_message_bytes: Some(64 * 1024), ..ConnectionLimits::default() }).await;
     let mut client = world.client().await;
     let report = |bytes| EvaluationReport {
-        run: None,
         learner_epoch: EPOCH,
-        version: 1,
-        updates: 1,
         json: format!("\"{}\"", "x".repeat(bytes)),
+        ..EvaluationReport::default()
     };
     client.report_evaluation(report(60 * 1024)).await.unwrap();
     assert_eq!(client.report_evaluation(report(64 * 1024)).await.unwrap_err().code(), Code::OutOfRange);

@@ -130,6 +130,12 @@ impl FakeLearner {
         self.inner.parameters.send_replace(pieces);
     }
 
+    /// The script's asset, as it is announced.
+    fn asset(&self) -> Option<Asset> {
+        let bytes = self.inner.script.asset.as_ref()?;
+        Some(Asset { source: "walks.h5".into(), sha256: Sha256::digest(bytes).to_vec(), size: bytes.len() as u64 })
+    }
+
     /// Takes an unroll; the second time it is a duplicate.
     fn take(&self, header: &UnrollHeader) -> Verdict {
         if !self.inner.numbers.lock().unwrap().insert(header.sequence) {
@@ -160,18 +166,13 @@ impl Learner for FakeLearner {
         let spec = TaskSpec::new(&experiment, vec!["walk".into()]).unwrap();
         let layout = UnrollLayout::new(UnrollShape::new(&spec, &experiment));
         let layout_hash = if self.inner.script.wrong_layout { vec![0; 32] } else { layout.hash().to_vec() };
-        let asset = |bytes: &Vec<u8>| Asset {
-            source: "walks.h5".into(),
-            sha256: Sha256::digest(bytes).to_vec(),
-            size: bytes.len() as u64,
-        };
         Ok(Response::new(JoinReply {
             learner_epoch: 1,
             actor: ACTOR,
             seed: 11,
             experiment: experiment.to_toml().unwrap(),
             task_spec: toml::to_string(&spec).unwrap(),
-            assets: self.inner.script.asset.iter().map(asset).collect(),
+            assets: self.asset().into_iter().collect(),
             layout_hash,
             next_sequence: 0,
             environments: self.inner.script.environments,
@@ -231,6 +232,13 @@ impl Learner for FakeLearner {
             Some((futures::stream::iter(pieces.into_iter().map(Ok)), receiver))
         });
         Ok(Response::new(Box::pin(versions.flatten())))
+    }
+
+    async fn get_checkpoint(&self, _request: Request<CheckpointRequest>) -> Reply<CheckpointReply> {
+        let asset = self.asset();
+        let (experiment, policy, assets) = (asset.clone(), asset.clone(), asset.into_iter().collect());
+        let checkpoint = Checkpoint { run: RUN, updates: 1, experiment, policy, assets, ..Checkpoint::default() };
+        Ok(Response::new(CheckpointReply { checkpoint: Some(checkpoint), run_over: false }))
     }
 
     async fn report_evaluation(&self, _request: Request<EvaluationReport>) -> Reply<EvaluationAck> {

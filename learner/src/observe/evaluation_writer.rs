@@ -1,0 +1,280 @@
+//! Keeps the evaluations that actors report: lines of `RUN/evaluations.jsonl`, films in `RUN/films`, and curves and images
+//! for TensorBoard.
+
+use std::fs;
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+
+use serde_json::{Value, json};
+
+use crate::error::{Error, Result};
+use crate::observe::append;
+use crate::observe::evaluation::Evaluation;
+use crate::observe::heat_map::HeatMap;
+use crate::observe::tensorboard::{Events, SummaryValue};
+
+/// Most clips that have a curve each. With more, TensorBoard's list of curves is hard to use.
+const MOST_CLIP_CURVES: usize = 64;
+/// Bytes of the longest name of a clip. Longer ones are not shown, because names come from the network.
+const LONGEST_NAME: usize = 200;
+
+/// Writes evaluations, and remembers their clips' rewards for the heat map.
+#[derive(Debug)]
+pub(super) struct EvaluationWriter {
+    run: PathBuf,
+    heat_map: HeatMap,
+}
+
+impl EvaluationWriter {
+    /// Writes into the directory `run`.
+    pub(super) fn new(run: &Path) -> Self {
+        Self { run: run.to_path_buf(), heat_map: HeatMap::new() }
+    }
+
+    /// Keeps an evaluation. What the disk refuses is logged, and the rest is kept. A report or a film that is not as expected
+    /// is shown as far as it can be.
+    ///
+    /// An evaluation that does not know its environment steps has no place in a curve, so TensorBoard does not show it.
+    pub(super) fn keep(&mut self, evaluation: &Evaluation, events: Option<&mut Events>) {
+        let version = evaluation.version;
+        let report: Value = serde_json::from_str(&evaluation.json).unwrap_or_default();
+        if let Err(error) = self.append(evaluation, &report) {
+            tracing::error!(version, "an evaluation is lost: {}", comic_proto::chain(&error));
+        }
+        let film_size = gif_size(&evaluation.film);
+        if film_size.is_some()
+            && let Err(error) = self.write_film(evaluation)
+        {
+            tracing::error!(version, "an evaluation's film is lost: {}", comic_proto::chain(&error));
+        }
+        if film_size.is_none() && !evaluation.film.is_empty() {
+            tracing::warn!(version, "an evaluation's film is ignored, because it is no GIF");
+        }
+        let steps_are_unknown = evaluation.environment_steps == 0 && evaluation.updates > 0;
+        if let Some(events) = events.filter(|_| !steps_are_unknown)
+            && let Err(error) = self.show(evaluation, &report, film_size, events)
+        {
+            tracing::error!(version, "TensorBoard's file lacks an evaluation: {error}");
+        }
+    }
+
+    fn append(&self, evaluation: &Evaluation, report: &Value) -> Result<()> {
+        let path = self.run.join("evaluations.jsonl");
+        let line = json!({
+            "run": evaluation.run,
+            "learner_epoch": evaluation.epoch,
+            "version": evaluation.version,
+            "updates": evaluation.updates,
+            "environment_steps": evaluation.environment_steps,
+            "seconds": evaluation.seconds,
+            "evaluation": report,
+        });
+        append(&path)?.write_all(format!("{line}\n").as_bytes()).map_err(Error::file("write", &path))
+    }
+
+    /// Writes `RUN/films/UPDATES.gif`, with as many digits as the name of the checkpoint.
+    fn write_film(&self, evaluation: &Evaluation) -> Result<()> {
+        let directory = self.run.join("films");
+        let path = directory.join(format!("{:010}.gif", evaluation.updates));
+        let written = fs::create_dir_all(&directory).and_then(|()| fs::write(&path, &evaluation.film));
+        if written.is_err() {
+            // Half a film would look like a whole one.
+            drop(fs::remove_file(&path));
+        }
+        written.map_err(Error::file("write", &path))
+    }
+
+    /// Writes curves, the film and the heat map of all evaluations for TensorBoard.
+    fn show(
+        &mut self,
+        evaluation: &Evaluation,
+        report: &Value,
+        film_size: Option<(u16, u16)>,
+        events: &mut Events,
+    ) -> io::Result<()> {
+        let mut values = SummaryValue::scalars("evaluation", &report["overall"]);
+        let clips = clips(report);
+        if clips.len() <= MOST_CLIP_CURVES {
+            let tag = |clip: &str| format!("evaluation_clips/{clip}/normalised_reward");
+            values.extend(clips.iter().map(|(clip, reward)| SummaryValue::scalar(tag(clip), *reward)));
+        }
+        if let Some(size) = film_size {
+            values.push(SummaryValue::image("evaluation/film", size, evaluation.film.clone()));
+        }
+        if clips.len() > 1 {
+            self.heat_map.add(&clips);
+            let picture = self.heat_map.draw()?;
+            values.push(SummaryValue::image("evaluation/clips", picture.size, picture.bytes.into()));
+        }
+        events.write_values(evaluation.environment_steps, values)
+    }
+}
+
+/// The clips of a report with their normalised rewards, in the report's order.
+fn clips(report: &Value) -> Vec<(&str, f64)> {
+    let clips = report["clips"].as_array().into_iter().flatten();
+    let named = clips.filter_map(|clip| Some((clip["clip"].as_str()?, clip["normalised_reward"].as_f64()?)));
+    named.filter(|(clip, _)| clip.len() <= LONGEST_NAME).collect()
+}
+
+/// Width and height of a GIF, pixels, from its header. `None` if the bytes do not begin like a GIF; nothing else is checked.
+fn gif_size(film: &[u8]) -> Option<(u16, u16)> {
+    match *film.first_chunk::<10>()? {
+        [b'G', b'I', b'F', b'8', b'7' | b'9', b'a', w0, w1, h0, h1] => {
+            Some((u16::from_le_bytes([w0, w1]), u16::from_le_bytes([h0, h1])))
+        }
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+
+    use super::*;
+    use crate::observe::tensorboard;
+
+    /// The header of a GIF of 3 × 2 pixels, and what might follow.
+    const FILM: &[u8] = b"GIF89a\x03\x00\x02\x00and so on";
+
+    /// An evaluation after so many updates, with these clips and their normalised rewards.
+    fn evaluation(updates: u64, clips: &[(&str, f64)]) -> Evaluation {
+        let clip = |(clip, reward): &(&str, f64)| json!({ "clip": clip, "normalised_reward": reward });
+        let report = json!({
+            "deterministic": true,
+            "clips": clips.iter().map(clip).collect::<Vec<_>>(),
+            "overall": { "clip": "overall", "normalised_reward": 0.5, "success_rate": 0.25,
+                "tracking_error": { "position_mm": 30.0 }, "reward_terms": { "pose": 0.75 } },
+        });
+        Evaluation {
+            updates,
+            environment_steps: 4096 * updates,
+            seconds: 1.5,
+            json: report.to_string(),
+            film: Bytes::from_static(FILM),
+            ..Evaluation::default()
+        }
+    }
+
+    /// Keeps evaluations of a run, and returns the steps and values that TensorBoard reads of each.
+    fn kept(run: &Path, evaluations: &[Evaluation]) -> Vec<(i64, Vec<SummaryValue>)> {
+        let mut events = Events::begin(run, 1, 0).unwrap();
+        let mut writer = EvaluationWriter::new(run);
+        evaluations.iter().for_each(|evaluation| writer.keep(evaluation, Some(&mut events)));
+        // Two records begin the file.
+        tensorboard::read(run, 1).split_off(2)
+    }
+
+    fn value<'a>(values: &'a [SummaryValue], tag: &str) -> Option<&'a SummaryValue> {
+        values.iter().find(|value| value.tag == tag)
+    }
+
+    #[test]
+    fn an_evaluation_is_a_line_a_film_curves_and_images() {
+        let run = tempfile::tempdir().unwrap();
+        let records = kept(run.path(), &[evaluation(7, &[("walk", 0.125), ("run", 1.0)])]);
+        let line = fs::read_to_string(run.path().join("evaluations.jsonl")).unwrap();
+        let line: Value = serde_json::from_str(&line).unwrap();
+        assert_eq!((line["environment_steps"].as_u64(), line["seconds"].as_f64()), (Some(4096 * 7), Some(1.5)));
+        assert_eq!(line["evaluation"]["clips"][1]["clip"], "run");
+        assert_eq!(fs::read(run.path().join("films/0000000007.gif")).unwrap(), FILM);
+
+        let [(step, values)] = records.as_slice() else { panic!("{} records", records.len()) };
+        assert_eq!(*step, 4096 * 7);
+        let points: Vec<_> =
+            values.iter().filter_map(|value| Some((value.tag.as_str(), value.simple_value?))).collect();
+        let expected: [(&str, f32); 6] = [
+            ("evaluation/normalised_reward", 0.5),
+            ("evaluation/reward_terms/pose", 0.75),
+            ("evaluation/success_rate", 0.25),
+            ("evaluation/tracking_error/position_mm", 30.0),
+            ("evaluation_clips/walk/normalised_reward", 0.125),
+            ("evaluation_clips/run/normalised_reward", 1.0),
+        ];
+        assert_eq!(points, expected);
+        let film = value(values, "evaluation/film").unwrap().image.clone().unwrap();
+        assert_eq!((film.width, film.height, film.colorspace), (3, 2, 3));
+        assert_eq!(film.encoded_image_string, FILM);
+        let map = value(values, "evaluation/clips").unwrap().image.clone().unwrap();
+        assert!(map.encoded_image_string.starts_with(b"\x89PNG"));
+    }
+
+    #[test]
+    fn the_heat_map_grows_by_a_column_with_each_evaluation() {
+        let run = tempfile::tempdir().unwrap();
+        let records = kept(run.path(), &[1, 2, 3].map(|updates| evaluation(updates, &[("walk", 0.5), ("run", 1.0)])));
+        // The map has two rows, and its cells are square.
+        let columns = |values: &[SummaryValue]| {
+            let map = value(values, "evaluation/clips").unwrap().image.clone().unwrap();
+            2 * map.width / map.height
+        };
+        assert_eq!(records.iter().map(|(_, values)| columns(values)).collect::<Vec<_>>(), [1, 2, 3]);
+    }
+
+    #[test]
+    fn many_clips_have_no_curves_and_a_single_one_has_no_heat_map() {
+        let names: Vec<String> = (0..65).map(|number| format!("clip {number}")).collect();
+        let many: Vec<(&str, f64)> = names.iter().map(|name| (name.as_str(), 0.5)).collect();
+        let run = tempfile::tempdir().unwrap();
+        let records = kept(run.path(), &[evaluation(1, &many), evaluation(2, &many[..64]), evaluation(3, &many[..1])]);
+        let curves =
+            |values: &[SummaryValue]| values.iter().filter(|value| value.tag.starts_with("evaluation_clips/")).count();
+        let found: Vec<_> =
+            records.iter().map(|(_, values)| (curves(values), value(values, "evaluation/clips").is_some())).collect();
+        assert_eq!(found, [(0, true), (64, true), (1, false)]);
+    }
+
+    #[test]
+    fn a_film_that_is_no_gif_is_not_written() {
+        for film in [&b""[..], b"GIF89a\x03\x00\x02", b"GIF88a\x03\x00\x02\x00", b"\x89PNG\r\n\x1a\n\0\0\0\x0d"] {
+            let run = tempfile::tempdir().unwrap();
+            let evaluation = Evaluation { film: Bytes::from_static(film), ..evaluation(7, &[]) };
+            let records = kept(run.path(), &[evaluation]);
+            assert!(!run.path().join("films").exists(), "{film:?}");
+            assert_eq!(value(&records[0].1, "evaluation/film"), None, "{film:?}");
+            assert!(value(&records[0].1, "evaluation/success_rate").is_some(), "{film:?}");
+        }
+    }
+
+    #[test]
+    fn a_report_of_another_shape_costs_nothing_but_its_curves() {
+        let long = "x".repeat(LONGEST_NAME + 1);
+        let clip = json!({ "clip": long, "normalised_reward": 1 });
+        let reports = [
+            "broken".to_owned(),
+            "[3]".to_owned(),
+            json!({ "clips": 3, "overall": [1, 2] }).to_string(),
+            json!({ "clips": [null, 3, { "clip": 1 }, { "clip": "walk" }, clip], "overall": { "a": null } })
+                .to_string(),
+        ];
+        for json in reports {
+            let run = tempfile::tempdir().unwrap();
+            let records = kept(run.path(), &[Evaluation { json: json.clone(), ..evaluation(7, &[]) }]);
+            let tags: Vec<_> = records[0].1.iter().map(|value| value.tag.as_str()).collect();
+            assert_eq!(tags, ["evaluation/film"], "{json}");
+        }
+    }
+
+    #[test]
+    fn an_evaluation_without_its_steps_is_kept_but_is_in_no_curve() {
+        let run = tempfile::tempdir().unwrap();
+        let unknown = Evaluation { environment_steps: 0, ..evaluation(7, &[]) };
+        // The initial checkpoint has no steps, and its evaluation begins the curves.
+        let records = kept(run.path(), &[unknown, evaluation(0, &[])]);
+        assert_eq!(records.iter().map(|(step, _)| *step).collect::<Vec<_>>(), [0]);
+        assert_eq!(fs::read_to_string(run.path().join("evaluations.jsonl")).unwrap().lines().count(), 2);
+        assert_eq!(fs::read_dir(run.path().join("films")).unwrap().count(), 2);
+    }
+
+    #[test]
+    fn a_full_disk_loses_the_film_and_nothing_else() {
+        let run = tempfile::tempdir().unwrap();
+        let film = run.path().join("films/0000000007.gif");
+        fs::create_dir(run.path().join("films")).unwrap();
+        // A device that is always full.
+        std::os::unix::fs::symlink("/dev/full", &film).unwrap();
+        assert_eq!(kept(run.path(), &[evaluation(7, &[])]).len(), 1);
+        assert!(fs::symlink_metadata(film).is_err(), "half a film is left");
+        assert!(run.path().join("evaluations.jsonl").exists());
+    }
+}
