@@ -8,13 +8,16 @@
 //! - [`train`] runs one learner and its actors on this machine and shows their progress.
 //! - [`sweep`] trains with varied fields of an experiment, and compares the runs.
 //! - [`mod@bench`] measures; [`python`] runs other people's code for comparison.
-//! - [`plot`] draws learning curves; [`metrics`] reads the files of metrics.
+//! - [`plot`] draws learning curves; [`metrics`] and [`evaluations`] read the files that it draws.
+//! - [`film`] makes the film of the README.
 //!
 //! This program runs before libtorch and MuJoCo are installed, so it links neither.
 
 mod bench;
 mod check;
 mod documentation;
+mod evaluations;
+mod film;
 mod fuzz;
 mod images;
 mod metrics;
@@ -55,7 +58,8 @@ enum Command {
     Sweep(sweep::Options),
     /// Measure; one JSON line for each figure
     Bench(bench::Options),
-    /// Draw the curves of runs, or of other files of metrics, in one picture
+    /// Draw the curves of runs, or of other files of metrics, in one picture; beside training, which has noise, a run's
+    /// evaluations without noise
     Plot {
         /// Files of metrics, such as `runs/NAME/metrics.jsonl`; `LABEL=FILE` names a curve, and `FILE#TASK` draws one task
         /// of joint training
@@ -64,10 +68,16 @@ enum Command {
         /// The quantities to draw, separated by commas, one below the other
         #[arg(long = "y", value_enum, value_delimiter = ',', default_value = "episode-return")]
         quantities: Vec<plot::Quantity>,
+        /// Draw files that have the same label, and all files without one, as one curve: their mean, and a band with its
+        /// 95 % bootstrap interval. They should differ in their seeds only
+        #[arg(long)]
+        seeds: bool,
         /// The picture
         #[arg(long, default_value = "curves.svg")]
         out: PathBuf,
     },
+    /// Set up, build, and make the film of the README from a checkpoint
+    Film(film::Options),
     /// Make the tests' fixtures again with the scripts in tests/python
     Fixtures(python::FixtureOptions),
 }
@@ -82,7 +92,8 @@ fn main() -> ExitCode {
         Command::Train(options) => train::run(options),
         Command::Sweep(options) => sweep::run(options),
         Command::Bench(options) => bench::run(&options),
-        Command::Plot { metrics, quantities, out } => plot::run(&metrics, &quantities, &out),
+        Command::Plot { metrics, quantities, seeds, out } => plot::run(&metrics, &quantities, seeds, &out),
+        Command::Film(options) => film::run(&options),
         Command::Fixtures(options) => python::fixtures(&options),
     };
     match result {

@@ -1,25 +1,31 @@
 //! Learning curves as pictures: single runs over wall-clock time and over environment steps, or groups of runs as mean and
-//! range over environment steps.
+//! bootstrap interval over environment steps. A run's evaluations without noise are drawn beside its training.
 
+mod bootstrap;
+mod curve;
+mod heat_map;
 mod panel;
 mod pool;
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, anyhow, bail};
+use anyhow::{Context, Result, anyhow};
 use plotters::prelude::*;
 
-use crate::metrics::{self, Line};
-use panel::{Series, panel};
+use crate::evaluations::{self, ClipEvaluation};
+use crate::metrics::Line;
+use panel::{Kind, Series, panel};
 use pool::pool;
 
-/// Points of a smoothing window. The learner writes a line every few seconds.
-const SMOOTHED_OVER: usize = 5;
+pub(crate) use heat_map::draw as draw_clips;
+
+/// The label of the x axis that all runs have.
+const STEPS: &str = "million environment steps";
 
 /// A quantity that curves show.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Quantity {
-    /// Return of an episode, with the acting policy's noise.
+    /// Return of an episode.
     EpisodeReturn,
     /// Return / (the largest reward of a step × the steps that were left).
     NormalisedReward,
@@ -39,30 +45,38 @@ impl Quantity {
         }
     }
 
+    fn of_evaluation(self, means: &ClipEvaluation) -> Option<f64> {
+        match self {
+            Self::EpisodeReturn => Some(means.return_mean),
+            Self::NormalisedReward => Some(means.normalised_reward),
+            Self::RewardPerStep => Some(means.reward_per_step),
+            Self::HeadHeight => means.head_height,
+        }
+    }
+
     fn label(self) -> &'static str {
         match self {
-            Self::EpisodeReturn => "episode return (with noise)",
-            Self::NormalisedReward => "normalised reward (with noise)",
-            Self::RewardPerStep => "reward per step (with noise)",
-            Self::HeadHeight => "height of the head, m (with noise)",
+            Self::EpisodeReturn => "episode return",
+            Self::NormalisedReward => "normalised reward",
+            Self::RewardPerStep => "reward per step",
+            Self::HeadHeight => "height of the head, m",
         }
     }
 }
 
 /// A file of metrics and the name of its curve.
 pub(crate) struct Source {
-    label: String,
+    /// The name, if one was given.
+    label: Option<String>,
     path: PathBuf,
     /// In joint training the task whose episodes are drawn; none draws all episodes.
     task: Option<String>,
 }
 
 impl Source {
-    /// A run's metrics are named after its directory, other files after themselves.
+    /// All episodes of the file.
     pub(crate) fn of(path: PathBuf) -> Self {
-        let metrics = path.file_stem().is_some_and(|stem| stem == "metrics");
-        let named = if metrics { path.parent().and_then(Path::file_name) } else { path.file_stem() };
-        Self { label: named.unwrap_or(path.as_os_str()).to_string_lossy().into_owned(), path, task: None }
+        Self { label: None, path, task: None }
     }
 
     /// Parses `FILE` or `LABEL=FILE`, either with `#TASK` after it. An existing file has no label, since the names of a
@@ -74,32 +88,57 @@ impl Source {
         };
         let source = match file.split_once('=') {
             Some((label, path)) if !Path::new(file).exists() => {
-                Self { label: label.to_owned(), ..Self::of(path.into()) }
+                Self { label: Some(label.to_owned()), ..Self::of(path.into()) }
             }
             _ => Self::of(file.into()),
         };
         Self { task, ..source }
     }
+
+    /// Whether this is a run's file of metrics, and not one of another program.
+    fn is_run(&self) -> bool {
+        self.path.file_stem().is_some_and(|stem| stem == "metrics")
+    }
+
+    /// The curve's name. Without a label a run has the name of its directory, and another file its own.
+    fn name(&self) -> String {
+        let named = if self.is_run() { self.path.parent().and_then(Path::file_name) } else { self.path.file_stem() };
+        let named = || named.unwrap_or(self.path.as_os_str()).to_string_lossy().into_owned();
+        self.label.clone().unwrap_or_else(named)
+    }
+
+    /// The path of the run's evaluations, which need not exist.
+    fn evaluations(&self) -> Option<PathBuf> {
+        self.is_run().then(|| self.path.with_file_name(evaluations::FILE))
+    }
 }
 
-/// A quantity's value at a moment of a run.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Point {
-    minutes: f64,
-    /// Environment steps, millions.
-    steps: f64,
-    value: f64,
-}
-
-/// `cargo xtask plot`.
-pub(crate) fn run(metrics: &[String], quantities: &[Quantity], out: &Path) -> Result<()> {
+/// `cargo xtask plot`; with `seeds` the files that have the same label are drawn as one curve.
+pub(crate) fn run(metrics: &[String], quantities: &[Quantity], seeds: bool, out: &Path) -> Result<()> {
     let sources: Vec<Source> = metrics.iter().map(|argument| Source::parse(argument)).collect();
-    draw_runs(&sources, quantities, out)?;
+    if seeds {
+        draw_groups(&by_label(sources), quantities, out)?;
+    } else {
+        draw_runs(&sources, quantities, out)?;
+    }
     eprintln!("drew {}", out.display());
     Ok(())
 }
 
-/// Draws a curve for each run, over wall-clock time and over environment steps; a row for each quantity.
+/// The labels in their first order, each with its files. All files without a label are one group.
+fn by_label(sources: Vec<Source>) -> Vec<(String, Vec<Source>)> {
+    let mut groups: Vec<(String, Vec<Source>)> = Vec::new();
+    for source in sources {
+        let label = source.label.clone().unwrap_or_else(|| "all".to_owned());
+        match groups.iter_mut().find(|(known, _)| *known == label) {
+            Some((_, group)) => group.push(source),
+            None => groups.push((label, vec![source])),
+        }
+    }
+    groups
+}
+
+/// Draws each run over wall-clock time and over environment steps; a row for each quantity.
 pub(crate) fn draw_runs(sources: &[Source], quantities: &[Quantity], out: &Path) -> Result<()> {
     let rows = quantities.iter().map(|quantity| Ok((*quantity, over_both(sources, *quantity)?)));
     draw(&rows.collect::<Result<Vec<_>>>()?, out)
@@ -107,59 +146,42 @@ pub(crate) fn draw_runs(sources: &[Source], quantities: &[Quantity], out: &Path)
 
 /// The curves of one quantity over wall-clock time, and over environment steps.
 fn over_both(sources: &[Source], quantity: Quantity) -> Result<Vec<Panel>> {
-    let curves = sources
-        .iter()
-        .map(|source| read(&source.path, source.task.as_deref(), quantity))
-        .collect::<Result<Vec<_>>>()?;
-    let series = |x: fn(&Point) -> f64| -> Vec<Series> {
-        let line = |points: &Vec<Point>| points.iter().map(|point| (x(point), point.value)).collect();
-        let named = sources.iter().zip(&curves);
-        named.map(|(source, points)| Series::line(source.label.clone(), line(points))).collect()
-    };
-    Ok(vec![
-        ("minutes of wall clock", series(|point| point.minutes)),
-        ("million environment steps", series(|point| point.steps)),
-    ])
-}
-
-/// Draws each group of runs as their mean over environment steps, with a band from the minimum to the maximum.
-pub(crate) fn draw_groups(groups: &[(String, Vec<PathBuf>)], quantity: Quantity, out: &Path) -> Result<()> {
-    let series = groups.iter().map(|(label, runs)| {
-        let curves = runs.iter().map(|path| read(path, None, quantity)).collect::<Result<Vec<_>>>()?;
-        Ok(pool(label.clone(), &curves))
-    });
-    draw(&[(quantity, vec![("million environment steps", series.collect::<Result<Vec<_>>>()?)])], out)
-}
-
-fn read(path: &Path, task: Option<&str>, quantity: Quantity) -> Result<Vec<Point>> {
-    let mut points: Vec<Point> = Vec::new();
-    for line in metrics::read(path)? {
-        let of_task = match task {
-            Some(task) => line.tasks.get(task),
-            None => Some(&line),
-        };
-        if let Some(value) = of_task.and_then(|line| quantity.of(line)) {
-            let steps = line.environment_steps as f64 / 1e6;
-            // A killed run repeats the steps after its last checkpoint. The newer lines replace the older ones.
-            points.truncate(points.partition_point(|point| point.steps < steps));
-            points.push(Point { minutes: line.seconds / 60.0, steps, value });
+    let (mut over_time, mut over_steps) = (Vec::new(), Vec::new());
+    for (colour, source) in sources.iter().enumerate() {
+        let training = curve::training(source, quantity)?;
+        let evaluated = curve::evaluated(source, quantity)?;
+        for (kind, points) in [(Kind::Training, training), (Kind::Evaluation, evaluated)] {
+            if points.is_empty() {
+                continue;
+            }
+            let series = || Series::new(&source.name(), kind, colour);
+            over_time.push(series().with_line(points.iter().map(|point| (point.minutes, point.value))));
+            over_steps.push(series().with_line(points.iter().map(|point| (point.steps, point.value))));
         }
     }
-    if points.is_empty() {
-        let of_task = task.map_or_else(String::new, |task| format!(" of {task}"));
-        bail!("{} has no finished episode{of_task} yet, or none with the {}", path.display(), quantity.label());
-    }
-    Ok(smooth(&points))
+    Ok(vec![("minutes of wall clock", over_time), (STEPS, over_steps)])
 }
 
-/// The mean of each point and the few before it.
-fn smooth(points: &[Point]) -> Vec<Point> {
-    let mean = |window: &[Point]| window.iter().map(|point| point.value).sum::<f64>() / window.len() as f64;
-    let smoothed = points.iter().enumerate().map(|(index, point)| {
-        let window = &points[(index + 1).saturating_sub(SMOOTHED_OVER)..=index];
-        Point { value: mean(window), ..*point }
-    });
-    smoothed.collect()
+/// Draws each group of runs as their mean over environment steps, with the 95 % bootstrap interval of the mean as a band; a
+/// row for each quantity.
+pub(crate) fn draw_groups(groups: &[(String, Vec<Source>)], quantities: &[Quantity], out: &Path) -> Result<()> {
+    let rows = quantities.iter().map(|quantity| Ok((*quantity, vec![(STEPS, pooled(groups, *quantity)?)])));
+    draw(&rows.collect::<Result<Vec<_>>>()?, out)
+}
+
+/// The curves of one quantity, for each group its training and its evaluation.
+fn pooled(groups: &[(String, Vec<Source>)], quantity: Quantity) -> Result<Vec<Series>> {
+    let mut series = Vec::new();
+    for (colour, (name, sources)) in groups.iter().enumerate() {
+        let training = sources.iter().map(|source| curve::training(source, quantity)).collect::<Result<Vec<_>>>()?;
+        let evaluated = sources.iter().map(|source| curve::evaluated(source, quantity)).collect::<Result<Vec<_>>>()?;
+        series.push(pool(Series::new(name, Kind::Training, colour), &training));
+        // The mean over a part of the runs could not be compared with that of training.
+        if !evaluated.is_empty() && evaluated.iter().all(|points| !points.is_empty()) {
+            series.push(pool(Series::new(name, Kind::Evaluation, colour), &evaluated));
+        }
+    }
+    Ok(series)
 }
 
 /// The label of the x axis, and the series.
@@ -195,6 +217,13 @@ mod tests {
         path
     }
 
+    /// Adds evaluations to the run with these metrics.
+    fn evaluate(metrics: &Path, lines: &[(u64, f64)]) {
+        let line = |(steps, reward): &(u64, f64)| evaluations::example(*steps, &[("walk", *reward)]);
+        let text: String = lines.iter().map(line).collect();
+        std::fs::write(metrics.with_file_name(evaluations::FILE), text).unwrap();
+    }
+
     #[test]
     fn a_run_and_a_baseline_are_drawn_into_one_picture_with_both_axes_and_names() {
         let directory = tempfile::tempdir().unwrap();
@@ -203,11 +232,26 @@ mod tests {
         std::fs::write(&baseline, "{\"seconds\": 30, \"env_steps\": 8030, \"episode_return\": 1.0}\n").unwrap();
         let out = directory.path().join("curve.svg");
         let arguments = [run.display().to_string(), format!("PPO={}", baseline.display())];
-        super::run(&arguments, &[Quantity::EpisodeReturn], &out).unwrap();
+        super::run(&arguments, &[Quantity::EpisodeReturn], false, &out).unwrap();
         let picture = std::fs::read_to_string(out).unwrap();
-        for text in ["walk-1", "PPO", "minutes of wall clock", "million environment steps"] {
+        for text in ["walk-1 (with noise)", "PPO (with noise)", "minutes of wall clock", "million environment steps"] {
             assert!(picture.contains(text), "{text} is missing");
         }
+        assert!(!picture.contains("without noise"));
+    }
+
+    #[test]
+    fn evaluations_are_drawn_beside_their_runs_training() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = metrics(directory.path(), "walk-1/metrics.jsonl", &[(1_000_000, 2.0), (2_000_000, 2.5)]);
+        evaluate(&run, &[(1_000_000, 0.25), (2_000_000, 0.5)]);
+        let out = directory.path().join("curve.svg");
+        draw_runs(&[Source::of(run)], &[Quantity::EpisodeReturn], &out).unwrap();
+        let picture = std::fs::read_to_string(out).unwrap();
+        for text in ["walk-1 (with noise)", "walk-1 (without noise)"] {
+            assert_eq!(picture.matches(text).count(), 2, "{text}: over wall clock and over steps");
+        }
+        assert_eq!(picture.matches("<circle").count(), 4, "every evaluation has a mark");
     }
 
     #[test]
@@ -216,12 +260,12 @@ mod tests {
         let (path, out) = (directory.path().join("metrics.jsonl"), directory.path().join("curve.svg"));
         std::fs::write(&path, "{\"environment_steps\":1000000,\"episode_return\":9.0,\"head_height\":1.2}\n").unwrap();
         let arguments = [path.display().to_string()];
-        super::run(&arguments, &[Quantity::EpisodeReturn, Quantity::HeadHeight], &out).unwrap();
+        super::run(&arguments, &[Quantity::EpisodeReturn, Quantity::HeadHeight], false, &out).unwrap();
         let picture = std::fs::read_to_string(&out).unwrap();
-        for text in ["episode return (with noise)", "height of the head, m (with noise)"] {
+        for text in ["episode return", "height of the head, m"] {
             assert_eq!(picture.matches(text).count(), 2, "{text}: over wall clock and over steps");
         }
-        let error = super::run(&arguments, &[Quantity::NormalisedReward], &out).unwrap_err();
+        let error = super::run(&arguments, &[Quantity::NormalisedReward], false, &out).unwrap_err();
         assert!(error.to_string().contains("normalised reward"), "{error}");
     }
 
@@ -232,12 +276,30 @@ mod tests {
             metrics(directory.path(), &format!("{value}/metrics.jsonl"), &[(1, value), (1_000_000, value)])
         });
         let out = directory.path().join("curves.svg");
-        draw_groups(&[("beta=0".into(), runs.to_vec())], Quantity::EpisodeReturn, &out).unwrap();
-        let picture = std::fs::read_to_string(out).unwrap();
-        for part in ["beta=0", "million environment steps", "<polygon"] {
+        let draw = || {
+            let sources = runs.iter().cloned().map(Source::of).collect();
+            draw_groups(&[("beta=0".into(), sources)], &[Quantity::EpisodeReturn], &out).unwrap();
+            std::fs::read_to_string(&out).unwrap()
+        };
+        let picture = draw();
+        for part in ["beta=0 (with noise)", "million environment steps", "<polygon"] {
             assert!(picture.contains(part), "{part} is missing");
         }
         assert!(!picture.contains("wall clock"));
+        evaluate(&runs[0], &[(1, 0.25), (1_000_000, 0.5)]);
+        assert!(!draw().contains("without noise"), "one of two runs was not evaluated");
+        evaluate(&runs[1], &[(1, 0.25), (1_000_000, 0.75)]);
+        assert!(draw().contains("beta=0 (without noise)"));
+    }
+
+    #[test]
+    fn files_with_the_same_label_are_one_group() {
+        let sources = ["mlp=a.jsonl", "b.jsonl", "lstm=c.jsonl", "mlp=d.jsonl", "e.jsonl"].map(Source::parse);
+        let groups = by_label(sources.into());
+        let names = |group: &[Source]| group.iter().map(|source| source.path.display().to_string()).collect::<String>();
+        let groups: Vec<_> = groups.iter().map(|(label, group)| (label.as_str(), names(group))).collect();
+        let expected = [("mlp", "a.jsonld.jsonl"), ("all", "b.jsonle.jsonl"), ("lstm", "c.jsonl")];
+        assert_eq!(groups, expected.map(|(label, files)| (label, files.to_owned())));
     }
 
     #[test]
@@ -245,41 +307,6 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = metrics(directory.path(), "beta=1e-4,seed=2/metrics.jsonl", &[(1, 1.0)]);
         let source = Source::parse(&run.display().to_string());
-        assert_eq!((source.label.as_str(), source.path), ("beta=1e-4,seed=2", run));
-    }
-
-    #[test]
-    fn a_named_tasks_episodes_are_drawn() {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("metrics.jsonl");
-        let line = r#"{"environment_steps":1000000,"episode_return":9.0,"tasks":{"get-up":{"episode_return":2.0}}}"#;
-        std::fs::write(&path, format!("{line}\n")).unwrap();
-        let of = |argument: &str| {
-            let Source { path, task, .. } = Source::parse(&argument.replace("FILE", &path.display().to_string()));
-            read(&path, task.as_deref(), Quantity::EpisodeReturn).map(|points| (points[0].steps, points[0].value))
-        };
-        assert_eq!(of("FILE").unwrap(), (1.0, 9.0));
-        assert_eq!(of("up=FILE#get-up").unwrap(), (1.0, 2.0));
-        assert!(of("FILE#gaps").unwrap_err().to_string().contains("no finished episode of gaps yet"));
-    }
-
-    #[test]
-    fn steps_repeated_after_a_crash_are_drawn_once() {
-        let directory = tempfile::tempdir().unwrap();
-        let lines = [(1_000_000, 1.0), (2_000_000, 7.0), (3_000_000, 7.0), (2_000_000, 1.0), (4_000_000, 1.0)];
-        let points = read(&metrics(directory.path(), "metrics.jsonl", &lines), None, Quantity::EpisodeReturn).unwrap();
-        assert_eq!(
-            points.iter().map(|point| (point.steps, point.value)).collect::<Vec<_>>(),
-            [(1.0, 1.0), (2.0, 1.0), (4.0, 1.0)]
-        );
-    }
-
-    #[test]
-    fn smoothing_keeps_a_constant_and_uses_no_later_points() {
-        let points = |values: &[f64]| -> Vec<Point> {
-            values.iter().map(|value| Point { minutes: 0.0, steps: 0.0, value: *value }).collect()
-        };
-        assert_eq!(smooth(&points(&[2.0; 9])), points(&[2.0; 9]));
-        assert_eq!(smooth(&points(&[0.0, 0.0, 3.0])), points(&[0.0, 0.0, 1.0]));
+        assert_eq!((source.name().as_str(), source.path), ("beta=1e-4,seed=2", run));
     }
 }

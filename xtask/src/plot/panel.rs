@@ -6,9 +6,21 @@ use anyhow::{Result, anyhow};
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
+/// What a line shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    /// Episodes of training, with the acting policy's noise.
+    Training,
+    /// Evaluations without noise.
+    Evaluation,
+}
+
 /// A line with a label, and the band around it.
 pub(super) struct Series {
-    pub(super) label: String,
+    label: String,
+    kind: Kind,
+    /// The colour's index. Training and evaluation of the same runs have the same colour.
+    colour: usize,
     /// (x, y).
     pub(super) line: Vec<(f64, f64)>,
     /// (x, lower edge, upper edge); empty for a line without a band.
@@ -16,9 +28,18 @@ pub(super) struct Series {
 }
 
 impl Series {
-    /// A line without a band.
-    pub(super) fn line(label: String, line: Vec<(f64, f64)>) -> Self {
-        Self { label, line, band: Vec::new() }
+    /// A line without points.
+    pub(super) fn new(name: &str, kind: Kind, colour: usize) -> Self {
+        let noise = match kind {
+            Kind::Training => "with noise",
+            Kind::Evaluation => "without noise",
+        };
+        Self { label: format!("{name} ({noise})"), kind, colour, line: Vec::new(), band: Vec::new() }
+    }
+
+    /// The same with these points.
+    pub(super) fn with_line(self, points: impl Iterator<Item = (f64, f64)>) -> Self {
+        Self { line: points.collect(), ..self }
     }
 
     /// The band's outline: forward along its upper edge, back along its lower edge.
@@ -28,7 +49,7 @@ impl Series {
     }
 }
 
-/// Draws the series, each in its own colour.
+/// Draws the series. Where there is an evaluation, it is stronger than its training's line.
 pub(super) fn panel<B: DrawingBackend>(
     area: &DrawingArea<B, Shift>,
     series: &[Series],
@@ -53,14 +74,20 @@ pub(super) fn panel<B: DrawingBackend>(
         .light_line_style(TRANSPARENT)
         .draw()
         .map_err(|error| failed(error.to_string()))?;
-    for (index, (series, outline)) in series.iter().zip(outlines).enumerate() {
-        let colour = Palette99::pick(index).to_rgba();
+    let evaluated =
+        |colour: usize| series.iter().any(|series| series.kind == Kind::Evaluation && series.colour == colour);
+    for (series, outline) in series.iter().zip(outlines) {
+        let colour = Palette99::pick(series.colour).to_rgba();
+        let faint = series.kind == Kind::Training && evaluated(series.colour);
+        let style = colour.mix(if faint { 0.45 } else { 1.0 }).filled().stroke_width(2);
+        // A mean over several runs has no points of its own.
+        let marks = if series.kind == Kind::Evaluation && series.band.is_empty() { 3 } else { 0 };
         chart.draw_series([Polygon::new(outline, colour.mix(0.2))]).map_err(|error| failed(error.to_string()))?;
         chart
-            .draw_series(LineSeries::new(series.line.iter().copied(), colour.stroke_width(2)))
+            .draw_series(LineSeries::new(series.line.iter().copied(), style).point_size(marks))
             .map_err(|error| failed(error.to_string()))?
             .label(&series.label)
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
+            .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], style));
     }
     chart
         .configure_series_labels()

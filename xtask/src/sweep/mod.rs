@@ -146,10 +146,10 @@ impl Sweep {
             .enumerate()
             .map(|(index, point)| {
                 let runs = self.runs.iter().filter(|run| run.point == index && run.finished());
-                (point.name(), runs.map(|run| run.job.metrics()).collect())
+                (point.name(), runs.map(|run| plot::Source::of(run.job.metrics())).collect())
             })
             .collect();
-        plot::draw_groups(&groups, plot::Quantity::NormalisedReward, &self.directory.join("curves.svg"))
+        plot::draw_groups(&groups, &[plot::Quantity::NormalisedReward], &self.directory.join("curves.svg"))
     }
 }
 

@@ -115,6 +115,8 @@ fn job(document: &Document, point: &Point, seed: u64, directory: &Path) -> Resul
         port: None,
         minutes: None,
         episodes: None,
+        // The runs are compared after equal times, and some share their cores.
+        no_evaluator: true,
         resume: directory.join("checkpoints").is_dir(),
     })?;
     refuse_another_experiment(job.experiment(), directory)?;

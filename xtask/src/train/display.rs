@@ -11,11 +11,16 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Map, Value};
 
 use super::process::append;
+use crate::evaluations;
 use crate::metrics::Line;
 
 /// The display of one run.
 pub(crate) struct Display {
     output: Output,
+    /// A panel's text about the newest line of metrics.
+    progress: String,
+    /// A panel's line about the newest evaluation, after a line break; empty before the first one.
+    evaluation: String,
     /// The run's name, if several runs share the terminal.
     name: Option<String>,
     budget: Budget,
@@ -33,6 +38,8 @@ enum Output {
     Lines,
 }
 
+/// A panel's text before the first line of metrics.
+const WAITING: &str = "waiting for the first batch";
 /// Ticks of the budget's bar.
 const TICKS: f64 = 1000.0;
 
@@ -44,12 +51,12 @@ impl Display {
             if let Ok(style) = ProgressStyle::with_template("{msg}\n{elapsed_precise} {wide_bar} {percent:>3} %") {
                 panel.set_style(style);
             }
-            panel.set_message("waiting for the first batch");
+            panel.set_message(WAITING);
             panel.enable_steady_tick(Duration::from_millis(500));
             panel
         };
         let output = if on_terminal() { Output::Panel(panel()) } else { Output::Lines };
-        Self { output, name: None, budget: budget.clone(), started: Instant::now() }
+        Self::with(output, None, budget)
     }
 
     /// For the run `name` among several: in `row` of their terminal, if there is one.
@@ -62,7 +69,12 @@ impl Display {
             row.set_prefix(name.to_owned());
             Output::Row(row)
         });
-        Self { output, name: Some(name.to_owned()), budget: budget.clone(), started: Instant::now() }
+        Self::with(output, Some(name.to_owned()), budget)
+    }
+
+    fn with(output: Output, name: Option<String>, budget: &Budget) -> Self {
+        let (progress, evaluation) = (WAITING.to_owned(), String::new());
+        Self { output, progress, evaluation, name, budget: budget.clone(), started: Instant::now() }
     }
 
     /// Shows an event with its facts.
@@ -94,7 +106,8 @@ impl Display {
         let ticks = (self.used_budget(&line) * TICKS) as u64;
         match &self.output {
             Output::Panel(panel) => {
-                panel.set_message(panel_text(&line));
+                self.progress = panel_text(&line);
+                panel.set_message(format!("{}{}", self.progress, self.evaluation));
                 panel.set_position(ticks);
             }
             Output::Row(row) => {
@@ -105,6 +118,27 @@ impl Display {
                 let facts = serde_json::from_str::<Map<String, Value>>(text).unwrap_or_default();
                 self.line("progress", facts);
             }
+        }
+    }
+
+    /// Shows a line of `evaluations.jsonl`, unless the evaluation had noise or was started by hand. `best` is the largest
+    /// normalised reward of the run.
+    pub(super) fn evaluation(&mut self, text: &str, best: Option<f64>) {
+        let Some(line) = evaluations::Line::parse(text) else {
+            self.event("unreadable evaluation", &[("line", text.to_owned())]);
+            return;
+        };
+        if !line.is_on_curve() {
+            return;
+        }
+        match &self.output {
+            Output::Panel(panel) => {
+                self.evaluation = format!("\n{}", evaluation_text(&line, best));
+                panel.set_message(format!("{}{}", self.progress, self.evaluation));
+            }
+            // A shared row has no room, and the next line of metrics would replace the text.
+            Output::Row(_) => {}
+            Output::Text | Output::Lines => self.line("evaluation", evaluation_facts(&line, best)),
         }
     }
 
@@ -205,9 +239,49 @@ fn row_text(line: &Line) -> String {
     )
 }
 
+fn evaluation_text(line: &evaluations::Line, best: Option<f64>) -> String {
+    let means = &line.evaluation.overall;
+    format!(
+        "evaluation without noise   normalised reward {:.3}   success {}   after {} steps   best {}",
+        means.normalised_reward,
+        number(means.success_rate, 2),
+        line.environment_steps,
+        number(best, 3)
+    )
+}
+
+fn evaluation_facts(line: &evaluations::Line, best: Option<f64>) -> Map<String, Value> {
+    let means = &line.evaluation.overall;
+    let facts: [(&str, Value); 6] = [
+        ("updates", line.updates.into()),
+        ("environment_steps", line.environment_steps.into()),
+        ("seconds", line.seconds.into()),
+        ("normalised_reward", means.normalised_reward.into()),
+        ("success_rate", means.success_rate.into()),
+        ("best", best.into()),
+    ];
+    facts.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_evaluation_is_one_line_of_the_panel_and_numbers_elsewhere() {
+        let line = evaluations::Line::parse(&evaluations::example(412_000, &[("walk", 0.5)])).unwrap();
+        assert_eq!(
+            evaluation_text(&line, Some(0.534)),
+            "evaluation without noise   normalised reward 0.500   success 0.75   after 412000 steps   best 0.534"
+        );
+        assert!(evaluation_text(&line, None).ends_with("best –"));
+        let facts = Value::Object(evaluation_facts(&line, Some(0.534)));
+        let expected = serde_json::json!({
+            "updates": 2, "environment_steps": 412_000, "seconds": 24.72, "normalised_reward": 0.5,
+            "success_rate": 0.75, "best": 0.534,
+        });
+        assert_eq!(facts, expected);
+    }
 
     #[test]
     fn the_panel_shows_the_reward_of_every_task() {

@@ -7,54 +7,11 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context, Result, bail};
 use comic_setup::Interrupt;
-use serde::{Deserialize, Serialize};
 
 use super::Job;
 use super::display::Display;
+use crate::evaluations::{ClipEvaluation, Evaluation};
 use crate::workspace;
-
-/// The members of the output of `comic-actor evaluate --json` that the table shows.
-#[derive(Clone, Debug, Deserialize, Serialize)]
-pub(crate) struct Evaluation {
-    clips: Vec<ClipEvaluation>,
-    /// In joint training the tasks, each over all its clips.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    tasks: Vec<ClipEvaluation>,
-    pub(crate) overall: ClipEvaluation,
-}
-
-/// Means over the episodes of one clip, of one task, or of all.
-#[derive(Clone, Debug, Deserialize, Serialize)]
-pub(crate) struct ClipEvaluation {
-    clip: String,
-    episodes: u64,
-    /// Steps.
-    pub(crate) length_mean: f64,
-    return_mean: f64,
-    /// Return / (the largest reward of a step × the steps that were left at the episode's start).
-    pub(crate) normalised_reward: f64,
-    /// Reward per survived step / the largest reward of a step.
-    pub(crate) reward_per_step: f64,
-    fraction_survived: f64,
-    /// Absent in evaluations of earlier releases, as the two below.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    success_rate: Option<f64>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    tracking_error: Option<TrackingError>,
-    /// m; absent in evaluations of earlier releases.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    head_height: Option<f64>,
-    /// Per survived step.
-    reward_terms: BTreeMap<String, f64>,
-}
-
-/// Mean distances to the reference.
-#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
-struct TrackingError {
-    position_mm: f64,
-    local_position_mm: f64,
-    velocity_mm_per_step: f64,
-}
 
 /// The file with the evaluations in a run's directory.
 const FILE: &str = "evaluation.json";
@@ -103,13 +60,6 @@ fn evaluate(checkpoint: &Path, episodes: Option<u32>, stderr: Stdio) -> Result<E
     }
     serde_json::from_slice(&output.stdout)
         .with_context(|| format!("unreadable output of {}", workspace::describe(&command)))
-}
-
-impl Evaluation {
-    /// The means with this name.
-    fn of(&self, clip: &str) -> Option<&ClipEvaluation> {
-        self.clips.iter().chain(&self.tasks).chain([&self.overall]).find(|evaluation| evaluation.clip == clip)
-    }
 }
 
 /// A block of rows for each clip, a column for each policy.
@@ -173,6 +123,7 @@ mod tests {
 
     fn evaluation(clips: &[&str], normalised_reward: f64) -> Evaluation {
         Evaluation {
+            deterministic: true,
             clips: clips.iter().map(|clip| of_clip(clip, normalised_reward)).collect(),
             tasks: Vec::new(),
             overall: of_clip("overall", normalised_reward),

@@ -14,9 +14,9 @@ use anyhow::{Context, Result, bail};
 use comic_experiment::Experiment;
 use comic_setup::Interrupt;
 
+use crate::evaluations::Evaluation;
 use crate::{plot, setup, workspace};
 use display::Display;
-use evaluation::Evaluation;
 use run_directory::RunDirectory;
 use supervisor::Supervisor;
 
@@ -46,6 +46,9 @@ pub(crate) struct Options {
     /// Episodes of each clip in the evaluations at the end [default: every start frame once]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) episodes: Option<u32>,
+    /// Start no process beside the actors that evaluates the newest checkpoint every few minutes, without noise
+    #[arg(long)]
+    pub(crate) no_evaluator: bool,
     /// Resume the run that --run names, or the preset's newest run
     #[arg(long)]
     pub(crate) resume: bool,
@@ -58,6 +61,8 @@ pub(crate) struct Job {
     document: Vec<String>,
     actors: u16,
     episodes: Option<u32>,
+    /// Whether a process evaluates checkpoints during training.
+    evaluator: bool,
     port: Option<u16>,
     directory: RunDirectory,
 }
@@ -104,6 +109,7 @@ impl Job {
             document,
             actors: options.actors,
             episodes: options.episodes,
+            evaluator: !options.no_evaluator,
             port: options.port,
             directory,
         })
@@ -124,7 +130,7 @@ impl Job {
         self.directory.metrics()
     }
 
-    /// Trains until the budget is used up or a stop is requested, and draws the curve.
+    /// Trains until the budget is used up or a stop is requested, and draws the run.
     pub(crate) fn train(&self, display: &mut Display, interrupt: &Interrupt) -> Result<()> {
         self.directory.make()?;
         // The port is chosen after the build, which takes minutes: another program may take a port in that time.
@@ -135,15 +141,24 @@ impl Job {
             supervisor.stop(display);
             outcome
         });
-        let metrics = self.metrics();
-        if metrics.exists() {
-            let curve = self.path().join("curve.svg");
-            match plot::draw_runs(&[plot::Source::of(metrics)], &[plot::Quantity::EpisodeReturn], &curve) {
-                Ok(()) => display.event("drew", &[("curve", curve.display().to_string())]),
-                Err(error) => display.event("no curve", &[("reason", format!("{error:#}"))]),
-            }
+        if self.metrics().exists() {
+            self.draw(display);
         }
         outcome
+    }
+
+    /// Draws the curve, and a picture of the clips if there are several. Training has not failed if a picture fails.
+    fn draw(&self, display: &mut Display) {
+        let (curve, clips) = (self.path().join("curve.svg"), self.path().join("clips.svg"));
+        match plot::draw_runs(&[plot::Source::of(self.metrics())], &[plot::Quantity::NormalisedReward], &curve) {
+            Ok(()) => display.event("drew", &[("curve", curve.display().to_string())]),
+            Err(error) => display.event("no curve", &[("reason", format!("{error:#}"))]),
+        }
+        match plot::draw_clips(&self.directory.evaluations(), &clips) {
+            Ok(true) => display.event("drew", &[("clips", clips.display().to_string())]),
+            Ok(false) => {}
+            Err(error) => display.event("no picture of the clips", &[("reason", format!("{error:#}"))]),
+        }
     }
 
     /// Evaluates the run's policies without noise and writes `evaluation.json`.

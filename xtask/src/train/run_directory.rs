@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 
-use crate::workspace;
+use crate::{evaluations, workspace};
 
-/// A run's directory: checkpoints, metrics.jsonl, tensorboard, logs, the evaluation and the curve.
+/// A run's directory: checkpoints, metrics.jsonl, evaluations.jsonl, tensorboard, logs, the evaluation and the pictures.
 pub(super) struct RunDirectory(PathBuf);
 
 impl RunDirectory {
@@ -45,6 +45,10 @@ impl RunDirectory {
 
     pub(super) fn metrics(&self) -> PathBuf {
         self.0.join("metrics.jsonl")
+    }
+
+    pub(super) fn evaluations(&self) -> PathBuf {
+        self.0.join(evaluations::FILE)
     }
 
     pub(super) fn log(&self, name: &str) -> PathBuf {

@@ -10,13 +10,13 @@ use comic_setup::Interrupt;
 use super::Job;
 use super::display::Display;
 use super::process::{Process, Tail};
-use crate::workspace;
+use crate::{evaluations, workspace};
 
 /// The time in which the learner must begin to serve. It opens the clips and builds the networks first.
 const START_LIMIT: Duration = Duration::from_secs(120);
 /// The time in which the learner must write its last checkpoint and end.
 const LEARNER_END_LIMIT: Duration = Duration::from_secs(60);
-/// The time in which an actor must send its last unrolls and end.
+/// The time in which an actor must send its last unrolls and end. The evaluator has as long.
 const ACTOR_END_LIMIT: Duration = Duration::from_secs(10);
 /// After this running time an actor's failure counts as the first.
 const STABLE: Duration = Duration::from_secs(30);
@@ -29,7 +29,10 @@ pub(super) struct Supervisor<'a> {
     port: u16,
     learner: Process,
     actors: Vec<Actor>,
+    /// Evaluates checkpoints. It is not started again: training does not need it.
+    evaluator: Option<Process>,
     metrics: Tail,
+    evaluations: Tail,
     log: Tail,
 }
 
@@ -43,9 +46,10 @@ struct Actor {
 }
 
 impl<'a> Supervisor<'a> {
-    /// Starts the learner, waits until it serves, and starts the actors.
+    /// Starts the learner, waits until it serves, and starts the actors and the evaluator.
     pub(super) fn start(job: &'a Job, port: u16, display: &mut Display, interrupt: &Interrupt) -> Result<Self> {
         let metrics = Tail::new(job.directory.metrics());
+        let evaluations = Tail::new(job.directory.evaluations());
         let log = Tail::new(job.directory.log("learner"));
         let mut command = Command::new(workspace::program("comic-learner")?);
         command.args(&job.document).args(["--address", "127.0.0.1", "--port", &port.to_string()]);
@@ -53,18 +57,40 @@ impl<'a> Supervisor<'a> {
         let mut learner = Process::start("comic-learner", &mut command, job.directory.log("learner"))?;
         await_serving(&mut learner, interrupt)?;
         display.event("learner serves", &[("address", format!("127.0.0.1:{port}"))]);
-        let mut supervisor = Self { job, port, learner, actors: Vec::new(), metrics, log };
+        let (actors, evaluator) = (Vec::new(), None);
+        let mut supervisor = Self { job, port, learner, actors, evaluator, metrics, evaluations, log };
         for number in 0..usize::from(job.actors) {
             let process = Some(supervisor.start_actor(number)?);
             supervisor.actors.push(Actor { number, process, failures: 0, restart_at: None });
         }
         display.event("actors started", &[("count", job.actors.to_string())]);
+        if job.evaluator {
+            // Training does not need it.
+            match supervisor.start_evaluator() {
+                Ok(process) => {
+                    supervisor.evaluator = Some(process);
+                    display.event("evaluator started", &[]);
+                }
+                Err(error) => display.event("evaluator failed", &[("reason", format!("{error:#}"))]),
+            }
+        }
         Ok(supervisor)
+    }
+
+    /// The learner's address.
+    fn address(&self) -> String {
+        format!("http://127.0.0.1:{}", self.port)
+    }
+
+    fn start_evaluator(&self) -> Result<Process> {
+        let mut command = Command::new(workspace::program("comic-actor")?);
+        command.args(["evaluate", "--learner", &self.address(), "--watch"]);
+        Process::start("evaluator", &mut command, self.job.directory.log("evaluator"))
     }
 
     fn start_actor(&self, number: usize) -> Result<Process> {
         let mut command = Command::new(workspace::program("comic-actor")?);
-        command.args(["--learner", &format!("http://127.0.0.1:{}", self.port)]);
+        command.args(["--learner", &self.address()]);
         let Experiment { unroll, actor, .. } = &self.job.experiment;
         if unroll.lockstep {
             // A batch waits for every environment, so the actors together must have all of them.
@@ -92,6 +118,7 @@ impl<'a> Supervisor<'a> {
                 bail!("comic-learner ended with {status}; {}", self.learner.last_lines());
             }
             self.restart_failed_actors(display)?;
+            self.report_failed_evaluator(display)?;
             std::thread::sleep(Duration::from_millis(200));
         }
     }
@@ -126,6 +153,20 @@ impl<'a> Supervisor<'a> {
         Ok(())
     }
 
+    /// Says why the evaluator has ended, if it has failed. Training continues without it.
+    fn report_failed_evaluator(&mut self, display: &mut Display) -> Result<()> {
+        if let Some(process) = &mut self.evaluator
+            && let Some(status) = process.ended()?
+        {
+            if !status.success() {
+                let facts = [("status", status.to_string()), ("log", process.last_lines())];
+                display.event("evaluator failed", &facts);
+            }
+            self.evaluator = None;
+        }
+        Ok(())
+    }
+
     /// Ends the processes that still run. The learner writes its checkpoint, the actors send their last unrolls.
     pub(super) fn stop(&mut self, display: &mut Display) {
         if matches!(self.learner.ended(), Ok(None)) {
@@ -134,20 +175,23 @@ impl<'a> Supervisor<'a> {
                 display.event("learner killed", &[("reason", "it did not end in time".into())]);
             }
         }
-        // The learner has told its actors that the run is over. The signal is for actors that were not connected.
-        let actors: Vec<_> = self.actors.iter_mut().filter_map(|actor| actor.process.as_mut()).collect();
-        for process in &actors {
+        // The learner has told its actors that the run is over. The signal is for actors that were not connected, and for an
+        // evaluator that is at work.
+        let actors = self.actors.iter_mut().filter_map(|actor| actor.process.as_mut());
+        let others: Vec<_> = actors.chain(&mut self.evaluator).collect();
+        for process in &others {
             process.terminate();
         }
-        for process in actors {
+        for process in others {
             if !process.wait(ACTOR_END_LIMIT) {
-                display.event("actor killed", &[("name", process.name.clone())]);
+                display.event("killed", &[("name", process.name.clone()), ("reason", "it did not end in time".into())]);
             }
         }
         self.show(display);
     }
 
-    /// Shows new metrics and new lines of the learner's log, which report the phases before the first update.
+    /// Shows new metrics, new evaluations, and new lines of the learner's log, which report the phases before the first
+    /// update.
     fn show(&mut self, display: &mut Display) {
         for line in self.log.lines() {
             if !line.contains(" metrics: ") && !is_listening_line(&line) {
@@ -156,6 +200,10 @@ impl<'a> Supervisor<'a> {
         }
         for line in self.metrics.lines() {
             display.metrics(&line);
+        }
+        for line in self.evaluations.lines() {
+            // The whole file is read for the best, which may be older than a resumed run's new lines.
+            display.evaluation(&line, evaluations::best(&self.job.directory.evaluations()));
         }
     }
 }
