@@ -1,4 +1,4 @@
-//! A learner and actors in containers, as `deploy/compose.yaml` starts them.
+//! A learner, actors and an evaluator in containers, as `deploy/compose.yaml` starts them.
 
 use std::env;
 use std::fmt::Write as _;

@@ -128,6 +128,8 @@ pub struct Cluster {
     pub learner: StatefulSet,
     /// The actors' Job.
     pub actors: Job,
+    /// The evaluator's Job.
+    pub evaluator: Job,
     /// The actors' PodDisruptionBudget.
     pub budget: PodDisruptionBudget,
     /// The network policies by name.
@@ -147,6 +149,7 @@ impl Cluster {
             service: take(&mut manifests, "Service", "comic-learner")?,
             learner: take(&mut manifests, "StatefulSet", "comic-learner")?,
             actors: take(&mut manifests, "Job", "comic-actor")?,
+            evaluator: take(&mut manifests, "Job", "comic-evaluator")?,
             budget: take(&mut manifests, "PodDisruptionBudget", "comic-actor")?,
             policies,
         };
@@ -154,12 +157,12 @@ impl Cluster {
         Ok(cluster)
     }
 
-    /// The learner's pod and the actors' pod.
+    /// The learner's pod, the actors' pod and the evaluator's pod.
     ///
     /// # Errors
     /// When one is missing.
-    pub fn pods(&self) -> Result<[&PodSpec; 2]> {
-        Ok([self.learner_pod()?, self.actor_pod()?])
+    pub fn pods(&self) -> Result<[&PodSpec; 3]> {
+        Ok([self.learner_pod()?, self.actor_pod()?, self.evaluator_pod()?])
     }
 
     /// The learner's pod.
@@ -175,9 +178,21 @@ impl Cluster {
     /// # Errors
     /// When there is none.
     pub fn actor_pod(&self) -> Result<&PodSpec> {
-        let spec = self.actors.spec.as_ref().context("no spec")?;
-        spec.template.spec.as_ref().context("no pod")
+        pod(&self.actors)
     }
+
+    /// The evaluator's pod.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn evaluator_pod(&self) -> Result<&PodSpec> {
+        pod(&self.evaluator)
+    }
+}
+
+fn pod(job: &Job) -> Result<&PodSpec> {
+    let spec = job.spec.as_ref().context("no spec")?;
+    spec.template.spec.as_ref().context("no pod")
 }
 
 /// Calls `check` with every overlay and with the base.

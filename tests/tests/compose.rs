@@ -34,13 +34,16 @@ async fn trains_on_with(actors: u64, project: &Project, what: &str) -> Result<Va
 
 #[tokio::test]
 async fn containers_survive_kills_and_cuts_and_the_accounting_balances() -> Result<()> {
-    let project = Project::new("faults", &["compose.yaml"]);
+    let mut project = Project::new("faults", &["compose.yaml"]);
+    // An evaluator can fetch a checkpoint only until the next one is written.
+    project.tell("--set learner.checkpoint_seconds=5");
     project.up(2)?;
     trains_on_with(2, &project, "two actors train").await?;
     check_containers(&project).await?;
     let metrics = get(&project, "learner", "9090", "/metrics")?;
     ensure!(metrics.contains("comic_actors{state=\"alive\"} 2\n"), "Prometheus sees two actors");
     tensorboard_shows_the_curves(&project).await?;
+    the_evaluator_films(&project).await?;
 
     let [killed, kept] = &project.containers("actor")?[..] else { bail!("not two actors") };
     killed.docker(&["kill"])?;
@@ -84,7 +87,7 @@ async fn containers_survive_kills_and_cuts_and_the_accounting_balances() -> Resu
 
 /// Each container runs as a user without privileges, on a read-only file system, with the program as process 1, and healthy.
 async fn check_containers(project: &Project) -> Result<()> {
-    for (service, program) in [("learner", "comic-learner"), ("actor", "comic-actor")] {
+    for (service, program) in [("learner", "comic-learner"), ("actor", "comic-actor"), ("evaluator", "comic-actor")] {
         for container in project.containers(service)? {
             let size = docker(&["image", "inspect", "--format", "{{.Size}}", &container.inspect(".Image")?])?;
             ensure!(size.trim().parse::<u64>()? < 700_000_000, "the image of the {service} has {size} bytes");
@@ -95,6 +98,10 @@ async fn check_containers(project: &Project) -> Result<()> {
                 "the container can write into its image"
             );
             ensure!(container.inspect(".HostConfig.ReadonlyRootfs")? == "true", "root could write into the image");
+            if service == "evaluator" {
+                ensure!(container.inspect(".State.Health")? == "null", "an evaluator writes no liveness file");
+                continue;
+            }
             // An actor is healthy after its first steps, some seconds after it joined.
             let begun = Instant::now();
             while let Err(error) = container.exec(&[program, "health"]) {
@@ -107,6 +114,22 @@ async fn check_containers(project: &Project) -> Result<()> {
     ensure!(actor.exec(&["python3", "--version"]).is_err(), "the actor's image holds Python");
     let libraries = project.in_learner(&["find", "/opt/comic", "-name", "libmujoco*"])?;
     ensure!(libraries.is_empty(), "the learner's image holds MuJoCo: {libraries}");
+    Ok(())
+}
+
+/// The evaluator makes films without a display and on a read-only file system, and the learner keeps them.
+async fn the_evaluator_films(project: &Project) -> Result<()> {
+    let begun = Instant::now();
+    loop {
+        match project.in_learner(&["ls", "/runs/default/films"]) {
+            Ok(films) if films.contains(".gif") => break,
+            answer => {
+                let log = project.container("evaluator")?.log()?;
+                ensure!(begun.elapsed() < LIMIT, "no film: {answer:?}: {log}");
+            }
+        }
+        tokio::time::sleep(Duration::from_secs(1)).await;
+    }
     Ok(())
 }
 
@@ -174,9 +197,13 @@ async fn containers_with_a_wrong_configuration_are_restarted_ten_times_only() ->
 async fn containers_end_when_the_run_is_over() -> Result<()> {
     let mut project = Project::new("over", &["compose.yaml"]);
     project.tell("--set budget.updates=200");
+    // The learner answers for 1.5 s after the end, so everyone has to be connected by then.
+    project.up(0)?;
+    project.container("evaluator")?.until_log_holds("following the learner's checkpoints", LIMIT).await?;
     project.up(2)?;
-    let containers = [project.containers("actor")?, vec![project.container("learner")?]].concat();
-    ensure!(containers.len() == 3, "{containers:?}");
+    let containers = ["learner", "actor", "evaluator"].map(|service| project.containers(service));
+    let containers = containers.into_iter().collect::<Result<Vec<_>>>()?.concat();
+    ensure!(containers.len() == 4, "{containers:?}");
     for container in containers {
         container.until_is(".State.Status", "exited", LIMIT).await?;
         ensure!(container.inspect(".State.ExitCode")? == "0", "{}", container.log()?);

@@ -75,6 +75,28 @@ fn with_tls_the_learner_has_the_same_options_except_for_access() -> Result<()> {
     Ok(())
 }
 
+/// It uses their image, their cache and their credentials. It writes no liveness file.
+#[test]
+fn the_evaluator_has_what_actors_have_and_no_health_check() -> Result<()> {
+    let (plain, tls) = (compose("compose.yaml")?, compose("compose.tls.yaml")?);
+    let (actor, evaluator) = (&plain["services"]["actor"], &plain["services"]["evaluator"]);
+    for field in ["image", "build", "tmpfs", "depends_on", "stop_grace_period"] {
+        ensure!(!actor[field].is_null() && actor[field] == evaluator[field], "{field}: {evaluator:?}");
+    }
+    ensure!(evaluator["healthcheck"]["disable"] == true && evaluator["scale"].is_null(), "{evaluator:?}");
+    let (actor, evaluator) = (&tls["services"]["actor"], &tls["services"]["evaluator"]);
+    ensure!(actor["volumes"] == evaluator["volumes"], "{evaluator:?}");
+    let mut access = actor["environment"].as_mapping().context("no environment")?.clone();
+    access.remove("COMIC_LEARNER");
+    ensure!(evaluator["environment"].as_mapping() == Some(&access), "{evaluator:?}");
+
+    let told = command("compose.yaml", "evaluator")?;
+    ensure!(told.starts_with(&["evaluate".to_owned(), "--watch".to_owned()]), "{told:?}");
+    let secured = told.iter().map(|word| word.replace("http://", "https://")).collect::<Vec<_>>();
+    ensure!(secured != told && secured == command("compose.tls.yaml", "evaluator")?, "{told:?} and {secured:?}");
+    Ok(())
+}
+
 fn arguments_of(dockerfile: &str) -> BTreeSet<String> {
     let name = |line: &str| Some(line.strip_prefix("ARG ")?.split('=').next()?.to_owned());
     dockerfile.lines().filter_map(name).collect()
@@ -96,10 +118,10 @@ fn every_argument_of_the_dockerfile_can_be_given_to_compose() -> Result<()> {
     let file = build["dockerfile"].as_str().context("no file")?;
     let own = arguments_of(&text(file.trim_start_matches("deploy/"))?);
     ensure!(given == own, "tensorboard: {given:?} for {own:?}");
-    for service in ["learner", "actor"] {
+    for (service, target) in [("learner", "learner"), ("actor", "actor"), ("evaluator", "actor")] {
         let (build, given) = given_to(service)?;
         ensure!(given == asked, "{service}: {given:?} for {asked:?}");
-        ensure!(dockerfile.contains(&format!(" AS {service}\n")) && build["target"] == service, "{service}: {build:?}");
+        ensure!(dockerfile.contains(&format!(" AS {target}\n")) && build["target"] == target, "{service}: {build:?}");
     }
     Ok(())
 }
@@ -122,7 +144,9 @@ fn what_is_in_volumes_is_where_the_image_lets_it_be_written() -> Result<()> {
     let prepared =
         prepared.lines().find(|line| line.contains("install --directory --owner comic")).context("no directories")?;
     let prepared: BTreeSet<_> = prepared.split_whitespace().filter(|word| word.starts_with('/')).collect();
-    for (file, services) in [("compose.yaml", ["learner", "actor"]), ("compose.tls.yaml", ["certs", "learner"])] {
+    let used =
+        [("compose.yaml", ["learner", "actor", "evaluator"]), ("compose.tls.yaml", ["certs", "learner", "evaluator"])];
+    for (file, services) in used {
         for service in services {
             let service = &compose(file)?["services"][service];
             let volumes = [&service["volumes"], &service["tmpfs"]].into_iter().filter_map(Value::as_sequence).flatten();

@@ -3,21 +3,21 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail, ensure};
 use comic_proto::Access;
 use comic_tests::kubernetes::{
-    Cluster, applicable, container, each, environment, manifests_in, option, render, strictly,
+    Cluster, amount, applicable, container, each, environment, manifests_in, option, render, strictly,
 };
 use comic_tests::repository::root;
 use comic_tests::system::{System, help, program};
-use k8s_openapi::api::core::v1::Probe;
+use k8s_openapi::api::batch::v1::JobSpec;
+use k8s_openapi::api::core::v1::{Container, Probe};
 use k8s_openapi::api::networking::v1::{
     NetworkPolicyEgressRule, NetworkPolicyIngressRule, NetworkPolicyPeer, NetworkPolicyPort, NetworkPolicySpec,
 };
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::LabelSelector;
 use k8s_openapi::apimachinery::pkg::util::intstr::IntOrString;
 use serde_json::{Value, json};
 
@@ -65,18 +65,18 @@ fn probes_use_ports_and_commands_that_exist() -> Result<()> {
         let asked = actor.readiness_probe.as_ref().and_then(|probe: &Probe| probe.exec.as_ref()?.command.as_deref());
         ensure!(asked == Some(&["comic-actor".to_owned(), "health".to_owned()]), "{asked:?}");
         ensure!(actor.liveness_probe.is_none(), "an actor that waits for its learner would be restarted");
-        let liveness = dockerfile()?
-            .lines()
-            .find_map(|line| Some(line.split("COMIC_LIVENESS=").nth(1)?.split(' ').next()?.to_owned()));
-        let liveness = PathBuf::from(liveness.context("the image names no liveness file")?);
-        let mounts = actor.volume_mounts.iter().flatten();
-        ensure!(
-            mounts.into_iter().any(|mount| liveness.starts_with(&mount.mount_path)),
-            "{} cannot be written",
-            liveness.display()
-        );
-        Ok(())
+        can_write_to(actor, "COMIC_LIVENESS")
     })
+}
+
+/// Checks that a container can write to the path in this variable of its image.
+fn can_write_to(container: &Container, variable: &str) -> Result<()> {
+    let dockerfile = dockerfile()?;
+    let path = dockerfile.split_whitespace().find_map(|word| word.strip_prefix(variable)?.strip_prefix('='));
+    let path = Path::new(path.with_context(|| format!("the image does not set {variable}"))?);
+    let mut mounts = container.volume_mounts.iter().flatten().filter(|mount| mount.read_only != Some(true));
+    ensure!(mounts.any(|mount| path.starts_with(&mount.mount_path)), "{} cannot be written", path.display());
+    Ok(())
 }
 
 #[test]
@@ -111,8 +111,11 @@ fn names_and_ports_agree_with_each_other_and_with_the_programs() -> Result<()> {
         let labels = set.template.metadata.as_ref().and_then(|metadata| metadata.labels.as_ref());
         ensure!(labels == set.selector.match_labels.as_ref() && labels == service.selector.as_ref(), "{labels:?}");
 
+        let url = format!("https://{name}:{grpc}");
         let variables = environment(container(cluster.actor_pod()?)?);
-        ensure!(variables["COMIC_LEARNER"] == format!("https://{name}:{grpc}"), "{variables:?}");
+        ensure!(variables["COMIC_LEARNER"] == url, "{variables:?}");
+        let evaluator = container(cluster.evaluator_pod()?)?;
+        ensure!(option(evaluator, "--learner")? == url, "{:?}", evaluator.args);
         ensure!(environment(learner)["COMIC_LEARNER"] == format!("https://localhost:{grpc}"));
         Ok(())
     })
@@ -138,8 +141,10 @@ fn images_are_pinned_to_this_version_everywhere() -> Result<()> {
             "{device:?}: {:?}",
             learner.image
         );
-        let actor = &container(cluster.actor_pod()?)?.image;
-        ensure!(actor.as_ref() == Some(&expected[3]), "{actor:?}");
+        for pod in [cluster.actor_pod()?, cluster.evaluator_pod()?] {
+            let image = &container(pod)?.image;
+            ensure!(image.as_ref() == Some(&expected[3]), "{image:?}");
+        }
         Ok(())
     })?;
     for file in ["compose.yaml", "compose.tls.yaml", "Dockerfile", "README.md"] {
@@ -167,25 +172,8 @@ fn actors_are_an_indexed_job_that_follows_their_exit_codes() -> Result<()> {
         let pod = cluster.actor_pod()?;
         let name = option(container(pod)?, "--name")?;
         ensure!(name.contains("$(JOB_COMPLETION_INDEX)"), "{name}: each pod would replace the others");
-        ensure!(pod.restart_policy.as_deref() == Some("Never"), "a pod failure policy needs this restart policy");
-        let name = container(pod)?.name.as_str();
-        let rules = &job.pod_failure_policy.as_ref().context("no policy for failures")?.rules;
-        let of_code = |code| {
-            let mut found = rules.iter().filter(|rule| {
-                let codes = rule.on_exit_codes.as_ref();
-                codes.is_some_and(|codes| {
-                    codes.container_name.as_deref() == Some(name)
-                        && codes.operator == "In"
-                        && codes.values.contains(&code)
-                })
-            });
-            found.next().map(|rule| rule.action.as_str())
-        };
-        ensure!(of_code(2) == Some("FailJob") && of_code(1) == Some("Ignore"), "{rules:?}");
-        let first = rules.first().and_then(|rule| Some((rule.action.as_str(), rule.on_pod_conditions.as_deref()?)));
-        ensure!(
-            first.is_some_and(|(action, conditions)| action == "Ignore" && conditions[0].type_ == "DisruptionTarget")
-        );
+        let actions = [action_after(job, 1)?, action_after(job, 2)?];
+        ensure!(actions == [Some("Ignore"), Some("FailJob")], "{actions:?}");
 
         let budget = cluster.budget.spec.as_ref().context("no spec")?;
         ensure!(
@@ -209,8 +197,49 @@ fn actors_are_an_indexed_job_that_follows_their_exit_codes() -> Result<()> {
     })
 }
 
+/// What a Job does after a pod that ended with this code. It replaces pods of drained nodes.
+fn action_after(job: &JobSpec, code: i32) -> Result<Option<&str>> {
+    let pod = job.template.spec.as_ref().context("no pod")?;
+    ensure!(pod.restart_policy.as_deref() == Some("Never"), "a pod failure policy needs this restart policy");
+    let name = container(pod)?.name.as_str();
+    let rules = &job.pod_failure_policy.as_ref().context("no policy for failures")?.rules;
+    let first = rules.first().and_then(|rule| Some((rule.action.as_str(), rule.on_pod_conditions.as_deref()?)));
+    ensure!(first.is_some_and(|(action, conditions)| action == "Ignore" && conditions[0].type_ == "DisruptionTarget"));
+    let mut found = rules.iter().filter(|rule| {
+        let codes = rule.on_exit_codes.as_ref();
+        codes.is_some_and(|codes| {
+            codes.container_name.as_deref() == Some(name) && codes.operator == "In" && codes.values.contains(&code)
+        })
+    });
+    Ok(found.next().map(|rule| rule.action.as_str()))
+}
+
 #[test]
-fn only_actors_reach_the_learners_port() -> Result<()> {
+fn the_evaluator_is_a_small_job_with_the_access_of_actors() -> Result<()> {
+    each(|cluster| {
+        let job = cluster.evaluator.spec.as_ref().context("no spec")?;
+        ensure!(job.parallelism.is_none() && job.completions.is_none(), "more than one evaluator");
+        let actions = [action_after(job, 1)?, action_after(job, 2)?];
+        ensure!(actions == [None, Some("FailJob")], "{actions:?}");
+        let evaluator = container(cluster.evaluator_pod()?)?;
+        let args = evaluator.args.as_deref().unwrap_or_default();
+        ensure!(args.starts_with(&["evaluate".to_owned(), "--watch".to_owned()]), "{args:?}");
+        let mut access = environment(container(cluster.actor_pod()?)?);
+        access.remove("COMIC_LEARNER");
+        ensure!(environment(evaluator) == access, "{:?}", evaluator.env);
+        let limits = evaluator.resources.as_ref().and_then(|resources| resources.limits.as_ref());
+        ensure!(amount(&limits.context("no limits")?["cpu"])? < 1.0, "{limits:?}");
+        ensure!(
+            evaluator.readiness_probe.is_none() && evaluator.liveness_probe.is_none(),
+            "an evaluator writes no liveness file"
+        );
+        // Films are made there.
+        can_write_to(evaluator, "TMPDIR")
+    })
+}
+
+#[test]
+fn only_actors_and_the_evaluator_reach_the_learners_port() -> Result<()> {
     each(|cluster| {
         let everybody = cluster.policies["comic"].spec.as_ref().context("no spec")?;
         let chosen = everybody.pod_selector.as_ref().context("no pods")?;
@@ -224,23 +253,30 @@ fn only_actors_reach_the_learners_port() -> Result<()> {
         );
         ensure!(everybody.ingress.is_none() && everybody.egress.is_none(), "the policy lets traffic through");
         let learner = cluster.learner.spec.template.metadata.as_ref().and_then(|metadata| metadata.labels.as_ref());
-        let job = cluster.actors.spec.as_ref().context("no spec")?;
-        let actors = job.template.metadata.as_ref().and_then(|metadata| metadata.labels.as_ref());
+        let learner = json!({ "matchLabels": learner });
+        let label = "app.kubernetes.io/name";
+        let names = [&cluster.actors, &cluster.evaluator].map(|job| {
+            let metadata = job.spec.as_ref().and_then(|spec| spec.template.metadata.as_ref());
+            metadata.and_then(|metadata| metadata.labels.as_ref()?.get(label))
+        });
+        ensure!(names[0] != names[1], "what selects actors also selects the evaluator: {names:?}");
+        let clients = json!({ "matchExpressions": [{ "key": label, "operator": "In", "values": names }] });
+        let monitoring = json!({ "matchLabels": { "kubernetes.io/metadata.name": "monitoring" } });
         let ports = container(cluster.learner_pod()?)?.ports.iter().flatten();
         let ports: BTreeMap<_, _> = ports
             .map(|port| (port.name.as_deref().unwrap_or_default(), format!("TCP {}", port.container_port)))
             .collect();
         let port = |name: &str| vec![ports[name].clone()];
         // Every other policy allows some traffic. These are all of them.
-        let ways = allowed(cluster, "comic-learner", learner, |policy| {
+        let ways = allowed(cluster, "comic-learner", &learner, |policy| {
             policy.ingress.iter().flatten().map(ingress).collect()
         })?;
-        let from_actors = (json!(actors), json!(null), port("grpc"));
-        let from_monitoring = (json!(null), json!({ "kubernetes.io/metadata.name": "monitoring" }), port("metrics"));
-        ensure!(ways == [from_actors, from_monitoring], "{ways:?}");
+        let from_clients = (clients.clone(), json!(null), port("grpc"));
+        let from_monitoring = (json!(null), monitoring, port("metrics"));
+        ensure!(ways == [from_clients, from_monitoring], "{ways:?}");
         let ways =
-            allowed(cluster, "comic-actor", actors, |policy| policy.egress.iter().flatten().map(egress).collect())?;
-        let to_learner = (json!(learner), json!(null), port("grpc"));
+            allowed(cluster, "comic-clients", &clients, |policy| policy.egress.iter().flatten().map(egress).collect())?;
+        let to_learner = (learner, json!(null), port("grpc"));
         let names = (json!(null), json!(null), vec!["UDP 53".to_owned(), "TCP 53".to_owned()]);
         ensure!(ways == [to_learner, names], "{ways:?}");
         ensure!(cluster.policies.len() == 3, "{:?}", cluster.policies.keys());
@@ -248,22 +284,19 @@ fn only_actors_reach_the_learners_port() -> Result<()> {
     })
 }
 
-/// Pods, namespaces and ports.
+/// The selectors of pods and of namespaces, and the ports.
 type Way = (Value, Value, Vec<String>);
 
-type Labels = BTreeMap<String, String>;
-
-/// The traffic that this policy allows. It must choose the pods with these labels.
+/// The traffic that this policy allows. It must choose its pods by this selector.
 fn allowed(
     cluster: &Cluster,
     name: &str,
-    pods: Option<&Labels>,
+    pods: &Value,
     ways: impl Fn(&NetworkPolicySpec) -> Result<Vec<Way>>,
 ) -> Result<Vec<Way>> {
     let policy = cluster.policies.get(name).and_then(|policy| policy.spec.as_ref()).context("no such policy")?;
-    let chosen = policy.pod_selector.as_ref().context("no pods")?;
-    ensure!(pods.is_some() && chosen.match_labels.as_ref() == pods, "{chosen:?}");
-    ensure!(chosen.match_expressions.is_none(), "{chosen:?}");
+    let chosen = serde_json::to_value(&policy.pod_selector)?;
+    ensure!(chosen == *pods, "{chosen}");
     ways(policy)
 }
 
@@ -276,10 +309,6 @@ fn egress(rule: &NetworkPolicyEgressRule) -> Result<Way> {
 }
 
 fn way(peers: Option<&[NetworkPolicyPeer]>, ports: Option<&[NetworkPolicyPort]>) -> Result<Way> {
-    let labels = |selector: Option<&LabelSelector>| -> Result<Value> {
-        ensure!(selector.is_none_or(|selector| selector.match_expressions.is_none()), "an expression");
-        Ok(serde_json::to_value(selector.and_then(|selector| selector.match_labels.as_ref()))?)
-    };
     let ports = ports.context("all ports")?.iter().map(|port| match port.port {
         Some(IntOrString::Int(number)) if port.end_port.is_none() => {
             Ok(format!("{} {number}", port.protocol.as_deref().unwrap_or("TCP")))
@@ -291,7 +320,7 @@ fn way(peers: Option<&[NetworkPolicyPeer]>, ports: Option<&[NetworkPolicyPort]>)
         None => Ok((Value::Null, Value::Null, ports)),
         Some([peer]) => {
             ensure!(peer.ip_block.is_none(), "{peer:?}");
-            Ok((labels(peer.pod_selector.as_ref())?, labels(peer.namespace_selector.as_ref())?, ports))
+            Ok((serde_json::to_value(&peer.pod_selector)?, serde_json::to_value(&peer.namespace_selector)?, ports))
         }
         Some(several) => bail!("not one peer: {several:?}"),
     }
@@ -327,7 +356,8 @@ fn secrets_hold_what_the_programs_read() -> Result<()> {
     })
 }
 
-/// Runs the real programs with the arguments of the manifests: the learner serves, and an actor joins it.
+/// Runs the real programs with the arguments of the manifests: the learner serves, an actor joins it, and the evaluator
+/// waits for a checkpoint.
 #[tokio::test]
 async fn the_programs_accept_the_arguments_of_the_manifests() -> Result<()> {
     let access = tempfile::tempdir()?;
@@ -369,11 +399,18 @@ async fn the_programs_accept_the_arguments_of_the_manifests() -> Result<()> {
             token_file: file("COMIC_TOKEN_FILE"),
         };
         system.start_learner(LIMIT).await.with_context(|| directory.display().to_string())?;
+        let evaluator = container(cluster.evaluator_pod()?)?;
+        let mut told: Vec<&str> = evaluator.args.iter().flatten().map(String::as_str).collect();
+        // The test names its own learner.
+        let at = told.iter().position(|word| *word == "--learner").context("no --learner")?;
+        told.drain(at..at + 2);
+        let mut evaluator = system.start("comic-actor", &told)?;
         let access = system.access.clone();
         let mut actor = system.start_actor_with(&access, |command| {
             command.args(actor.args.iter().flatten());
         })?;
         actor.until_log_holds("joined the learner", LIMIT).await?;
+        evaluator.until_log_holds("following the learner's checkpoints", LIMIT).await?;
     }
     Ok(())
 }
