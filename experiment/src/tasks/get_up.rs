@@ -30,6 +30,10 @@ pub struct GetUp {
     pub start_pose: StartPose,
     /// Seconds an episode lasts (S).
     pub time_limit: f64,
+    /// Seconds an episode of training lasts (D); 0 is the same as `time_limit`. A body that cannot stand yet falls within a
+    /// second, and lies for the rest of the episode: shorter episodes give more experience of standing. Evaluations last
+    /// `time_limit`.
+    pub training_time_limit: f64,
     /// δ of the simulator's derivative of the coming rewards (`vmpo.action_gradient`): each later step counts this much less.
     pub gradient_decay: f64,
 }
@@ -47,6 +51,7 @@ impl Default for GetUp {
             angular_velocity_noise: 0.5,
             start_pose: StartPose::Upright,
             time_limit: 8.0,
+            training_time_limit: 0.0,
             gradient_decay: 0.9,
         }
     }
@@ -73,6 +78,9 @@ impl TaskParameters for GetUp {
         section.deviation("velocity_noise", self.velocity_noise)?;
         section.deviation("angular_velocity_noise", self.angular_velocity_noise)?;
         section.seconds("time_limit", self.time_limit)?;
+        let (training, longest) = (self.training_time_limit, self.time_limit);
+        let remedy = "must be 0, which is time_limit, or positive seconds up to time_limit";
+        section.ensure("training_time_limit", training, (0.0..=longest).contains(&training), remedy)?;
         let decay = self.gradient_decay;
         section.ensure("gradient_decay", decay, (0.0..=1.0).contains(&decay), "must be in [0, 1]")
     }

@@ -62,6 +62,8 @@ pub(crate) struct RuledEnvironment<R: Rules> {
     start: usize,
     /// Control steps since the last reset.
     steps: usize,
+    /// Control steps until the time limit of this episode.
+    max_steps: usize,
     diverged: bool,
     /// Records steps for the derivative of the reward, if somebody wants it.
     tape: Option<GradientTape>,
@@ -72,7 +74,9 @@ impl<R: Rules> RuledEnvironment<R> {
         let mut random = Pcg64::seed_from_u64(seed);
         let stage = task.rules.stage(&mut random)?;
         let state = R::State::default();
-        let mut environment = Self { task, stage, state, random, start: 0, steps: 0, diverged: false, tape: None };
+        let max_steps = steps_in(task.rules.training_time_limit());
+        let mut environment =
+            Self { task, stage, state, random, start: 0, steps: 0, max_steps, diverged: false, tape: None };
         environment.reset();
         Ok(environment)
     }
@@ -83,7 +87,8 @@ impl<R: Rules> RuledEnvironment<R> {
         let mut stage = rules.stage(&mut random)?;
         stage.place(&pose.qpos, &pose.qvel);
         let task = Arc::new(RuledTask::new(rules, TaskSpec::default()));
-        Ok(Self { task, stage, state, random, start: 0, steps: 0, diverged: false, tape: None })
+        let max_steps = steps_in(task.rules.time_limit());
+        Ok(Self { task, stage, state, random, start: 0, steps: 0, max_steps, diverged: false, tape: None })
     }
 
     pub(crate) fn stage(&self) -> &Stage {
@@ -98,11 +103,13 @@ impl<R: Rules> RuledEnvironment<R> {
         &self.task.rules
     }
 
-    /// The number of control steps until the time limit.
-    fn max_steps(&self) -> usize {
-        let steps = self.task.rules.time_limit() / CONTROL_TIMESTEP;
-        // The division is not exact. 45 s must give 1500 steps.
-        (steps - 1e-9).ceil().max(1.0) as usize
+    /// Begins an episode of at most so many seconds.
+    fn begin(&mut self, time_limit: f64) {
+        (self.steps, self.diverged, self.max_steps) = (0, false, steps_in(time_limit));
+        if let Some(tape) = &mut self.tape {
+            tape.end_episode();
+        }
+        self.task.rules.begin(&mut self.stage, &mut self.state, &mut self.random);
     }
 
     /// `began` says whether the step was recorded.
@@ -115,13 +122,15 @@ impl<R: Rules> RuledEnvironment<R> {
     }
 }
 
+/// The number of control steps in so many seconds.
+fn steps_in(seconds: f64) -> usize {
+    // The division is not exact. 45 s must give 1500 steps.
+    (seconds / CONTROL_TIMESTEP - 1e-9).ceil().max(1.0) as usize
+}
+
 impl<R: Rules> Environment for RuledEnvironment<R> {
     fn reset(&mut self) {
-        (self.steps, self.diverged) = (0, false);
-        if let Some(tape) = &mut self.tape {
-            tape.end_episode();
-        }
-        self.task.rules.begin(&mut self.stage, &mut self.state, &mut self.random);
+        self.begin(self.task.rules.training_time_limit());
     }
 
     fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error> {
@@ -133,7 +142,7 @@ impl<R: Rules> Environment for RuledEnvironment<R> {
         // The last episode must not change this one.
         self.state = R::State::default();
         self.start = start;
-        self.reset();
+        self.begin(self.task.rules.time_limit());
         Ok(())
     }
 
@@ -160,7 +169,7 @@ impl<R: Rules> Environment for RuledEnvironment<R> {
     }
 
     fn episode(&self) -> Episode {
-        Episode { clip: 0, start: self.start, steps_left: self.max_steps(), task: 0 }
+        Episode { clip: 0, start: self.start, steps_left: self.max_steps, task: 0 }
     }
 
     fn record_gradients(&mut self) {
@@ -199,7 +208,7 @@ impl<R: Rules> Simulated for RuledEnvironment<R> {
             self.task.rules.judge(&mut self.stage, &mut self.state, &mut self.random);
         let outcome = if failed {
             Outcome::Terminated
-        } else if self.steps >= self.max_steps() {
+        } else if self.steps >= self.max_steps {
             Outcome::Truncated
         } else {
             Outcome::Running

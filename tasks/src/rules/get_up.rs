@@ -166,6 +166,11 @@ impl Rules for GetUpRules {
         self.config.time_limit
     }
 
+    fn training_time_limit(&self) -> f64 {
+        let limit = self.config.training_time_limit;
+        if limit > 0.0 { limit } else { self.config.time_limit }
+    }
+
     fn gradient_decay(&self) -> Option<f64> {
         Some(self.config.gradient_decay)
     }
@@ -265,6 +270,24 @@ mod tests {
         let moved = std::array::from_fn(|index| action[index] + 0.3 * gradients[0][index] / length);
         let (after, _) = rewards(&moved);
         assert!(after > before, "{after} is not above {before}");
+    }
+
+    #[test]
+    fn only_episodes_of_training_have_its_time_limit() {
+        use crate::environment::{Environment as _, Outcome};
+        let config = GetUp { time_limit: 0.3, training_time_limit: 0.12, ..GetUp::default() };
+        let task: Arc<dyn Task> = Arc::new(RuledTask::new(rules(&config), comic_experiment::TaskSpec::default()));
+        let mut environment = task.environment(3).unwrap();
+        let mut steps = |evaluates: bool| {
+            if evaluates {
+                environment.reset_to(0, 7).unwrap();
+            } else {
+                environment.reset();
+            }
+            let begun = (1..).find(|_| environment.step(&[0.0; 56]).outcome == Outcome::Truncated);
+            (begun.unwrap(), environment.episode().steps_left)
+        };
+        assert_eq!([steps(false), steps(true), steps(false)], [(4, 4), (10, 10), (4, 4)]);
     }
 
     #[test]

@@ -34,6 +34,11 @@ pub(crate) trait Rules: Debug + Send + Sync + 'static {
     /// Length of an episode, s.
     fn time_limit(&self) -> f64;
 
+    /// Length of an episode whose start was drawn for training, s. Evaluations last [`time_limit`](Self::time_limit).
+    fn training_time_limit(&self) -> f64 {
+        self.time_limit()
+    }
+
     /// δ of the derivative of the coming rewards with respect to the actions; `None` in a task without one.
     fn gradient_decay(&self) -> Option<f64> {
         None
