@@ -1,4 +1,4 @@
-//! The loop in which environments act: observe → forward pass → action → step → record.
+//! The loop in which environments act: observe → forward pass → choose an action → make it a command → step → record.
 //!
 //! The [worker](crate::worker) and the [evaluation](crate::evaluate) share it. They differ in the `Recorder`: the worker's
 //! writes unrolls, the evaluation's collects episodes.
@@ -9,7 +9,7 @@ use comic_proto::{Field, UnrollShape};
 use comic_tasks::{Environment, Episode, MAX_REWARD_TERMS, Outcome, Step};
 
 use crate::Error;
-use crate::forward_pass::{ActingBatch, ActingRow, ForwardPass, clip_action};
+use crate::forward_pass::{ActingBatch, ActingRow, ForwardPass, LowLevelShape, clip_command};
 
 /// What decides on the distribution of actions.
 #[derive(Debug)]
@@ -45,6 +45,25 @@ impl<F: ForwardPass> Controller<'_, F> {
         }
         Ok(())
     }
+
+    /// Turns the chosen actions into commands for the simulator.
+    fn actuate(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+        match self {
+            Self::Policy(forward) => forward.actuate(batch),
+            Self::Servo { .. } | Self::Zero => {
+                batch.command.copy_from_slice(&batch.action);
+                Ok(())
+            }
+        }
+    }
+
+    /// The frozen low level that acts for a policy, if any.
+    pub(crate) fn low_level(&self) -> Option<LowLevelShape> {
+        match self {
+            Self::Policy(forward) => forward.low_level(),
+            Self::Servo { .. } | Self::Zero => None,
+        }
+    }
 }
 
 /// What happens around the steps of the environments. `index` is the environment's place in the loop.
@@ -58,7 +77,10 @@ pub(crate) trait Recorder<E> {
     /// Before the forward pass: draws the noise of the row's latent.
     fn draw_latent_noise(&mut self, index: usize, row: &mut ActingRow<'_>);
 
-    /// After the forward pass: moves the environment on by a step, or begins an episode. `Break` ends the iteration.
+    /// After the forward pass: chooses the row's action from its distribution.
+    fn choose(&mut self, index: usize, rollout: &Rollout<E>, row: &mut ActingRow<'_>);
+
+    /// With the command: moves the environment on by a step, or begins an episode. `Break` ends the iteration.
     ///
     /// # Errors
     /// Whatever ends the loop.
@@ -79,10 +101,9 @@ pub(crate) struct ActingLoop<E> {
 
 impl<E: Environment> ActingLoop<E> {
     /// Environments that are in no episode yet.
-    pub(crate) fn new(environments: Vec<E>, shape: &UnrollShape) -> Self {
-        let batch = ActingBatch::new(environments.len(), shape);
-        let rollouts = environments.into_iter().map(|environment| Rollout::new(environment, shape.action));
-        Self { rollouts: rollouts.collect(), batch }
+    pub(crate) fn new(environments: Vec<E>, shape: &UnrollShape, low_level: Option<LowLevelShape>) -> Self {
+        let batch = ActingBatch::new(environments.len(), shape, low_level);
+        Self { rollouts: environments.into_iter().map(Rollout::new).collect(), batch }
     }
 
     /// Records every environment's current observation.
@@ -107,6 +128,10 @@ impl<E: Environment> ActingLoop<E> {
             recorder.draw_latent_noise(index, &mut self.batch.row(index));
         }
         controller.decide(&self.rollouts, &mut self.batch)?;
+        for (index, rollout) in self.rollouts.iter().enumerate() {
+            recorder.choose(index, rollout, &mut self.batch.row(index));
+        }
+        controller.actuate(&mut self.batch)?;
         for (index, rollout) in self.rollouts.iter_mut().enumerate() {
             if recorder.step(index, rollout, &mut self.batch.row(index))?.is_break() {
                 return Ok(ControlFlow::Break(()));
@@ -129,12 +154,10 @@ pub(crate) struct Rollout<E> {
     pub(crate) returns: [f64; MAX_REWARD_TERMS],
     /// Sum of the head's heights after each step, m.
     pub(crate) head_heights: f64,
-    /// Scratch: the action for the simulator.
-    clipped: Vec<f32>,
 }
 
 impl<E: Environment> Rollout<E> {
-    fn new(environment: E, actions: usize) -> Self {
+    fn new(environment: E) -> Self {
         Self {
             environment,
             episode: Episode::default(),
@@ -142,7 +165,6 @@ impl<E: Environment> Rollout<E> {
             steps: 0,
             returns: [0.0; MAX_REWARD_TERMS],
             head_heights: 0.0,
-            clipped: vec![0.0; actions],
         }
     }
 
@@ -157,10 +179,10 @@ impl<E: Environment> Rollout<E> {
         self.write_observation(row);
     }
 
-    /// Takes a step with this action, which is clipped for the simulator, and writes the next observation.
-    pub(crate) fn step(&mut self, action: &[f32], row: &mut ActingRow<'_>) -> Step {
-        clip_action(action, &mut self.clipped);
-        let step = self.environment.step(&self.clipped);
+    /// Takes a step with the row's command, which is clipped, and writes the next observation.
+    pub(crate) fn step(&mut self, row: &mut ActingRow<'_>) -> Step {
+        clip_command(row.command);
+        let step = self.environment.step(row.command);
         self.steps += 1;
         for (sum, term) in self.returns.iter_mut().zip(&step.reward_terms) {
             *sum += term;

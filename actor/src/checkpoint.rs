@@ -2,7 +2,7 @@
 //!
 //! A checkpoint is a directory whose `MANIFEST.json` maps each file's name to its SHA-256 (hexadecimal). Of its files
 //! three matter here: `experiment.toml`, `progress.json`, and `policy.safetensors`, the parameters of the online policy. A
-//! file that `comic-learner export` made of a checkpoint can be read too.
+//! file that `comic-learner export` made of a checkpoint can be read too. In transfer there is also `low_level.safetensors`.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -17,6 +17,8 @@ const MANIFEST: &str = "MANIFEST.json";
 const EXPERIMENT: &str = "experiment.toml";
 const PROGRESS: &str = "progress.json";
 const POLICY: &str = "policy.safetensors";
+/// In transfer: the file of the frozen low level.
+const LOW_LEVEL: &str = "low_level.safetensors";
 /// What a path has to name.
 const WANTED: &str = "name a run's directory (runs/… of `cargo xtask train`), its `checkpoints`, one of them, or a file of `comic-learner export`";
 
@@ -29,6 +31,8 @@ pub struct Checkpoint {
     pub experiment: Experiment,
     /// Parameters of the online policy (safetensors).
     pub policy: Vec<u8>,
+    /// In transfer: the file of the frozen low level.
+    pub low_level: Option<Vec<u8>>,
     /// Where the run stood.
     pub position: Position,
 }
@@ -75,14 +79,17 @@ pub fn read(path: &Path) -> Result<Checkpoint, Error> {
 }
 
 fn read_exported(path: &Path) -> Result<Checkpoint, Error> {
-    let Exported { spec, experiment, bytes } = Exported::open(path).map_err(|error| refuse(path, error))?;
+    let exported = Exported::open(path).map_err(|error| refuse(path, error))?;
+    let low_level = exported.low_level_file().map_err(|error| refuse(path, error))?.map(<[u8]>::to_vec);
+    let policy = exported.parameters().map_err(|error| refuse(path, error))?;
+    let Exported { spec, experiment, .. } = exported;
     if !matches!(spec.part, Part::Policy(_)) {
         let part = spec.part;
         return Err(refuse(path, format!("{part} cannot act alone: export a policy with --part policy")));
     }
     let Source { epoch, version, updates, .. } = spec.source;
     let position = Position { run: None, epoch, version, updates };
-    Ok(Checkpoint { path: path.to_path_buf(), experiment, policy: bytes, position })
+    Ok(Checkpoint { path: path.to_path_buf(), experiment, policy, low_level, position })
 }
 
 /// Numbered checkpoints, oldest first: the numbers are zero-padded.
@@ -109,7 +116,9 @@ fn read_one(path: &Path) -> Result<Checkpoint, Error> {
     let experiment = Experiment::from_toml(&path.join(EXPERIMENT).display().to_string(), &experiment)?;
     let position = serde_json::from_slice(&part(path, &manifest, PROGRESS)?)
         .map_err(|error| refuse(path, format!("{PROGRESS}: {error}")))?;
-    Ok(Checkpoint { path: path.to_path_buf(), experiment, policy: part(path, &manifest, POLICY)?, position })
+    let policy = part(path, &manifest, POLICY)?;
+    let low_level = experiment.transfer.is_on().then(|| part(path, &manifest, LOW_LEVEL)).transpose()?;
+    Ok(Checkpoint { path: path.to_path_buf(), experiment, policy, low_level, position })
 }
 
 fn part(path: &Path, manifest: &BTreeMap<String, String>, name: &str) -> Result<Vec<u8>, Error> {

@@ -1,12 +1,16 @@
 //! What one batched forward pass reads and writes.
 
-use std::ops::{Index, IndexMut};
+mod one_by_one;
+
+use std::ops::{Index, IndexMut, Range};
 
 use comic_proto::{Field, PerField, UnrollShape};
 use rand::Rng;
 use rand_distr::{Distribution as _, StandardNormal};
 
 use crate::Error;
+
+pub use one_by_one::OneByOne;
 
 /// The fields of an unroll that a forward pass reads or writes.
 const FIELDS: [Field; 8] = [
@@ -19,6 +23,15 @@ const FIELDS: [Field; 8] = [
     Field::Std,
     Field::LogWeights,
 ];
+
+/// Widths of what a frozen low level makes, and of its memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LowLevelShape {
+    /// Entries of a command.
+    pub command: usize,
+    /// S, the size of its recurrent state.
+    pub state: usize,
+}
 
 /// The observations of E environments and the action distributions of the behaviour policy. Arrays are row-major.
 ///
@@ -36,6 +49,13 @@ pub struct ActingBatch {
     fields: PerField<Vec<f32>>,
     /// z_t `[E, Z]`: written by the forward pass.
     pub latent: Vec<f32>,
+    /// The policy's action, `[E, A]`, not clipped: chosen from the distribution.
+    pub action: Vec<f32>,
+    /// What the simulator receives, before it is clipped, `[E, 56]`: the action, or in transfer what the frozen low level
+    /// makes of it.
+    pub command: Vec<f32>,
+    /// The recurrent state of a frozen low level, `[E, S]`, zero at an episode's first step.
+    pub low_level_state: Vec<f32>,
     /// Camera images, `[E, I]`.
     pub image: Vec<u8>,
     /// The task of each environment's episode, `[E]`: its index among the tasks of the experiment.
@@ -48,6 +68,12 @@ pub struct ActingRow<'a> {
     pub(crate) fields: PerField<&'a mut [f32]>,
     /// `[Z]`.
     pub latent: &'a mut [f32],
+    /// `[A]`.
+    pub action: &'a mut [f32],
+    /// `[56]`.
+    pub command: &'a mut [f32],
+    /// `[S]` of a frozen low level.
+    pub low_level_state: &'a mut [f32],
     /// `[I]`.
     pub image: &'a mut [u8],
     /// The task's index among the tasks of the experiment.
@@ -55,14 +81,18 @@ pub struct ActingRow<'a> {
 }
 
 impl ActingBatch {
-    /// Zeros for `environments` environments whose unrolls have this shape.
-    pub fn new(environments: usize, shape: &UnrollShape) -> Self {
+    /// Zeros for `environments` environments whose unrolls have this shape, and the frozen low level that acts, if any.
+    pub fn new(environments: usize, shape: &UnrollShape, low_level: Option<LowLevelShape>) -> Self {
+        let LowLevelShape { command, state } = low_level.unwrap_or(LowLevelShape { command: shape.action, state: 0 });
         let widths = PerField::from_fn(|field| if FIELDS.contains(&field) { field.width(shape) } else { 0 });
         Self {
             environments,
             widths,
             fields: widths.map(|_, width| vec![0.0; environments * width]),
             latent: vec![0.0; environments * shape.latent],
+            action: vec![0.0; environments * shape.action],
+            command: vec![0.0; environments * command],
+            low_level_state: vec![0.0; environments * state],
             image: vec![0; environments * shape.image],
             tasks: vec![0; environments],
         }
@@ -79,11 +109,17 @@ impl ActingBatch {
             &mut array[environment * width..(environment + 1) * width]
         }
         let (widths, environments) = (&self.widths, self.environments.max(1));
-        let (latent, image) = (self.latent.len() / environments, self.image.len() / environments);
+        fn own<T>(array: &mut [T], environment: usize, environments: usize) -> &mut [T] {
+            let width = array.len() / environments;
+            part(array, environment, width)
+        }
         ActingRow {
             fields: self.fields.each_mut().map(|field, array| part(array, environment, widths[field])),
-            latent: part(&mut self.latent, environment, latent),
-            image: part(&mut self.image, environment, image),
+            latent: own(&mut self.latent, environment, environments),
+            action: own(&mut self.action, environment, environments),
+            command: own(&mut self.command, environment, environments),
+            low_level_state: own(&mut self.low_level_state, environment, environments),
+            image: own(&mut self.image, environment, environments),
             task: &mut self.tasks[environment],
         }
     }
@@ -124,6 +160,9 @@ impl ActingRow<'_> {
             values.copy_from_slice(&other[field]);
         }
         self.latent.copy_from_slice(other.latent);
+        self.action.copy_from_slice(other.action);
+        self.command.copy_from_slice(other.command);
+        self.low_level_state.copy_from_slice(other.low_level_state);
         self.image.copy_from_slice(other.image);
         *self.task = *other.task;
     }
@@ -133,38 +172,49 @@ impl ActingRow<'_> {
         fill_normal(&mut self[Field::LatentNoise], rng);
     }
 
-    /// Sets the recurrent state and the previous latent to zero, as at an episode's beginning.
+    /// Sets the recurrent states and the previous latent to zero, as at an episode's beginning.
     pub fn reset_recurrent_state(&mut self) {
+        self.low_level_state.fill(0.0);
         self[Field::PreviousLatent].fill(0.0);
         self[Field::State].fill(0.0);
     }
 
-    /// Draws an action from the distribution. It is not clipped: only the action as drawn has the distribution's density.
+    /// Chooses an action from the distribution. It is not clipped: only the action as drawn has the distribution's density.
     /// A mixture draws its component first.
-    pub fn sample(&self, action: &mut [f32], rng: &mut impl Rng) {
-        let log_weights = &self[Field::LogWeights];
+    pub fn sample(&mut self, rng: &mut impl Rng) {
+        let Self { fields, action, .. } = self;
+        let log_weights = &fields[Field::LogWeights];
         let component = if log_weights.is_empty() { 0 } else { draw_component(log_weights, rng.random()) };
         let place = component * action.len()..(component + 1) * action.len();
         fill_normal(action, rng);
-        let (mean, std) = (&self[Field::Mean][place.clone()], &self[Field::Std][place]);
+        let (mean, std) = (&fields[Field::Mean][place.clone()], &fields[Field::Std][place]);
         for ((action, mean), std) in action.iter_mut().zip(mean).zip(std) {
             *action = mean + std * *action;
         }
     }
 
+    /// Chooses the action without noise, the [mode](Self::mode).
+    pub fn take_mode(&mut self) {
+        let place = self.mode_place();
+        self.action.copy_from_slice(&self.fields[Field::Mean][place]);
+    }
+
     /// The action without noise, `[A]`: the mean of the most likely component.
     pub fn mode(&self) -> &[f32] {
+        &self[Field::Mean][self.mode_place()]
+    }
+
+    fn mode_place(&self) -> Range<usize> {
         let (mean, log_weights) = (&self[Field::Mean], &self[Field::LogWeights]);
         let actions = mean.len() / log_weights.len().max(1);
         let component = most_likely(log_weights);
-        &mean[component * actions..(component + 1) * actions]
+        component * actions..(component + 1) * actions
     }
 
-    /// The action without noise plus Gaussian noise with this standard deviation. Nothing is drawn for a deviation of 0.
-    pub fn mode_with_noise(&self, std: f32, action: &mut [f32], rng: &mut impl Rng) {
-        action.copy_from_slice(self.mode());
+    /// Adds Gaussian noise with this standard deviation to the command. Nothing is drawn for a deviation of 0.
+    pub fn disturb_command(&mut self, std: f32, rng: &mut impl Rng) {
         if std > 0.0 {
-            for value in action {
+            for value in self.command.iter_mut() {
                 let noise: f32 = StandardNormal.sample(rng);
                 *value += std * noise;
             }
@@ -210,14 +260,15 @@ fn fill_normal(values: &mut [f32], rng: &mut impl Rng) {
     }
 }
 
-/// The action for the simulator: each dimension within [−1, 1], and 0 instead of NaN.
-pub fn clip_action(action: &[f32], clipped: &mut [f32]) {
-    for (clipped, action) in clipped.iter_mut().zip(action) {
-        *clipped = if action.is_nan() { 0.0 } else { action.clamp(-1.0, 1.0) };
+/// Makes a command one that the simulator takes: each entry within [−1, 1], and 0 instead of NaN.
+pub fn clip_command(command: &mut [f32]) {
+    for value in command {
+        *value = if value.is_nan() { 0.0 } else { value.clamp(-1.0, 1.0) };
     }
 }
 
-/// Makes latents and action distributions of observations, for all environments of a thread at once.
+/// Makes latents and action distributions of observations, and commands of chosen actions, for all environments of a thread
+/// at once.
 ///
 /// The acting loop is generic over it, so that the rows of unrolls are tested without libtorch.
 pub trait ForwardPass {
@@ -233,6 +284,20 @@ pub trait ForwardPass {
     /// # Errors
     /// When libtorch fails.
     fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error>;
+
+    /// The frozen low level that acts for the policy; `None` if the policy's actions are commands.
+    fn low_level(&self) -> Option<LowLevelShape> {
+        None
+    }
+
+    /// Turns the chosen actions into commands for the simulator.
+    ///
+    /// # Errors
+    /// When libtorch fails.
+    fn actuate(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+        batch.command.copy_from_slice(&batch.action);
+        Ok(())
+    }
 }
 
 impl<F: ForwardPass + ?Sized> ForwardPass for Box<F> {
@@ -243,35 +308,13 @@ impl<F: ForwardPass + ?Sized> ForwardPass for Box<F> {
     fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
         (**self).forward(batch)
     }
-}
 
-/// A forward pass for each environment alone. The order of a library's sums depends on the size of the batch. With a batch
-/// of one, an environment's numbers do not depend on the number of environments.
-#[derive(Debug)]
-pub struct OneByOne<F> {
-    forward: F,
-    single: ActingBatch,
-}
-
-impl<F: ForwardPass> OneByOne<F> {
-    /// Uses this forward pass for environments whose unrolls have this shape.
-    pub fn new(forward: F, shape: &UnrollShape) -> Self {
-        Self { forward, single: ActingBatch::new(1, shape) }
-    }
-}
-
-impl<F: ForwardPass> ForwardPass for OneByOne<F> {
-    fn load(&mut self, parameters: &[u8]) -> Result<(), Error> {
-        self.forward.load(parameters)
+    fn low_level(&self) -> Option<LowLevelShape> {
+        (**self).low_level()
     }
 
-    fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
-        for environment in 0..batch.environments() {
-            self.single.row(0).copy_from(&batch.row(environment));
-            self.forward.forward(&mut self.single)?;
-            batch.row(environment).copy_from(&self.single.row(0));
-        }
-        Ok(())
+    fn actuate(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+        (**self).actuate(batch)
     }
 }
 
@@ -281,30 +324,6 @@ mod tests {
     use rand_pcg::Pcg64;
 
     use super::*;
-
-    /// Adds the batch's size to the recurrent state.
-    struct AddsBatchSize;
-
-    impl ForwardPass for AddsBatchSize {
-        fn load(&mut self, _: &[u8]) -> Result<(), Error> {
-            Ok(())
-        }
-
-        fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
-            let environments = batch.environments() as f32;
-            batch[Field::State].iter_mut().for_each(|value| *value += environments);
-            Ok(())
-        }
-    }
-
-    #[test]
-    fn one_by_one_every_environment_is_a_batch_of_its_own() {
-        let mut batch = ActingBatch::new(3, &SHAPE);
-        let state: Vec<f32> = (0..12).map(|value| value as f32).collect();
-        batch[Field::State].copy_from_slice(&state);
-        OneByOne::new(AddsBatchSize, &SHAPE).forward(&mut batch).unwrap();
-        assert_eq!(batch[Field::State], (1..13).map(|value| value as f32).collect::<Vec<_>>());
-    }
 
     const SHAPE: UnrollShape = UnrollShape {
         length: 1,
@@ -321,7 +340,7 @@ mod tests {
 
     /// Components whose samples cannot be confused, with these weights.
     fn mixture(weights: [f32; 3]) -> ActingBatch {
-        let mut batch = ActingBatch::new(1, &SHAPE);
+        let mut batch = ActingBatch::new(1, &SHAPE, None);
         batch[Field::Mean].copy_from_slice(&[-10.0, -20.0, 0.5, 0.25, 10.0, 20.0]);
         batch[Field::Std].fill(0.1);
         batch[Field::LogWeights].copy_from_slice(&weights.map(f32::ln));
@@ -333,9 +352,9 @@ mod tests {
         let mut batch = mixture([0.2, 0.5, 0.3]);
         let mut rng = Pcg64::seed_from_u64(1);
         let mut counts = [0_u32; 3];
-        let mut action = [0.0; 2];
         for _ in 0..10_000 {
-            batch.row(0).sample(&mut action, &mut rng);
+            batch.row(0).sample(&mut rng);
+            let action = &batch.action;
             let component = if action[0] < -5.0 { 0 } else { 1 + usize::from(action[0] > 5.0) };
             let mean = &batch[Field::Mean][2 * component..2 * component + 2];
             assert!(action.iter().zip(mean).all(|(action, mean)| (action - mean).abs() < 1.0), "{action:?}");
@@ -351,7 +370,7 @@ mod tests {
     fn without_noise_the_most_likely_component_acts() {
         assert_eq!(mixture([0.2, 0.3, 0.5]).row(0).mode(), [10.0, 20.0]);
         assert_eq!(mixture([0.2, 0.5, 0.3]).row(0).mode(), [0.5, 0.25]);
-        let mut one = ActingBatch::new(1, &UnrollShape { components: 1, ..SHAPE });
+        let mut one = ActingBatch::new(1, &UnrollShape { components: 1, ..SHAPE }, None);
         one[Field::Mean].copy_from_slice(&[0.5, -0.5]);
         assert_eq!(one.row(0).mode(), [0.5, -0.5]);
     }

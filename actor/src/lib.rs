@@ -12,6 +12,7 @@
 //! - [`liveness`] is the file for a container's health check.
 //! - [`run`] is the actor process made of these parts.
 //! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads the learner's checkpoints.
+//! - [`latents`] collects latents for a prior, and [`assess`] measures a low level before anything is learned with it.
 //! - [`render`] films a policy, or shows it in a window.
 //! - [`clips`] is `comic-actor clips`: motion capture from files and from the network.
 //!
@@ -19,12 +20,14 @@
 //! acknowledgement in a bounded window. When the window is full, the environments wait.
 
 pub mod acting_loop;
+pub mod assess;
 pub mod checkpoint;
 pub mod clips;
 pub mod dump;
 mod error;
 pub mod evaluate;
 pub mod forward_pass;
+pub mod latents;
 pub mod liveness;
 pub mod mailbox;
 pub mod policy;

@@ -6,9 +6,11 @@ use std::process::ExitCode;
 
 use anyhow::Context as _;
 use clap::{Args, CommandFactory as _, Parser, Subcommand, ValueEnum};
+use comic_actor::assess::Assess;
 use comic_actor::clips::Clips;
 use comic_actor::dump;
 use comic_actor::evaluate::command::Evaluate;
+use comic_actor::latents::Latents;
 use comic_actor::liveness::Health;
 use comic_actor::render::command::Render;
 use comic_actor::render::view::View;
@@ -41,6 +43,10 @@ struct Arguments {
 enum Command {
     /// Evaluates a policy, per clip and reward term.
     Evaluate(Evaluate),
+    /// Writes latents of a policy's encoder, to which `comic-learner prior` fits a prior.
+    Latents(Latents),
+    /// Measures how long a low level stays upright and how far it walks with random latents, before anything is learned.
+    Assess(Assess),
     /// Films a policy at work; needs no display.
     Render(Render),
     /// Shows a policy at work in a window.
@@ -111,6 +117,8 @@ fn main() -> ExitCode {
 fn command(arguments: Arguments) -> anyhow::Result<()> {
     match arguments.command {
         Some(Command::Evaluate(evaluate)) => evaluate.run().context("cannot evaluate"),
+        Some(Command::Latents(latents)) => latents.run().context("cannot collect latents"),
+        Some(Command::Assess(assess)) => assess.run().context("cannot assess"),
         Some(Command::Render(render)) => render.run().context("cannot film"),
         Some(Command::View(view)) => view.run().context("cannot show"),
         Some(Command::Clips(clips)) => clips.run().map_err(anyhow::Error::from),

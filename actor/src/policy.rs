@@ -1,19 +1,22 @@
 //! The forward pass through libtorch.
 
-use comic_experiment::{Experiment, InitialPose, TaskSpec};
-use comic_networks::{Policy, RecurrentState, Routing};
+use comic_experiment::{ACTION_SIZE, Experiment, InitialPose, TaskSpec};
+use comic_networks::export::Exported;
+use comic_networks::{FrozenLowLevel, Policy, RecurrentState, Routing};
 use comic_proto::Field;
 use tch::nn::VarStore;
-use tch::{Device, Tensor};
+use tch::{Device, TchError, Tensor};
 
 use crate::Error;
-use crate::forward_pass::{ActingBatch, ForwardPass};
+use crate::forward_pass::{ActingBatch, ForwardPass, LowLevelShape};
 
 /// The behaviour policy: its networks and their parameters, on the CPU.
 #[derive(Debug)]
 pub struct TorchPolicy {
     store: VarStore,
     policy: Policy,
+    /// In transfer: what turns the policy's latents into commands.
+    low_level: Option<FrozenLowLevel>,
     /// Number of tasks.
     tasks: usize,
 }
@@ -26,16 +29,18 @@ pub fn use_one_torch_thread() {
 }
 
 impl TorchPolicy {
-    /// Freshly initialised networks of the experiment, drawn from `seed`.
+    /// Freshly initialised networks of the experiment, drawn from `seed`. In transfer `low_level` is the file of the frozen low
+    /// level.
     ///
     /// `mean_action` (`[A]`, control order) is the clips' mean pose as an action. It is called only if the experiment
     /// starts there.
     ///
     /// # Errors
-    /// What `mean_action` returns.
+    /// What `mean_action` returns; [`Error::Misfit`] when the low level is missing or does not fit.
     pub fn untrained(
         spec: &TaskSpec,
         experiment: &Experiment,
+        low_level: Option<&[u8]>,
         seed: u64,
         mean_action: impl FnOnce() -> Result<[f64; 56], Error>,
     ) -> Result<Self, Error> {
@@ -46,16 +51,33 @@ impl TorchPolicy {
         // libtorch takes signed seeds; two's complement maps every seed to one.
         tch::manual_seed(seed.cast_signed());
         let store = VarStore::new(Device::Cpu);
-        let policy = Policy::new(&store.root(), spec, &experiment.network, &pose).map_err(misfit)?;
-        Ok(Self { store, policy, tasks: spec.tasks.len() })
+        let policy = Policy::of(&store.root(), spec, experiment, &pose).map_err(misfit)?;
+        let low_level = match low_level {
+            _ if !experiment.transfer.is_on() => None,
+            Some(file) => {
+                let frozen = Exported::read(file.to_vec()).and_then(|file| file.freeze_for(experiment));
+                Some(frozen.map_err(misfit)?)
+            }
+            None => {
+                return Err(misfit(
+                    "the low level of transfer.low_level is missing: name a checkpoint, or leave that field empty",
+                ));
+            }
+        };
+        Ok(Self { store, policy, low_level, tasks: spec.tasks.len() })
     }
 
-    /// The networks of the experiment with these parameters (safetensors).
+    /// The networks of the experiment with these parameters (safetensors), and in transfer with this low level (its file).
     ///
     /// # Errors
     /// [`Error::Misfit`] when a name, shape, type or value does not fit.
-    pub fn from_parameters(spec: &TaskSpec, experiment: &Experiment, parameters: &[u8]) -> Result<Self, Error> {
-        let mut policy = Self::untrained(spec, experiment, 0, || Ok([0.0; 56]))?;
+    pub fn from_parameters(
+        spec: &TaskSpec,
+        experiment: &Experiment,
+        low_level: Option<&[u8]>,
+        parameters: &[u8],
+    ) -> Result<Self, Error> {
+        let mut policy = Self::untrained(spec, experiment, low_level, 0, || Ok([0.0; 56]))?;
         policy.load(parameters)?;
         Ok(policy)
     }
@@ -80,10 +102,7 @@ impl ForwardPass for TorchPolicy {
 
     fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
         let environments = batch.environments() as i64;
-        let matrix = |values: &[f32]| {
-            let width = values.len() as i64 / environments.max(1);
-            Tensor::f_from_slice(values)?.f_view([environments, width])
-        };
+        let matrix = |values: &[f32]| matrix(values, environments);
         tch::no_grad(|| {
             let image = (!batch.image.is_empty())
                 .then(|| Tensor::f_from_slice(&batch.image)?.f_view([environments, -1]))
@@ -101,10 +120,6 @@ impl ForwardPass for TorchPolicy {
                 RecurrentState { state: &matrix(&batch[Field::State])?, first: None },
             );
             let (mean, std, log_weights) = acting.action.to_rows();
-            let read = |tensor: &Tensor, values: &mut [f32]| match values {
-                [] => Ok(()),
-                values => tensor.f_copy_data(values, values.len()),
-            };
             read(&acting.latent, &mut batch.latent)?;
             read(&mean, &mut batch[Field::Mean])?;
             read(&std, &mut batch[Field::Std])?;
@@ -114,5 +129,45 @@ impl ForwardPass for TorchPolicy {
             }
             Ok(())
         })
+    }
+
+    fn low_level(&self) -> Option<LowLevelShape> {
+        self.low_level.as_ref().map(|frozen| LowLevelShape { command: ACTION_SIZE, state: frozen.state_size() })
+    }
+
+    fn actuate(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+        match &self.low_level {
+            Some(frozen) => actuate(frozen, batch),
+            None => {
+                batch.command.copy_from_slice(&batch.action);
+                Ok(())
+            }
+        }
+    }
+}
+
+/// Turns the chosen actions into commands by a frozen low level.
+pub(crate) fn actuate(frozen: &FrozenLowLevel, batch: &mut ActingBatch) -> Result<(), Error> {
+    let environments = batch.environments() as i64;
+    let matrix = |values: &[f32]| matrix(values, environments);
+    tch::no_grad(|| {
+        let (action, proprioception) = (matrix(&batch.action)?, matrix(&batch[Field::Proprioception])?);
+        let (command, state) = frozen.act(&action, &proprioception, &matrix(&batch.low_level_state)?);
+        read(&command, &mut batch.command)?;
+        read(&state, &mut batch.low_level_state)?;
+        Ok(())
+    })
+}
+
+/// A tensor `[environments, width]` of these values.
+fn matrix(values: &[f32], environments: i64) -> Result<Tensor, TchError> {
+    let width = values.len() as i64 / environments.max(1);
+    Tensor::f_from_slice(values)?.f_view([environments, width])
+}
+
+fn read(tensor: &Tensor, values: &mut [f32]) -> Result<(), TchError> {
+    match values {
+        [] => Ok(()),
+        values => tensor.f_copy_data(values, values.len()),
     }
 }

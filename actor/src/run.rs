@@ -158,6 +158,7 @@ fn build(
     if task.spec() != spec {
         return Err(Error::Disagreement { what: "the task's observations, rewards or clips" });
     }
+    let low_level = joined.low_level()?;
     let mut parameters = 0;
     let mut workers = Vec::with_capacity(threads);
     let each = numbers.len().div_ceil(threads);
@@ -170,7 +171,7 @@ fn build(
             })
             .collect::<Result<_, comic_tasks::Error>>()?;
         // The first parameters from the learner replace the initial ones.
-        let policy = TorchPolicy::untrained(spec, experiment, 0, || Ok([0.0; 56]))?;
+        let policy = TorchPolicy::untrained(spec, experiment, low_level.as_deref(), 0, || Ok([0.0; 56]))?;
         parameters = policy.to_parameters()?.len() as u64;
         let policy: Box<dyn ForwardPass + Send> = match pace {
             Pace::Free => Box::new(policy),

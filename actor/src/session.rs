@@ -88,7 +88,7 @@ pub struct Joined {
     pub seed: u64,
     /// The numbers of this actor's environments in lockstep, never empty; none without lockstep.
     pub environments: Option<Range<u32>>,
-    /// The experiment's clip sources and their files on this machine.
+    /// The experiment's clip sources and, in transfer, its low level, with their files on this machine.
     pub assets: HashMap<String, PathBuf>,
     terms: Terms,
     connector: Connector,
@@ -208,6 +208,14 @@ fn read_environments(reply: &JoinReply, experiment: &Experiment) -> Result<Optio
 }
 
 impl Joined {
+    /// The file of the frozen low level, if the experiment is a transfer.
+    ///
+    /// # Errors
+    /// A file that cannot be read, or one that the learner did not announce.
+    pub fn low_level(&self) -> Result<Option<Vec<u8>>, Error> {
+        assets::low_level(&self.experiment, &self.assets)
+    }
+
     /// Sends unrolls and receives parameters until the run is over, or until all workers have ended and every unroll is
     /// acknowledged; both are `Ok`. When `stop` becomes true it sends the finished unrolls, for at most `limits.flush`.
     ///

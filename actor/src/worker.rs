@@ -3,7 +3,7 @@
 //! Every environment writes exactly one row an iteration of the [acting loop](crate::acting_loop). So all unrolls of a
 //! thread begin and end together, and parameters change only there. The iteration of row t copies the current observation
 //! into row t, makes one forward pass for all environments, samples the actions, writes them into row t, and steps every
-//! environment.
+//! environment. In transfer the actions are latents, and a frozen low level turns them into commands before the step.
 //!
 //! An episode's last observation takes a row of its own, without an action (`Valid` 0). That iteration resets the
 //! environment and does not step it, so the next row is the next episode's first. Row T holds the observation after the
@@ -99,7 +99,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         seed: u64,
     ) -> Self {
         let (length, records) = (layout.shape().length, layout.shape().action_gradient > 0);
-        let mut acting = ActingLoop::new(environments, layout.shape());
+        let mut acting = ActingLoop::new(environments, layout.shape(), forward.low_level());
         let recorder = UnrollRecorder::new(layout, (first..).take(acting.rollouts.len()), seed);
         for (index, rollout) in acting.rollouts.iter_mut().enumerate() {
             if records {
@@ -153,13 +153,19 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     /// Uses a directive from the next unroll on.
     ///
     /// # Errors
-    /// Parameters that do not fit.
+    /// Parameters that do not fit, or a demonstration where a frozen low level acts.
     pub fn adopt(&mut self, directive: &Arc<Directive>) -> Result<(), Error> {
         if self.directive.as_ref().is_some_and(|current| Arc::ptr_eq(current, directive)) {
             return Ok(());
         }
-        if directive.behaviour == Behaviour::Policy {
-            self.forward.load(&directive.parameters)?;
+        match directive.behaviour {
+            Behaviour::Policy => self.forward.load(&directive.parameters)?,
+            // Its action is a command, and the policy's is a latent.
+            Behaviour::Demonstration if self.forward.low_level().is_some() => {
+                let reason = "the learner wants a demonstration, although a frozen low level acts".to_owned();
+                return Err(Error::Misfit { reason });
+            }
+            Behaviour::Demonstration | Behaviour::Unspecified => {}
         }
         self.directive = Some(Arc::clone(directive));
         Ok(())

@@ -29,7 +29,7 @@ fn setup() -> Setup {
     let catalogue = Catalogue::open(&experiment.clips).unwrap();
     let task = comic_tasks::build(&experiment, &catalogue).unwrap();
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(task.spec(), &experiment)));
-    let policy = TorchPolicy::untrained(task.spec(), &experiment, 5, || Ok(catalogue.mean_action()?)).unwrap();
+    let policy = TorchPolicy::untrained(task.spec(), &experiment, None, 5, || Ok(catalogue.mean_action()?)).unwrap();
     Setup { experiment, task, layout, policy }
 }
 
@@ -37,7 +37,7 @@ fn setup() -> Setup {
 fn record(setup: &Setup, behaviour: Behaviour) -> Vec<Vec<FinishedUnroll>> {
     let environments =
         (0..ENVIRONMENTS as u64).map(|seed| Arc::clone(&setup.task).environment(seed).unwrap()).collect();
-    let policy = TorchPolicy::untrained(setup.task.spec(), &setup.experiment, 6, || Ok([0.0; 56])).unwrap();
+    let policy = TorchPolicy::untrained(setup.task.spec(), &setup.experiment, None, 6, || Ok([0.0; 56])).unwrap();
     let mut worker = Worker::new(environments, policy, Arc::clone(&setup.layout), 0.1, 0, 9);
     let parameters = Bytes::from(setup.policy.to_parameters().unwrap());
     worker.adopt(&Arc::new(Directive { learner_epoch: 2, version: 4, behaviour, parameters })).unwrap();
@@ -71,7 +71,7 @@ fn the_behaviour_policy_follows_from_the_recorded_fields() {
     for round in record(&setup, Behaviour::Policy) {
         let mut unrolls: Vec<_> =
             round.iter().map(|unroll| UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap()).collect();
-        let mut batch = ActingBatch::new(ENVIRONMENTS, setup.layout.shape());
+        let mut batch = ActingBatch::new(ENVIRONMENTS, setup.layout.shape(), None);
         for t in 0..setup.layout.shape().length {
             for (index, unroll) in unrolls.iter().enumerate() {
                 let mut row = batch.row(index);

@@ -3,9 +3,10 @@
 use crate::clips::{ClipSource, SUBSETS};
 use crate::document::Experiment;
 use crate::fault::{AT_LEAST_ONE, Fault, NOT_NEGATIVE, POSITIVE, ensure, not_negative, positive};
-use crate::network::{Network, Prior};
+use crate::network::{InitialPose, Network, Prior};
 use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
 use crate::tasks::{TaskName, TerminationError, Vision};
+use crate::transfer::Transfer;
 
 /// The squared ratio of two float32 numbers overflows with a smaller deviation. The wire refuses a smaller one, too.
 const SMALLEST_STD: f64 = 1e-6;
@@ -13,6 +14,8 @@ const AT_LEAST_STD: &str = "must be at least 1e-6";
 /// With a larger deviation an action is only noise. The wire's limit is a thousand times as large.
 const LARGEST_STD: f64 = 1e3;
 const AT_MOST_STD: &str = "must be at most 1000";
+/// A latent beyond this is a typing error: an encoder's latents are near N(0, I).
+const LARGEST_LATENT: f64 = 1e3;
 
 /// The first fault, in the order of the document.
 pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
@@ -20,6 +23,7 @@ pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
     joint(experiment)?;
     experiment.clips.iter().enumerate().try_for_each(|(index, source)| clips(index, source))?;
     TaskName::ALL.into_iter().try_for_each(|task| experiment.parameters(task).check(task.section()))?;
+    transfer(experiment)?;
     network(&experiment.network)?;
     vmpo(&experiment.vmpo, &experiment.unroll)?;
     optimiser(&experiment.optimiser)?;
@@ -76,6 +80,28 @@ fn clips(index: usize, source: &ClipSource) -> Result<(), Fault> {
         ensure(&field("end_step"), end_step, end_step > start_step, "must exceed start_step")?;
     }
     ensure(&field("weight"), weight, not_negative(*weight), NOT_NEGATIVE)
+}
+
+/// Fields of a transfer, and fields that make no sense beside a frozen low level.
+fn transfer(experiment: &Experiment) -> Result<(), Fault> {
+    let Experiment { transfer, network, vmpo, joint, .. } = experiment;
+    let Transfer { low_level: _, sha256, latent_limit, mean_scale, prior: _ } = transfer;
+    let holds = sha256.is_empty() || (sha256.len() == 64 && sha256.bytes().all(|byte| byte.is_ascii_hexdigit()));
+    ensure("transfer.sha256", sha256, holds, "must be empty, or 64 hexadecimal digits")?;
+    let in_range = |number: &f64| positive(*number) && *number <= LARGEST_LATENT;
+    ensure("transfer.latent_limit", latent_limit, in_range(latent_limit), "must be positive, at most 1000")?;
+    ensure("transfer.mean_scale", mean_scale, in_range(mean_scale), "must be positive, at most 1000")?;
+    if !transfer.is_on() {
+        return Ok(());
+    }
+    ensure("joint", joint.len(), joint.is_empty(), "must be empty with transfer.low_level")?;
+    let pose = network.initial_pose;
+    let remedy = "must be \"mid-range\" with transfer.low_level: the policy's action is then a latent, and no pose";
+    ensure("network.initial_pose", pose, pose == InitialPose::MidRange, remedy)?;
+    let remedy = "must be 0 with transfer.low_level: the policy's action is then a latent";
+    ensure("vmpo.action_gradient", vmpo.action_gradient, vmpo.action_gradient == 0.0, remedy)?;
+    let steps = experiment.warm_start.steps;
+    ensure("warm_start.steps", steps, steps == 0, remedy)
 }
 
 fn network(network: &Network) -> Result<(), Fault> {
@@ -213,7 +239,7 @@ fn together(experiment: &Experiment) -> Result<(), Fault> {
     let holds = vmpo.action_gradient == 0.0 || differentiable;
     let remedy = "must be 0 without tracking and get-up, and with another tracking.termination_error than dm-control";
     ensure("vmpo.action_gradient", vmpo.action_gradient, holds, remedy)?;
-    let holds = vmpo.control_variate == 0.0 || network.components() == 1;
+    let holds = vmpo.control_variate == 0.0 || experiment.components() == 1;
     let remedy = "must be 0 with network.low_level = \"mixture\", whose KL has no closed form";
     ensure("vmpo.control_variate", vmpo.control_variate, holds, remedy)?;
     let holds = !unroll.lockstep || unroll.ahead == 0;

@@ -2,11 +2,13 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::body::ACTION_SIZE;
 use crate::clips::ClipSource;
 use crate::for_each_task;
 use crate::network::Network;
 use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
 use crate::tasks::{self, TaskName, TaskParameters};
+use crate::transfer::Transfer;
 
 macro_rules! document {
     ($($(#[$description:meta])* $task:ident, $section:ident, $name:literal;)*) => {
@@ -26,6 +28,8 @@ macro_rules! document {
             /// Motion capture, one entry per source: the references of tracking, and the start poses of other tasks.
             pub clips: Vec<ClipSource>,
             $($(#[$description])* pub $section: tasks::$task,)*
+            /// A low level that was learned before, which acts frozen.
+            pub transfer: Transfer,
             /// Sizes and initial values of the networks.
             pub network: Network,
             /// Parameters of V-MPO.
@@ -53,6 +57,7 @@ macro_rules! document {
                     joint: Vec::new(),
                     clips: vec![ClipSource::whole("builtin:CMU_007_01")],
                     $($section: tasks::$task::default(),)*
+                    transfer: Transfer::default(),
                     network: Network::default(),
                     vmpo: Vmpo::default(),
                     optimiser: Optimiser::default(),
@@ -94,5 +99,25 @@ impl Experiment {
         let others = self.joint.iter().map(|complement| (complement.task, complement.probability));
         let left = 1.0 - others.clone().map(|(_, probability)| probability).sum::<f64>();
         std::iter::once((self.task, left)).chain(others).collect()
+    }
+
+    /// Length of the policy's action: the actuators, or the latent of a frozen low level.
+    pub fn action_size(&self) -> usize {
+        if self.transfer.is_on() { self.network.latent.size } else { ACTION_SIZE }
+    }
+
+    /// Length of the latent that the policy samples itself.
+    pub fn latent_size(&self) -> usize {
+        if self.transfer.is_on() { 0 } else { self.network.latent.size }
+    }
+
+    /// Gaussians in the distribution of the policy's action.
+    pub fn components(&self) -> usize {
+        if self.transfer.is_on() { 1 } else { self.network.components() }
+    }
+
+    /// Size of the policy's recurrent state. A frozen low level's state is not part of it.
+    pub fn state_size(&self) -> usize {
+        if self.transfer.is_on() { 0 } else { self.network.state_size() }
     }
 }

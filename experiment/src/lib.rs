@@ -31,6 +31,7 @@ mod settings;
 mod spec;
 pub mod statistics;
 mod tasks;
+mod transfer;
 mod vocabulary;
 
 pub use body::{ACTION_SIZE, IMAGE_SIZE, PROPRIOCEPTION, PROPRIOCEPTION_SIZE};
@@ -45,3 +46,4 @@ pub use resolve::resolve;
 pub use settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
 pub use spec::{TaskPart, TaskSpec};
 pub use tasks::*;
+pub use transfer::{Transfer, TransferPrior};

@@ -20,7 +20,8 @@ pub struct TaskSpec {
     pub task: usize,
     /// Bytes of a camera image: 64 rows of 64 pixels of red, green and blue. 0 in a task without images.
     pub image: usize,
-    /// Length of the action vector, each in [−1, 1].
+    /// Length of the action vector, each in [−1, 1]. In transfer the policy's action is the latent of the frozen low level,
+    /// which is not bounded.
     pub action: usize,
     /// Names of the reward terms. Their sum is the reward. Joint training has one term, the reward itself.
     pub reward_terms: Vec<String>,
@@ -77,7 +78,8 @@ impl TaskSpec {
     /// # Errors
     /// The name of an observation that the tracking task does not have.
     pub fn of_task(experiment: &Experiment, task: TaskName, clips: Vec<String>) -> Result<Self, String> {
-        Self::alone(task, experiment.parameters(task), clips)
+        let spec = Self::alone(task, experiment.parameters(task), clips)?;
+        Ok(Self { action: experiment.action_size(), ..spec })
     }
 
     /// The tracking task with these clips.

@@ -3,5 +3,6 @@
 pub mod certs;
 pub mod export;
 pub mod health;
+pub mod prior;
 pub mod sizes;
 pub mod status;

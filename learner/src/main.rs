@@ -43,6 +43,7 @@ fn main() -> ExitCode {
 fn run(options: &Options) -> Result<()> {
     match &options.command {
         Some(Command::Export { checkpoint, part, out }) => commands::export::run(checkpoint, *part, out),
+        Some(Command::Prior(prior)) => prior.run(),
         Some(Command::Sizes) => {
             let table = commands::sizes::table(&options.document)?;
             let written = std::io::stdout().write_all(table.as_bytes());

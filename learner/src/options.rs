@@ -8,6 +8,7 @@ use comic_networks::export::Part;
 
 use crate::commands::certs::Certs;
 use crate::commands::health::Health;
+use crate::commands::prior::Prior;
 use crate::commands::status::Status;
 use crate::document::DocumentArguments;
 use crate::security::{ConnectionLimits, SecurityArguments};
@@ -71,6 +72,8 @@ pub enum Command {
         #[arg(long, value_name = "FILE")]
         out: PathBuf,
     },
+    /// Fit the prior of a low level's latents, for a transfer with `transfer.prior = "state"`.
+    Prior(Prior),
     /// Print how many parameters the networks of the paper's presets have, or those of --preset and --set.
     Sizes,
     /// Print the state of a running learner.

@@ -1,5 +1,6 @@
 //! One learner epoch: resume a run or begin it, serve and train, end.
 
+mod low_level;
 mod prepare;
 
 use std::io::Write as _;

@@ -189,6 +189,7 @@ fn live_evaluated(
         experiment,
         spec,
         pose,
+        low_level: None,
         backend: Backend::cpu(),
         run,
         epoch,

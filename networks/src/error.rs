@@ -74,6 +74,21 @@ pub enum Error {
         /// The tasks of the experiment.
         known: String,
     },
+    /// The part cannot be exported from a transfer, whose policy has no encoder and no low level of its own.
+    #[error(
+        "`{part}` is not part of a transfer's policy, which gives latents to a frozen low level: export policy or \
+         policy:TASK"
+    )]
+    Transfer {
+        /// The requested part.
+        part: String,
+    },
+    /// The file holds no low level that can be used frozen.
+    #[error("no low level for a transfer: {problem}")]
+    NotLowLevel {
+        /// What is wrong, and what to do.
+        problem: String,
+    },
     /// The part cannot be exported as TorchScript, because it is not a policy of one task.
     #[error(
         "only a policy of one task can be exported as TorchScript, not `{part}`: export policy:TASK; tasks are {tasks}"

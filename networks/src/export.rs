@@ -19,4 +19,4 @@ mod weights;
 
 pub use file::{Exported, KEY, LONGEST};
 pub use part::Part;
-pub use spec::{Entry, FORMAT, Normalisation, Source, Spec, Vector};
+pub use spec::{Entry, FORMAT, FittedPrior, Normalisation, Source, Spec, Vector};

@@ -6,6 +6,8 @@
 //! - In joint training each task has its own encoder and value function ([`Routing`]), and all tasks share the low
 //!   level.
 //! - `low_level` has one file per low level: MLP, LSTM, mixture and product of primitives.
+//! - In transfer a new policy gives latents to a [`FrozenLowLevel`], which was learned before. The learner trains only the
+//!   new policy. A [`StatePrior`] says which latents are likely in a pose.
 //! - If a task has a camera image, the image encoder turns it into a few numbers. They join the task observation, for
 //!   policy and value.
 //! - [`Value`] is the value function. Only the learner needs it; it has its own parameter store.
@@ -26,7 +28,9 @@ mod action;
 mod encoder;
 mod error;
 pub mod export;
+mod frozen;
 mod gaussian;
+mod high_level;
 mod image_encoder;
 mod layers;
 mod low_level;
@@ -34,16 +38,19 @@ mod lstm;
 mod normaliser;
 mod parameters;
 mod policy;
+mod prior;
 mod routing;
 mod value;
 
 pub use action::ActionDistribution;
 pub use error::Error;
+pub use frozen::FrozenLowLevel;
 pub use gaussian::DiagonalGaussian;
 pub use low_level::{Layer, Sizes, low_level_layers};
 pub use lstm::RecurrentState;
 pub use normaliser::{NORMALISED_LIMIT, NORMALISER_MIN_STD, NormalisedObservation, NormaliserStatistics};
 pub use parameters::{from_safetensors, to_safetensors};
 pub use policy::{Acting, Policy};
+pub use prior::StatePrior;
 pub use routing::Routing;
 pub use value::Value;

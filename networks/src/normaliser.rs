@@ -124,6 +124,6 @@ impl Normaliser {
     }
 }
 
-fn normalise(observation: &Tensor, mean: &Tensor, std: &Tensor) -> Tensor {
+pub(crate) fn normalise(observation: &Tensor, mean: &Tensor, std: &Tensor) -> Tensor {
     (observation - mean).divide_(std).clamp_(-NORMALISED_LIMIT, NORMALISED_LIMIT)
 }

@@ -36,13 +36,14 @@ pub fn to_safetensors(store: &nn::VarStore) -> Result<Vec<u8>, Error> {
 /// # Errors
 /// [`Error`] with the name of the invalid parameter; then `store` is unchanged.
 pub fn from_safetensors(store: &mut nn::VarStore, bytes: &[u8]) -> Result<(), Error> {
-    set(&store.variables(), bytes)
+    set(&store.variables(), bytes, None)
 }
 
-/// Like [`from_safetensors`], for these variables of a store.
-pub(crate) fn set(variables: &HashMap<String, Tensor>, bytes: &[u8]) -> Result<(), Error> {
+/// Like [`from_safetensors`], for these variables of a store. The document may have one tensor more, which is not read.
+pub(crate) fn set(variables: &HashMap<String, Tensor>, bytes: &[u8], other: Option<&str>) -> Result<(), Error> {
     let document = SafeTensors::deserialize(bytes)?;
-    if let Some(name) = document.names().into_iter().find(|name| !variables.contains_key(*name)) {
+    let unknown = |name: &&str| !variables.contains_key(*name) && Some(*name) != other;
+    if let Some(name) = document.names().into_iter().find(unknown) {
         return Err(Error::Unknown { name: name.to_string() });
     }
     let mut checked: HashMap<&str, Tensor> = HashMap::new();

@@ -1,12 +1,13 @@
-//! The policy: normaliser, image encoder, reference encoder, low level.
+//! The policy: normaliser, image encoder, and what decides: reference encoder and low level, or a transfer's high level.
 
-use comic_experiment::{Network, TaskSpec};
+use comic_experiment::{Experiment, Network, TaskSpec, Transfer};
 use tch::{Tensor, nn};
 
 use crate::action::ActionDistribution;
 use crate::encoder::Encoder;
 use crate::error::Error;
 use crate::gaussian::DiagonalGaussian;
+use crate::high_level::HighLevel;
 use crate::image_encoder::ImageEncoder;
 use crate::layers::rows;
 use crate::low_level::{self, LowLevel};
@@ -36,15 +37,37 @@ pub struct Acting {
 pub struct Policy {
     normaliser: Normaliser,
     image_encoder: Option<ImageEncoder>,
-    encoder: Encoder,
-    low_level: Box<dyn LowLevel>,
+    decides: Decides,
     /// σ of every action, `[1]`, if a schedule sets it. It is published with the parameters, and is not trained.
     scheduled_std: Option<Tensor>,
     /// Least standard deviation of an action, also of one that a file brings.
     min_std: f64,
 }
 
+/// What turns normalised observations into a distribution of actions.
+#[derive(Debug)]
+enum Decides {
+    /// A latent, and from it the action.
+    Skills { encoder: Encoder, low_level: Box<dyn LowLevel> },
+    /// In transfer: the action is the latent of a frozen low level.
+    Latents(HighLevel),
+}
+
 impl Policy {
+    /// The policy of this experiment; everything else as in [`new`](Self::new). In transfer its action is the latent of the
+    /// frozen low level, and `pose` is not used.
+    ///
+    /// # Errors
+    /// [`Error::Length`] if `pose` is not an action of this task.
+    pub fn of(store: &nn::Path, spec: &TaskSpec, experiment: &Experiment, pose: &[f32]) -> Result<Self, Error> {
+        let Experiment { network, transfer, .. } = experiment;
+        if transfer.is_on() {
+            Ok(Self::of_transfer(store, spec, network, transfer))
+        } else {
+            Self::new(store, spec, network, pose)
+        }
+    }
+
     /// Creates the policy's parameters in `store`. `pose` is the initial mean of the action, A entries in [−1, 1]; 0 is
     /// the middle of a joint's range.
     ///
@@ -55,19 +78,35 @@ impl Policy {
             return Err(Error::Length { name: "initial pose", expected: spec.action, found: pose.len() });
         }
         let proprioception = spec.proprioception as i64;
-        let image_encoder =
-            (spec.image > 0).then(|| ImageEncoder::new(&(store / "image_encoder"), config.image_features as i64));
-        let image_features = image_encoder.as_ref().map_or(0, ImageEncoder::output);
+        let (image_encoder, image_features) = encode_images(store, spec, config);
         let latent = config.latent.size as i64;
         let encoder = Encoder::new(&(store / "encoder"), spec, image_features, config);
         let low_level = low_level::Config { latent, proprioception, pose, network: config };
         let low_level = low_level::build(&(store / "low_level"), &low_level);
+        let decides = Decides::Skills { encoder, low_level };
+        Ok(Self::assemble(store, "low_level", spec, config, image_encoder, decides))
+    }
+
+    fn of_transfer(store: &nn::Path, spec: &TaskSpec, config: &Network, transfer: &Transfer) -> Self {
+        let (image_encoder, image_features) = encode_images(store, spec, config);
+        let high_level = HighLevel::new(&(store / "high_level"), spec, image_features, config, transfer);
+        Self::assemble(store, "high_level", spec, config, image_encoder, Decides::Latents(high_level))
+    }
+
+    /// `acting` is the path of the part that decides on the action.
+    fn assemble(
+        store: &nn::Path,
+        acting: &str,
+        spec: &TaskSpec,
+        config: &Network,
+        image_encoder: Option<ImageEncoder>,
+        decides: Decides,
+    ) -> Self {
         let normaliser = Normaliser::new(&(store / "normaliser"), spec, config.normaliser_steps > 0);
-        let scheduled_std =
-            (config.final_std > 0.0).then(|| (store / "low_level").zeros_no_train("scheduled_std", &[1]));
-        let policy = Self { normaliser, image_encoder, encoder, low_level, scheduled_std, min_std: config.min_std };
+        let scheduled_std = (config.final_std > 0.0).then(|| (store / acting).zeros_no_train("scheduled_std", &[1]));
+        let policy = Self { normaliser, image_encoder, decides, scheduled_std, min_std: config.min_std };
         policy.set_scheduled_std(config.initial_std);
-        Ok(policy)
+        policy
     }
 
     /// Normalises observations: proprioception `[.., P]`, task observation `[.., X]`, image `[.., I]` uint8. The
@@ -98,15 +137,31 @@ impl Policy {
         recurrent: RecurrentState<'_>,
     ) -> Acting {
         let NormalisedObservation { proprioception, task, routing } = observation;
-        let input = rows(&Tensor::cat(&[task, proprioception, previous_latent], -1));
-        let encoded = self.encoder.forward(&input, &rows(latent_noise), routing);
-        let input = low_level::Input { intent: &encoded.intent, proprioception: &rows(proprioception), recurrent };
-        let low_level::Output { action, state } = self.low_level.act(&input);
-        let action = match &self.scheduled_std {
-            Some(std) => action.with_std(&std.clamp(self.min_std, LARGEST_STD)),
-            None => action,
+        let acting = match &self.decides {
+            Decides::Skills { encoder, low_level } => {
+                let input = rows(&Tensor::cat(&[task, proprioception, previous_latent], -1));
+                let encoded = encoder.forward(&input, &rows(latent_noise), routing);
+                let proprioception = &rows(proprioception);
+                let input = low_level::Input { intent: &encoded.intent, proprioception, recurrent };
+                let low_level::Output { action, state } = low_level.act(&input);
+                Acting { latent: encoded.latent, action, latent_posterior: encoded.posterior, state }
+            }
+            Decides::Latents(high_level) => Acting {
+                latent: rows(latent_noise),
+                action: ActionDistribution::Gaussian(
+                    high_level.forward(&rows(&Tensor::cat(&[task, proprioception], -1))),
+                ),
+                latent_posterior: None,
+                state: recurrent.state.shallow_clone(),
+            },
         };
-        Acting { latent: encoded.latent, action, latent_posterior: encoded.posterior, state }
+        match &self.scheduled_std {
+            Some(std) => {
+                let action = acting.action.with_std(&std.clamp(self.min_std, LARGEST_STD));
+                Acting { action, ..acting }
+            }
+            None => acting,
+        }
     }
 
     /// Sets the standard deviation of every action, if the experiment schedules it (`final_std`); otherwise nothing
@@ -127,4 +182,14 @@ impl Policy {
     pub fn set_normaliser(&self, statistics: &NormaliserStatistics) -> Result<(), Error> {
         self.normaliser.set(statistics)
     }
+}
+
+/// The image encoder of a task with images, and the number of image features.
+fn encode_images(store: &nn::Path, spec: &TaskSpec, config: &Network) -> (Option<ImageEncoder>, i64) {
+    if spec.image == 0 {
+        return (None, 0);
+    }
+    let encoder = ImageEncoder::new(&(store / "image_encoder"), config.image_features as i64);
+    let features = encoder.output();
+    (Some(encoder), features)
 }

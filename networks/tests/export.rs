@@ -58,7 +58,7 @@ fn source() -> Source {
 fn exported(part: &str, experiment: &Experiment) -> Result<Exported, Error> {
     let _guard = GENERATOR.lock().unwrap();
     let (store, ..) = policy(experiment);
-    Exported::new(part.parse().unwrap(), experiment, source(), &to_safetensors(&store).unwrap())
+    Exported::new(part.parse().unwrap(), experiment, source(), &to_safetensors(&store).unwrap(), None)
 }
 
 fn names(exported: &Exported) -> BTreeSet<String> {

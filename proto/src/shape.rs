@@ -38,12 +38,12 @@ impl UnrollShape {
             proprioception: spec.proprioception,
             task: spec.task,
             action: spec.action,
-            latent: experiment.network.latent.size,
+            latent: experiment.latent_size(),
             reward_terms: spec.reward_terms.len(),
             // The image has whole words, so every row is aligned.
             image: spec.image.next_multiple_of(ELEMENT),
-            components: experiment.network.components(),
-            state: experiment.network.state_size(),
+            components: experiment.components(),
+            state: experiment.state_size(),
             action_gradient: if experiment.vmpo.action_gradient > 0.0 { spec.action } else { 0 },
         }
     }

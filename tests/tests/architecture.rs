@@ -119,7 +119,8 @@ fn places(sources: &[Source], holds: impl Fn(&str) -> bool) -> Vec<String> {
 fn neither_actor_nor_learner_names_a_low_level() -> Result<()> {
     let mut sources = within(&["actor/src/", "learner/src/"])?;
     sources.retain(|source| !source.path.ends_with("/options.rs"));
-    let found = places(&sources, |line| line.contains(concat!("LowLevel", "Name::")) || line.contains(".low_level"));
+    let found =
+        places(&sources, |line| line.contains(concat!("LowLevel", "Name::")) || line.contains("network.low_level"));
     ensure!(found.is_empty(), "{found:?}");
     Ok(())
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use clap::Args;
 use comic_clips::Catalogue;
-use comic_experiment::Experiment;
+use comic_experiment::{Experiment, Transfer};
 use comic_proto::v1::EvaluationReport;
 use comic_proto::{Access, UnrollShape};
 use comic_tasks::{Simulated, Task};
@@ -121,6 +121,8 @@ pub struct Evaluate {
 struct Subject {
     experiment: Experiment,
     parameters: Option<Vec<u8>>,
+    /// In transfer: the file of the frozen low level.
+    low_level: Option<Vec<u8>>,
     position: Position,
 }
 
@@ -163,7 +165,11 @@ impl Evaluate {
 
     /// The report, and the result of the film.
     fn evaluate(&self, subject: Subject) -> Result<(Report, Result<(), Error>), Error> {
-        let Subject { experiment, parameters, .. } = subject;
+        let Subject { mut experiment, parameters, low_level, .. } = subject;
+        if self.servo {
+            // The servo action is a command, not a latent.
+            experiment.transfer = Transfer::default();
+        }
         if let Some(out) = &self.video {
             Format::of(out)?;
             self.look.suits(experiment.task)?;
@@ -181,7 +187,8 @@ impl Evaluate {
             ..RolloutSettings::default()
         };
         let shape = UnrollShape::new(task.spec(), &experiment);
-        let mut policy = self.policy(&experiment, task.as_ref(), own.as_ref(), parameters.as_deref())?;
+        let mut policy =
+            self.policy(&experiment, task.as_ref(), own.as_ref(), low_level.as_deref(), parameters.as_deref())?;
         let mut controller = policy.as_mut().map_or(Controller::Servo { std: 0.0 }, Controller::Policy);
         let recorder =
             self.video.as_ref().map(|out| Recorder::new(&self.look, out, task.control_timestep())).transpose()?;
@@ -203,8 +210,8 @@ impl Evaluate {
         if let Some(path) = &self.checkpoint {
             let found = checkpoint::read(path)?;
             tracing::info!(checkpoint = %found.path.display(), "evaluating");
-            let Checkpoint { experiment, policy, position, .. } = found;
-            return Ok(Subject { experiment, parameters: Some(policy), position });
+            let Checkpoint { experiment, policy, low_level, position, .. } = found;
+            return Ok(Subject { experiment, parameters: Some(policy), low_level, position });
         }
         let preset = self.preset.as_deref().unwrap_or_default();
         if !self.untrained && !self.servo {
@@ -213,7 +220,7 @@ impl Evaluate {
             ));
         }
         let experiment = comic_experiment::resolve(preset, &self.set)?;
-        Ok(Subject { experiment, parameters: None, position: Position::default() })
+        Ok(Subject { experiment, parameters: None, low_level: None, position: Position::default() })
     }
 
     fn policy(
@@ -221,14 +228,17 @@ impl Evaluate {
         experiment: &Experiment,
         task: &dyn Task,
         own: Option<&Catalogue>,
+        low_level: Option<&[u8]>,
         parameters: Option<&[u8]>,
     ) -> Result<Option<TorchPolicy>, Error> {
         if self.servo {
             return Ok(None);
         }
         let policy = match parameters {
-            Some(parameters) if !self.untrained => TorchPolicy::from_parameters(task.spec(), experiment, parameters)?,
-            _ => TorchPolicy::untrained(task.spec(), experiment, experiment.seed, || {
+            Some(parameters) if !self.untrained => {
+                TorchPolicy::from_parameters(task.spec(), experiment, low_level, parameters)?
+            }
+            _ => TorchPolicy::untrained(task.spec(), experiment, low_level, experiment.seed, || {
                 own.map_or(Ok([0.0; 56]), |own| Ok(own.mean_action()?))
             })?,
         };

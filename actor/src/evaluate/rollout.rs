@@ -57,7 +57,7 @@ pub(super) fn run<E: Environment, F: ForwardPass>(
     options: &RolloutSettings,
     audience: &mut dyn Audience<E>,
 ) -> Result<Vec<Finished>, Error> {
-    let mut acting = ActingLoop::new(environments, shape);
+    let mut acting = ActingLoop::new(environments, shape, controller.low_level());
     let mut recorder = EpisodeRecorder {
         running: vec![Running::default(); acting.rollouts.len()],
         queue: starts.iter().enumerate(),
@@ -67,7 +67,6 @@ pub(super) fn run<E: Environment, F: ForwardPass>(
         noise: options.noise,
         errors: Vec::new(),
         rng: Pcg64::seed_from_u64(options.seed),
-        action: vec![0.0; shape.action],
         audience,
     };
     for (index, rollout) in acting.rollouts.iter_mut().enumerate() {
@@ -90,14 +89,12 @@ struct EpisodeRecorder<'a, E> {
     all: usize,
     finished: Vec<Finished>,
     deterministic: bool,
-    /// Standard deviation of the noise on mean actions.
+    /// Standard deviation of the noise on commands without other noise.
     noise: f32,
     /// Scratch: the bodies' position errors after a step.
     errors: Vec<[f64; 3]>,
     /// The noise of all environments.
     rng: Pcg64,
-    /// Scratch: the sampled action.
-    action: Vec<f32>,
     audience: &'a mut dyn Audience<E>,
 }
 
@@ -160,6 +157,14 @@ impl<E: Environment> Recorder<E> for EpisodeRecorder<'_, E> {
         }
     }
 
+    fn choose(&mut self, _index: usize, rollout: &Rollout<E>, row: &mut ActingRow<'_>) {
+        match (rollout.ended, self.deterministic) {
+            (true, _) => {}
+            (false, true) => row.take_mode(),
+            (false, false) => row.sample(&mut self.rng),
+        }
+    }
+
     fn step(
         &mut self,
         index: usize,
@@ -169,11 +174,10 @@ impl<E: Environment> Recorder<E> for EpisodeRecorder<'_, E> {
         if rollout.ended {
             return Ok(ControlFlow::Continue(()));
         }
-        match self.deterministic {
-            true => row.mode_with_noise(self.noise, &mut self.action, &mut self.rng),
-            false => row.sample(&mut self.action, &mut self.rng),
+        if self.deterministic {
+            row.disturb_command(self.noise, &mut self.rng);
         }
-        let step = rollout.step(&self.action, row);
+        let step = rollout.step(row);
         rollout.environment.position_errors(&mut self.errors);
         let Running { number, rewards, tracking, .. } = &mut self.running[index];
         rewards.push(step.reward_terms.iter().sum());

@@ -177,7 +177,7 @@ impl Evaluator<'_> {
         newest: &watch::Receiver<Option<Checkpoint>>,
     ) -> Result<(), Error> {
         let begun = Instant::now();
-        let Fetched { experiment, policy, assets } = fetched;
+        let Fetched { experiment, policy, low_level, assets } = fetched;
         let scene = match self.scene.take().filter(|scene| scene.experiment == experiment) {
             Some(scene) => scene,
             None => Scene::new(experiment, &self.settings.clips, &assets)?,
@@ -189,7 +189,7 @@ impl Evaluator<'_> {
             seed: self.settings.seed,
             ..RolloutSettings::default()
         };
-        let mut policy = TorchPolicy::from_parameters(task.spec(), experiment, &policy)?;
+        let mut policy = TorchPolicy::from_parameters(task.spec(), experiment, low_level.as_deref(), &policy)?;
         let shape = UnrollShape::new(task.spec(), experiment);
         let camera = if self.films { Camera::new(task.control_timestep(), experiment) } else { Ok(None) };
         let mut audience = Crew { camera, newest };

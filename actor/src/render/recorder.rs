@@ -65,6 +65,11 @@ impl Look {
         Self { camera: Place::Tracking, ghost, size: Size::new(160, 120), fps: Some(12) }
     }
 
+    /// For a contact sheet: a tile every third of a second.
+    pub(crate) fn sheet() -> Self {
+        Self { camera: Place::Side, ghost: None, size: Size::new(160, 120), fps: Some(3) }
+    }
+
     /// Checks whether a film of this task can look like this.
     ///
     /// # Errors

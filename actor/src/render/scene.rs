@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use clap::Args;
 use comic_clips::Catalogue;
-use comic_experiment::{ClipSource, Experiment, TaskName};
+use comic_experiment::{ClipSource, Experiment, TaskName, Transfer};
 use comic_proto::UnrollShape;
 use comic_tasks::{Simulated, Task};
 
@@ -59,6 +59,12 @@ pub(super) struct Cast {
     options: RolloutSettings,
 }
 
+/// What a checkpoint holds for acting.
+struct Learned {
+    policy: Vec<u8>,
+    low_level: Option<Vec<u8>>,
+}
+
 impl Scene {
     /// The task's name.
     pub(super) fn task(&self) -> TaskName {
@@ -70,14 +76,15 @@ impl Scene {
     /// # Errors
     /// Errors of the experiment, the checkpoint, a clip or the start.
     pub(super) fn cast(&self) -> Result<Cast, Error> {
-        let (mut experiment, parameters) = self.experiment()?;
+        let (mut experiment, learned) = self.experiment()?;
         if let Some(clip) = &self.clip {
             experiment.clips = vec![ClipSource::parse(clip)];
         }
         let task = comic_tasks::build(&experiment, &Catalogue::open(&experiment.clips)?)?;
-        let policy = parameters
-            .map(|parameters| TorchPolicy::from_parameters(task.spec(), &experiment, &parameters))
-            .transpose()?;
+        let policy = learned.map(|Learned { policy, low_level }| {
+            TorchPolicy::from_parameters(task.spec(), &experiment, low_level.as_deref(), &policy)
+        });
+        let policy = policy.transpose()?;
         let starts = self.starts(task.as_ref())?;
         let name = self.task;
         let options = RolloutSettings {
@@ -90,22 +97,24 @@ impl Scene {
         Ok(Cast { task, policy, shape, name, starts, options })
     }
 
-    /// The experiment, and the parameters when there is a checkpoint.
-    fn experiment(&self) -> Result<(Experiment, Option<Vec<u8>>), Error> {
+    /// The experiment, and what was learned when there is a checkpoint. Without one, no low level acts.
+    fn experiment(&self) -> Result<(Experiment, Option<Learned>), Error> {
         let own = if self.task == TaskName::Tracking { TRACKING_PRESET } else { self.task.name() };
-        let (experiment, parameters, origin) = match &self.checkpoint {
+        let (experiment, learned, origin) = match &self.checkpoint {
             Some(path) => {
-                let Checkpoint { path, experiment, policy, .. } = checkpoint::read(path)?;
+                let Checkpoint { path, experiment, policy, low_level, .. } = checkpoint::read(path)?;
                 tracing::info!(checkpoint = %path.display(), "playing");
-                (experiment, Some(policy), format!("checkpoint {}", path.display()))
+                (experiment, Some(Learned { policy, low_level }), format!("checkpoint {}", path.display()))
             }
             None => {
                 let preset = self.preset.as_deref().unwrap_or(own);
-                (comic_experiment::resolve(preset, &self.set)?, None, format!("preset {preset}"))
+                let mut experiment = comic_experiment::resolve(preset, &self.set)?;
+                experiment.transfer = Transfer::default();
+                (experiment, None, format!("preset {preset}"))
             }
         };
         if experiment.tasks().iter().any(|(task, _)| *task == self.task) {
-            return Ok((experiment, parameters));
+            return Ok((experiment, learned));
         }
         Err(Error::Usage(format!(
             "{origin}: its task is {}, not {}: name that one with --task, or another checkpoint or preset",

@@ -1,9 +1,12 @@
 //! The experiment's files, fetched from the learner once and stored under their SHA-256.
 
 use std::collections::HashMap;
+use std::fs::File;
 use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};
 
+use comic_experiment::{Experiment, Transfer};
+use comic_networks::export::LONGEST;
 use comic_proto::Client;
 use comic_proto::v1::{Asset, AssetRequest};
 use sha2::{Digest as _, Sha256};
@@ -43,6 +46,22 @@ pub(crate) async fn fetch(
         located.insert(asset.source.clone(), path);
     }
     Ok(located)
+}
+
+/// The frozen low level of a transfer, from the files that [`fetch`] located; `None` in any other experiment.
+pub(super) fn low_level(experiment: &Experiment, located: &HashMap<String, PathBuf>) -> Result<Option<Vec<u8>>, Error> {
+    let Transfer { low_level, sha256, .. } = &experiment.transfer;
+    if !experiment.transfer.is_on() {
+        return Ok(None);
+    }
+    let path = located.get(low_level).ok_or(Error::Disagreement { what: "the frozen low level" })?;
+    let mut file = Vec::new();
+    let opened = File::open(path).map_err(Error::file(path))?;
+    opened.take(LONGEST).read_to_end(&mut file).map_err(Error::file(path))?;
+    if hex::encode(Sha256::digest(&file)) != *sha256 {
+        return Err(Error::Disagreement { what: "the frozen low level" });
+    }
+    Ok(Some(file))
 }
 
 /// The name in the cache is the hash alone, so that no name from a learner can lead out of the directory.

@@ -38,6 +38,8 @@ pub struct Fetched {
     pub experiment: Experiment,
     /// Parameters of the online policy (safetensors).
     pub policy: Vec<u8>,
+    /// In transfer: the file of the frozen low level.
+    pub low_level: Option<Vec<u8>>,
     /// The file of each source of clips, if they were wanted.
     pub assets: HashMap<String, PathBuf>,
 }
@@ -111,10 +113,14 @@ impl Follower {
         let experiment = assets::read(&mut client, &experiment, EXPERIMENT_LIMIT).await?;
         let experiment = Experiment::from_toml("the checkpoint's experiment", &String::from_utf8_lossy(&experiment))
             .map_err(|error| Failure::Fatal(error.into()))?;
-        let clips = if wanted(&experiment) { checkpoint.assets.as_slice() } else { &[] };
-        let assets = assets::fetch(&mut client, clips, self.cache.as_deref()).await?;
+        let wants_clips = wanted(&experiment);
+        let is_low_level = |asset: &Asset| experiment.transfer.is_on() && asset.source == experiment.transfer.low_level;
+        let needed = |asset: &&Asset| wants_clips || is_low_level(asset);
+        let needed: Vec<Asset> = checkpoint.assets.iter().filter(needed).cloned().collect();
+        let assets = assets::fetch(&mut client, &needed, self.cache.as_deref()).await?;
+        let low_level = assets::low_level(&experiment, &assets).map_err(Failure::Fatal)?;
         let policy = assets::read(&mut client, &policy, POLICY_LIMIT).await?;
-        Ok(Fetched { experiment, policy, assets })
+        Ok(Fetched { experiment, policy, low_level, assets })
     }
 
     fn judge(&self, status: &Status) -> Failure {

@@ -107,6 +107,13 @@ impl<E: Environment> Recorder<E> for UnrollRecorder {
         row.draw_latent_noise(&mut self.unrolls[index].rng);
     }
 
+    fn choose(&mut self, index: usize, rollout: &Rollout<E>, row: &mut ActingRow<'_>) {
+        let unroll = &mut self.unrolls[index];
+        if rollout.episode.task == unroll.task && !rollout.ended {
+            row.sample(&mut unroll.rng);
+        }
+    }
+
     fn step(
         &mut self,
         index: usize,
@@ -131,12 +138,11 @@ impl<E: Environment> Recorder<E> for UnrollRecorder {
 }
 
 impl OpenUnroll {
-    /// Samples an action, takes a step, and writes both as row `t`.
+    /// Takes a step, and writes it with the chosen action as row `t`.
     fn write_transition<E: Environment>(&mut self, t: usize, rollout: &mut Rollout<E>, row: &mut ActingRow<'_>) {
         self.write_distribution(t, row);
-        let action = self.buffer.row_mut(Field::Action, t);
-        row.sample(action, &mut self.rng);
-        let step = rollout.step(action, row);
+        self.buffer.row_mut(Field::Action, t).copy_from_slice(row.action);
+        let step = rollout.step(row);
         let reward = self.buffer.row_mut(Field::Reward, t);
         for (reward, term) in reward.iter_mut().zip(&step.reward_terms) {
             *reward = *term as f32;

@@ -8,6 +8,7 @@ use super::*;
 use crate::forward_pass::ActingBatch;
 
 mod running;
+mod transfer;
 
 /// An observation names its episode and its step, so a row can be recognised; episode k lasts `lengths[k]` steps.
 #[derive(Debug)]

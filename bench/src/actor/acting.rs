@@ -61,7 +61,7 @@ fn environments(subject: &Subject, family: u64) -> Result<Vec<Box<dyn Simulated>
 fn worker<E: Environment>(subject: &Subject, environments: Vec<E>, seed: u64) -> Result<Worker<E, TorchPolicy>> {
     let (spec, experiment) = (subject.task.spec(), &subject.experiment);
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, experiment)));
-    let policy = TorchPolicy::untrained(spec, experiment, seed, || Ok([0.0; 56]))?;
+    let policy = TorchPolicy::untrained(spec, experiment, None, seed, || Ok([0.0; 56]))?;
     let parameters = Bytes::from(policy.to_parameters()?);
     let mut worker = Worker::new(environments, policy, layout, 0.0, 0, seed);
     worker.adopt(&Arc::new(Directive { learner_epoch: 1, version: 1, behaviour: Behaviour::Policy, parameters }))?;

@@ -11,6 +11,8 @@ use crate::error::{Error, Result};
 
 /// The file of a checkpoint that holds the SHA-256 of each part.
 pub(super) const MANIFEST: &str = "MANIFEST.json";
+/// In transfer: the part that is the file of the frozen low level.
+pub(crate) const LOW_LEVEL: &str = "low_level.safetensors";
 /// What the path of a checkpoint has to name.
 const WANTED: &str = "name a run's directory, its `checkpoints`, or one of them";
 

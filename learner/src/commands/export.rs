@@ -6,6 +6,7 @@ use comic_experiment::Experiment;
 use comic_networks::export::{Exported, Part, Source};
 
 use crate::checkpoint::progress::Progress;
+use crate::checkpoint::snapshot::LOW_LEVEL;
 use crate::checkpoint::{self, Snapshot};
 use crate::error::{Error, Result};
 
@@ -48,7 +49,10 @@ fn format_of(out: &Path) -> Result<Format> {
 }
 
 /// Makes the file's contents of a snapshot.
-fn read(place: &Path, part: Part, snapshot: &Snapshot) -> Result<Exported> {
+///
+/// # Errors
+/// A part that is missing, or does not fit the snapshot's experiment.
+pub(crate) fn read(place: &Path, part: Part, snapshot: &Snapshot) -> Result<Exported> {
     let experiment = Experiment::from_toml("experiment.toml of the checkpoint", snapshot.text("experiment.toml")?)?;
     let progress: Progress =
         serde_json::from_slice(snapshot.part("progress.json")?).map_err(Error::json("the checkpoint's progress"))?;
@@ -67,5 +71,6 @@ fn read(place: &Path, part: Part, snapshot: &Snapshot) -> Result<Exported> {
         version: progress.version,
         seed: experiment.seed,
     };
-    Ok(Exported::new(part, &experiment, source, snapshot.part("policy.safetensors")?)?)
+    let low_level = experiment.transfer.is_on().then(|| snapshot.part(LOW_LEVEL)).transpose()?;
+    Ok(Exported::new(part, &experiment, source, snapshot.part("policy.safetensors")?, low_level)?)
 }

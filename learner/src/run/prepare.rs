@@ -1,5 +1,6 @@
 //! What a learner epoch begins with: the experiment, the checkpoint to resume from, and the parts made of them.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use comic_clips::Catalogue;
@@ -7,6 +8,7 @@ use comic_experiment::{Difference, Experiment, InitialPose, TaskSpec, Unroll};
 use comic_proto::{UnrollLayout, UnrollShape};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Phase};
 
+use super::low_level::LowLevel;
 use crate::checkpoint::{Snapshot, Store, incompatible};
 use crate::device::Backend;
 use crate::error::{Error, Result};
@@ -19,10 +21,13 @@ use crate::train::setup::Setup;
 /// The trainer's setup and the service. Begins the learner epoch.
 pub(super) fn prepare(
     options: &Options,
-    experiment: Experiment,
+    mut experiment: Experiment,
     backend: Backend,
     security: Security,
 ) -> Result<(Setup, Service)> {
+    let store = Store::open(&options.run, experiment.learner.checkpoints_kept)?;
+    let newest = store.newest()?;
+    let low_level = LowLevel::find(&mut experiment, newest.as_ref().map(|(_, snapshot)| snapshot))?;
     let catalogue = Catalogue::open(&experiment.clips)?;
     let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
     let spec = TaskSpec::new(&experiment, names).map_err(|name| {
@@ -32,8 +37,7 @@ pub(super) fn prepare(
         InitialPose::MidRange => vec![0.0; spec.action],
         InitialPose::ReferenceMean => catalogue.mean_action()?.iter().map(|action| *action as f32).collect(),
     };
-    let store = Store::open(&options.run, experiment.learner.checkpoints_kept)?;
-    let resume = checkpoint(&store, options, &experiment, &spec)?;
+    let resume = resumed(newest, options, &experiment, &spec)?;
     let epoch = store.begin_epoch()?;
     let document = options.run.join("experiment.toml");
     std::fs::write(&document, experiment.to_toml()?).map_err(Error::file("write", document))?;
@@ -46,6 +50,10 @@ pub(super) fn prepare(
     let config = batches(&experiment.unroll);
     let batcher = Batcher::new(layout, config, Phase::begin(epoch), ledger);
     let publisher = Publisher::new(epoch);
+    let mut assets = catalogue.assets()?;
+    if let Some(low_level) = &low_level {
+        assets.push(low_level.offer(&options.run, experiment.transfer.low_level.clone())?);
+    }
     let service = Service::new(service::Setup {
         run: options.run.clone(),
         id: store.run()?,
@@ -53,20 +61,27 @@ pub(super) fn prepare(
         limits: options.limits.clone(),
         experiment: experiment.clone(),
         spec: spec.clone(),
-        assets: catalogue.assets()?,
+        assets,
         batcher: batcher.clone(),
         publisher: publisher.clone(),
         quarantine: options.quarantine.clone(),
     })?;
     let run = options.run.clone();
     let handle = service.trainer();
-    let setup = Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, service: handle };
+    let low_level = low_level.map(|low_level| low_level.bytes);
+    let setup =
+        Setup { experiment, spec, pose, low_level, backend, run, epoch, resume, batcher, publisher, service: handle };
     Ok((setup, service))
 }
 
-/// The checkpoint to resume from; `None` if the run begins.
-fn checkpoint(store: &Store, options: &Options, experiment: &Experiment, spec: &TaskSpec) -> Result<Option<Snapshot>> {
-    let Some((path, snapshot)) = store.newest()? else { return Ok(None) };
+/// The newest checkpoint, if there is one and the run may resume from it.
+fn resumed(
+    newest: Option<(PathBuf, Snapshot)>,
+    options: &Options,
+    experiment: &Experiment,
+    spec: &TaskSpec,
+) -> Result<Option<Snapshot>> {
+    let Some((path, snapshot)) = newest else { return Ok(None) };
     check_same_experiment(experiment, spec, &snapshot, options.allow_changed)
         .map_err(|error| incompatible(&options.run, error))?;
     tracing::info!(checkpoint = %path.display(), "resuming");
@@ -96,6 +111,8 @@ fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot,
     now.budget = then.budget.clone();
     now.learner = then.learner.clone();
     now.actor = then.actor.clone();
+    // Only what is there counts, not where it is.
+    now.transfer.low_level.clone_from(&then.transfer.low_level);
     let changed = |Difference { field, ours, theirs }| format!("{field} was {ours} and is {theirs}");
     let mut changes: Vec<String> = then.differences(&now)?.into_iter().map(changed).collect();
     let task = serde_json::from_slice::<TaskSpec>(snapshot.part("task.json")?);
@@ -120,7 +137,7 @@ fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot,
 mod tests {
     use super::*;
 
-    fn resumed(change: impl FnOnce(&mut Experiment), allowed: bool) -> Result<()> {
+    fn resume(change: impl FnOnce(&mut Experiment), allowed: bool) -> Result<()> {
         let then = Experiment::default();
         let spec = TaskSpec::new(&then, vec!["walk".into()]).unwrap();
         let mut snapshot = Snapshot::default();
@@ -137,13 +154,13 @@ mod tests {
             experiment.vmpo.lambda = 0.5;
             experiment.network.latent.beta = 0.25;
         };
-        let refused = resumed(change, false).unwrap_err();
+        let refused = resume(change, false).unwrap_err();
         assert_eq!(refused.exit_code(), 2);
         let message = refused.to_string();
         for part in ["vmpo.lambda was", "is 0.5", "network.latent.beta was", "is 0.25", "--allow-changed"] {
             assert!(message.contains(part), "no `{part}` in {message}");
         }
-        assert!(resumed(change, true).is_ok());
+        assert!(resume(change, true).is_ok());
     }
 
     #[test]
@@ -153,6 +170,13 @@ mod tests {
             experiment.learner.checkpoint_seconds = 8.0;
             experiment.actor.threads = 9;
         };
-        assert!(resumed(change, false).is_ok());
+        assert!(resume(change, false).is_ok());
+    }
+
+    #[test]
+    fn a_low_level_may_move_but_not_change() {
+        assert!(resume(|experiment| experiment.transfer.low_level = "elsewhere".into(), false).is_ok());
+        let refused = resume(|experiment| experiment.transfer.sha256 = "1".repeat(64), false).unwrap_err().to_string();
+        assert!(refused.contains("transfer.sha256 was"), "{refused}");
     }
 }

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_replay::Batcher;
 
@@ -19,6 +20,8 @@ pub struct Setup {
     pub spec: TaskSpec,
     /// The action at which the policy's mean starts, `[A]`.
     pub pose: Vec<f32>,
+    /// In transfer: the file of the frozen low level, for checkpoints.
+    pub low_level: Option<Bytes>,
     /// The device.
     pub backend: Backend,
     /// The run's directory.

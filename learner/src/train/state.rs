@@ -8,7 +8,7 @@ use tch::Device;
 
 use crate::algorithm::Algorithm;
 use crate::checkpoint::progress::{PROGRESS, Progress};
-use crate::checkpoint::snapshot::Snapshot;
+use crate::checkpoint::snapshot::{self, Snapshot};
 use crate::error::{Error, Result};
 use crate::tensors;
 use crate::train::statistics::ObservationStatistics;
@@ -23,10 +23,13 @@ pub(super) struct State {
     pub(super) progress: Progress,
     /// The parameters that actors act with, as published.
     pub(super) target: Bytes,
+    /// In transfer: the file of the frozen low level.
+    low_level: Option<Bytes>,
 }
 
 impl State {
-    /// The state at the beginning of run number `run`. `pose` is the action at which the policy's mean starts, `[A]`.
+    /// The state at the beginning of run number `run`. `pose` is the action at which the policy's mean starts, `[A]`;
+    /// `low_level` the file of a transfer's frozen low level.
     ///
     /// # Errors
     /// When the networks cannot be made.
@@ -34,6 +37,7 @@ impl State {
         experiment: &Experiment,
         spec: &TaskSpec,
         pose: &[f32],
+        low_level: Option<Bytes>,
         device: Device,
         run: u64,
         epoch: u64,
@@ -51,7 +55,7 @@ impl State {
             random: Pcg64::seed_from_u64(experiment.seed),
         };
         let target = Bytes::from(algorithm.policy_parameters()?);
-        Ok(Self { algorithm, statistics: ObservationStatistics::new(spec), progress, target })
+        Ok(Self { algorithm, statistics: ObservationStatistics::new(spec), progress, target, low_level })
     }
 
     /// Normalises by the statistics of the observations seen so far.
@@ -84,7 +88,9 @@ impl State {
             (PROGRESS, serde_json::to_vec_pretty(&self.progress).map_err(json(PROGRESS))?),
             ("accounting.json", serde_json::to_vec_pretty(accounting).map_err(json("accounting.json"))?),
         ];
-        Ok(Snapshot { parts: parts.map(|(name, bytes)| (name.to_string(), bytes)).into() })
+        let low_level = self.low_level.as_ref().map(|file| (snapshot::LOW_LEVEL, file.to_vec()));
+        let parts = parts.into_iter().chain(low_level);
+        Ok(Snapshot { parts: parts.map(|(name, bytes)| (name.to_string(), bytes)).collect() })
     }
 
     /// Restores a checkpoint, as learner epoch `epoch` of run number `run`.

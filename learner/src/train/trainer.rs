@@ -49,9 +49,10 @@ impl Trainer {
     /// # Errors
     /// A checkpoint that does not fit the experiment; a disk that refuses.
     pub fn new(setup: Setup) -> Result<Self> {
-        let Setup { experiment, spec, pose, backend, run, epoch, resume, batcher, publisher, service } = setup;
+        let Setup { experiment, spec, pose, low_level, backend, run, epoch, resume, batcher, publisher, service } =
+            setup;
         backend.train_here()?;
-        let mut state = State::new(&experiment, &spec, &pose, backend.device(), service.id(), epoch)?;
+        let mut state = State::new(&experiment, &spec, &pose, low_level, backend.device(), service.id(), epoch)?;
         if let Some(snapshot) = &resume {
             state.restore(snapshot, service.id(), epoch).map_err(|error| incompatible(&run, error))?;
         }

@@ -55,10 +55,10 @@ impl VmpoLearner {
         let Experiment { network, vmpo, optimiser, .. } = experiment;
         let policy_store = nn::VarStore::new(device);
         let value_store = nn::VarStore::new(device);
-        let policy = Policy::new(&policy_store.root(), spec, network, pose)?;
+        let policy = Policy::of(&policy_store.root(), spec, experiment, pose)?;
         let value = Value::new(&value_store.root(), spec, network);
         let temperatures = if vmpo.temperature_per_task { spec.tasks.len() } else { 1 };
-        let multipliers = Multipliers::initial(vmpo, temperatures, network.components(), device);
+        let multipliers = Multipliers::initial(vmpo, temperatures, experiment.components(), device);
         let mut adam = Adam::new(optimiser);
         let mut parameters = trainable("policy", &policy_store);
         parameters.extend(trainable("value", &value_store));
@@ -124,18 +124,7 @@ impl VmpoLearner {
 
     fn check(&self, minibatch: &MinibatchTensors) -> Result<(), Error> {
         let found = minibatch.shape();
-        let unroll = UnrollShape {
-            length: found.unroll.length,
-            proprioception: self.spec.proprioception,
-            task: self.spec.task,
-            action: self.spec.action,
-            latent: self.experiment.network.latent.size,
-            reward_terms: self.spec.reward_terms.len(),
-            image: self.spec.image,
-            components: self.experiment.network.components(),
-            state: self.experiment.network.state_size(),
-            action_gradient: if self.experiment.vmpo.action_gradient > 0.0 { self.spec.action } else { 0 },
-        };
+        let unroll = UnrollShape { length: found.unroll.length, ..UnrollShape::new(&self.spec, &self.experiment) };
         let expected = MinibatchShape { unrolls: found.unrolls, tasks: self.spec.tasks.len(), unroll };
         let known = self.spec.clips.len();
         if found == expected && minibatch.clips() <= known {

@@ -14,7 +14,7 @@ pub enum Part {
     Policy(Option<TaskName>),
     /// The encoder of one task, the image encoder, and the statistics that normalise their inputs.
     Encoder(TaskName),
-    /// The low level, with the statistics that normalise proprioception.
+    /// The low level, with the statistics that normalise proprioception, and a prior of its latents if one was fitted.
     LowLevel,
 }
 
@@ -38,7 +38,9 @@ impl Part {
             Self::Encoder(task) => {
                 encodes(task) || name.starts_with("image_encoder.") || name.starts_with("normaliser.")
             }
-            Self::LowLevel => name.starts_with("low_level.") || name.starts_with("normaliser.proprioception_"),
+            Self::LowLevel => {
+                ["low_level.", "normaliser.proprioception_", "prior."].iter().any(|start| name.starts_with(start))
+            }
         }
     }
 
@@ -47,6 +49,9 @@ impl Part {
     /// # Errors
     /// [`Error::NoTask`] if the experiment has no such task.
     pub(crate) fn of(self, experiment: &Experiment) -> Result<Experiment, Error> {
+        if experiment.transfer.is_on() && !matches!(self, Self::Policy(_)) {
+            return Err(Error::Transfer { part: self.to_string() });
+        }
         let Some(task) = self.task() else { return Ok(experiment.clone()) };
         let tasks: Vec<TaskName> = experiment.tasks().into_iter().map(|(task, _)| task).collect();
         if !tasks.contains(&task) {

@@ -12,6 +12,7 @@ use super::file::{Exported, KEY};
 use super::part::Part;
 use super::spec::task_spec;
 use crate::error::Error;
+use crate::frozen::FrozenLowLevel;
 use crate::lstm::RecurrentState;
 use crate::policy::Policy;
 use crate::routing::Routing;
@@ -34,15 +35,15 @@ impl Exported {
         self.load(&store)?;
         // A tensor that requires a gradient cannot be a constant of a trace.
         store.freeze();
-        let network = &self.experiment.network;
-        let (latent, state) = (network.latent.size as i64, network.state_size() as i64);
+        let frozen = self.frozen_low_level()?;
+        let (latent, state) = (self.experiment.latent_size() as i64, self.experiment.network.state_size() as i64);
         let row = |size: i64, kind| Tensor::zeros([1, size], (kind, store.device()));
         let widths = [sizes.proprioception as i64, sizes.task as i64, latent + state];
         let mut inputs: Vec<Tensor> = widths.into_iter().map(|width| row(width, Kind::Float)).collect();
         if sizes.image > 0 {
             inputs.push(row(sizes.image as i64, Kind::Uint8));
         }
-        let mut forward = |inputs: &[Tensor]| vec![step(&policy, inputs, latent, state)];
+        let mut forward = |inputs: &[Tensor]| vec![step(&policy, frozen.as_ref(), inputs, latent)];
         let module = tch::no_grad(|| CModule::create_by_tracing("Policy", "forward", &inputs, &mut forward))?;
         module.save(path)?;
         self.enclose(path).map_err(Error::File)
@@ -63,10 +64,15 @@ impl Exported {
 }
 
 /// One step without noise: the action within its bounds, the latent, and the state.
-fn step(policy: &Policy, inputs: &[Tensor], latent: i64, state: i64) -> Tensor {
+fn step(policy: &Policy, frozen: Option<&FrozenLowLevel>, inputs: &[Tensor], latent: i64) -> Tensor {
     let observation = policy.normalise(&inputs[0], &inputs[1], inputs.get(3), &Routing::single());
     let previous = inputs[2].narrow(1, 0, latent);
-    let recurrent = RecurrentState { state: &inputs[2].narrow(1, latent, state), first: None };
-    let acting = policy.act(&observation, &previous, &previous.zeros_like(), recurrent);
-    Tensor::cat(&[acting.action.mode().clamp(-1.0, 1.0), acting.latent, acting.state], 1)
+    let state = inputs[2].narrow(1, latent, inputs[2].size()[1] - latent);
+    let acting =
+        policy.act(&observation, &previous, &previous.zeros_like(), RecurrentState { state: &state, first: None });
+    let (action, state) = match frozen {
+        Some(frozen) => frozen.act(&acting.action.mode(), &inputs[0], &state),
+        None => (acting.action.mode(), acting.state),
+    };
+    Tensor::cat(&[action.clamp(-1.0, 1.0), acting.latent, state], 1)
 }

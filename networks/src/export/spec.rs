@@ -1,6 +1,6 @@
 //! The description in an exported file.
 
-use comic_experiment::{Experiment, PROPRIOCEPTION, TaskSpec};
+use comic_experiment::{ACTION_SIZE, Experiment, PROPRIOCEPTION, TaskSpec};
 use serde::{Deserialize, Serialize};
 
 use super::part::Part;
@@ -25,6 +25,9 @@ pub struct Spec {
     pub outputs: Vec<Vector>,
     /// The normalisation of the observations.
     pub normalisation: Normalisation,
+    /// The prior of the latents, if one was fitted to a low level.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub prior: Option<FittedPrior>,
     /// The run and the checkpoint.
     pub source: Source,
     /// The resolved experiment (TOML). For a part of one task, it has only that task.
@@ -68,6 +71,21 @@ pub struct Normalisation {
     pub limit: f64,
 }
 
+/// The prior p(z | s) in a file of a low level: a Gaussian of the latent, whose mean and standard deviation depend on
+/// proprioception. The tensors are `prior.…`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FittedPrior {
+    /// Hidden sizes.
+    pub hidden: Vec<usize>,
+    /// Latents that it was fitted to.
+    pub latents: u64,
+    /// Mean −ln p(z | s) of latents that it was not fitted to, nats.
+    pub nats: f64,
+    /// Mean −ln N(z; 0, I) of the same latents, nats.
+    pub standard_nats: f64,
+}
+
 /// The run and the checkpoint that a file comes from.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -109,6 +127,7 @@ impl Spec {
             inputs,
             outputs,
             normalisation: Normalisation { active, limit: NORMALISED_LIMIT },
+            prior: None,
             source,
             experiment: experiment.to_toml().map_err(Error::Experiment)?,
         })
@@ -161,7 +180,7 @@ fn observations(experiment: &Experiment, sizes: &TaskSpec) -> Result<Vec<Vector>
 fn policy(experiment: &Experiment, sizes: &TaskSpec) -> Result<(Vec<Vector>, Vec<Vector>), Error> {
     let network = &experiment.network;
     let recurrent = || {
-        let entries = [("latent", network.latent.size), ("state", network.state_size())];
+        let entries = [("latent", experiment.latent_size()), ("state", network.state_size())];
         let entries = entries.map(|(name, size)| (name.to_string(), size));
         Vector::of("recurrent_state", entries, "output of the previous step; zeros at the first step of an episode")
     };
@@ -170,7 +189,7 @@ fn policy(experiment: &Experiment, sizes: &TaskSpec) -> Result<(Vec<Vector>, Vec
     inputs.push(recurrent());
     let meaning =
         "without noise: the mean, or the mean of a mixture's most likely component; within [-1, 1], in control order";
-    Ok((inputs, vec![Vector::plain("action", sizes.action, meaning), recurrent()]))
+    Ok((inputs, vec![Vector::plain("action", ACTION_SIZE, meaning), recurrent()]))
 }
 
 fn encoder(experiment: &Experiment, sizes: &TaskSpec) -> Result<(Vec<Vector>, Vec<Vector>), Error> {

@@ -1,25 +1,30 @@
 //! The number of weights of an experiment's networks, without building them.
 
-use comic_experiment::{Network, TaskSpec};
+use comic_experiment::{Experiment, Network, TaskSpec};
 
 use super::part::Part;
 use crate::low_level::{Layer, Sizes, low_level_layers};
 
 /// Number of entries of the matrices of encoders and low level in `part`. A reader compares it with the content of a
-/// file, so that a small file cannot describe networks that need huge memory.
-pub(super) fn count(part: Part, spec: &TaskSpec, network: &Network) -> u64 {
+/// file, so that a small file cannot describe networks that need huge memory. `prior` has the hidden sizes of a prior. A
+/// transfer's frozen low level is a file of its own inside, which is counted when that file is read.
+pub(super) fn count(part: Part, prior: &[usize], spec: &TaskSpec, experiment: &Experiment) -> u64 {
+    let (network, transfer) = (&experiment.network, experiment.transfer.is_on());
+    if transfer {
+        return high_level(spec, network);
+    }
     let encoders = || spec.tasks.iter().map(|task| encoder(spec, task.observation, network)).sum();
     match part {
         Part::Policy(_) => encoders() + low_level(spec, network),
         Part::Encoder(_) => encoders(),
-        Part::LowLevel => low_level(spec, network),
+        Part::LowLevel => low_level(spec, network) + of_prior(prior, spec, network),
     }
 }
 
 /// Whether [`count`] counts a tensor of this name and shape.
 pub(super) fn is_counted(name: &str, shape: &[usize]) -> bool {
     let matrix = shape.len() > 1 && !name.ends_with("biases");
-    matrix && (name.starts_with("encoder.") || name.starts_with("low_level."))
+    matrix && ["encoder.", "low_level.", "high_level.", "prior."].iter().any(|part| name.starts_with(part))
 }
 
 /// The number of weights of hidden layers, and the width of the last layer.
@@ -35,6 +40,18 @@ fn encoder(spec: &TaskSpec, observation: usize, network: &Network) -> u64 {
     let output = if latent == 0 { network.primitives.count as u64 } else { 2 * latent };
     let path = if latent > 0 && network.encoder_linear_path { output * input } else { 0 };
     weights + width * output + path
+}
+
+fn high_level(spec: &TaskSpec, network: &Network) -> u64 {
+    let image_features = if spec.image > 0 { network.image_features } else { 0 };
+    let (weights, width) = hidden((spec.proprioception + spec.task + image_features) as u64, &network.encoder);
+    weights + width * 2 * spec.action as u64
+}
+
+/// `prior` is empty if there is none.
+fn of_prior(prior: &[usize], spec: &TaskSpec, network: &Network) -> u64 {
+    let (weights, width) = hidden(spec.proprioception as u64, prior);
+    if prior.is_empty() { 0 } else { weights + width * 2 * network.latent.size as u64 }
 }
 
 fn low_level(spec: &TaskSpec, network: &Network) -> u64 {
@@ -58,9 +75,9 @@ mod tests {
             for overrides in [&[][..], &bare[..]] {
                 // Not every low level can do without a bottleneck.
                 let Ok(experiment) = resolve(name, overrides) else { continue };
-                let (spec, network) = (task_spec(&experiment).unwrap(), &experiment.network);
+                let spec = task_spec(&experiment).unwrap();
                 let store = nn::VarStore::new(Device::Cpu);
-                Policy::new(&store.root(), &spec, network, &vec![0.0; spec.action]).unwrap();
+                Policy::of(&store.root(), &spec, &experiment, &vec![0.0; spec.action]).unwrap();
                 for part in [Part::Policy(None), Part::LowLevel] {
                     let sizes =
                         |tensor: &tch::Tensor| tensor.size().iter().map(|size| *size as usize).collect::<Vec<_>>();
@@ -70,7 +87,7 @@ mod tests {
                         .filter(|(name, tensor)| part.holds(name) && is_counted(name, &sizes(tensor)))
                         .map(|(_, tensor)| tensor.numel())
                         .sum();
-                    assert_eq!(count(part, &spec, network), built as u64, "{name}: {part}");
+                    assert_eq!(count(part, &[], &spec, &experiment), built as u64, "{name}: {part}");
                 }
             }
         }

@@ -23,7 +23,9 @@ use crate::physics::{Data, Simulation, is_healthy};
 
 impl BuildTask for Tracking {
     fn build(&self, context: &Context<'_>) -> Result<Arc<dyn Task>, Error> {
-        Ok(Arc::new(TrackingTask::new(self, context.catalogue)?))
+        let mut task = TrackingTask::new(self, context.catalogue)?;
+        task.spec.action = context.experiment.action_size();
+        Ok(Arc::new(task))
     }
 }
 

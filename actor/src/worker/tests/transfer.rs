@@ -1,0 +1,74 @@
+//! A frozen low level between the policy's action and the simulator.
+
+use super::*;
+use crate::forward_pass::LowLevelShape;
+
+/// Entries of a command: fewer than those of an action.
+const COMMANDS: usize = 1;
+
+/// Acts as [`Plain`]. Its low level counts the steps of the episode in its state, and commands a hundredth of the count.
+#[derive(Debug, Default)]
+struct WithLowLevel {
+    policy: Plain,
+    /// The actions of each pass.
+    actions: Vec<Vec<f32>>,
+}
+
+impl ForwardPass for WithLowLevel {
+    fn load(&mut self, parameters: &[u8]) -> Result<(), Error> {
+        self.policy.load(parameters)
+    }
+    fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+        self.policy.forward(batch)
+    }
+    fn low_level(&self) -> Option<LowLevelShape> {
+        Some(LowLevelShape { command: COMMANDS, state: 1 })
+    }
+    fn actuate(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
+        self.actions.push(batch.action.clone());
+        batch.low_level_state.iter_mut().for_each(|steps| *steps += 1.0);
+        for (command, steps) in batch.command.iter_mut().zip(&batch.low_level_state) {
+            *command = steps / 100.0;
+        }
+        Ok(())
+    }
+}
+
+#[test]
+fn the_simulator_gets_the_low_levels_command_and_the_unroll_the_policys_action() {
+    let layout = layout(9);
+    let mut worker = Worker::new(vec![Counter::new(&[4])], WithLowLevel::default(), Arc::clone(&layout), 0.1, 0, 3);
+    worker.adopt(&directive(0, Behaviour::Policy)).unwrap();
+    let unrolls = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap();
+    let rows = Rows { layout: &layout, payload: &unrolls[0].payload };
+    for t in (0..9).filter(|t| rows.one(Field::Valid, *t) == 1.0) {
+        assert_eq!(rows.row(Field::Action, t), worker.forward.actions[t], "row {t}");
+        // The observation after a step names its command. The low level's state begins anew with each episode.
+        let (_, step) = rows.place(t);
+        assert_eq!(rows.one(Field::Task, t + 1), (step + 1) as f32 / 100.0, "row {t}");
+    }
+}
+
+#[test]
+fn one_by_one_every_environment_has_its_own_low_level_state() {
+    let lengths = [vec![3], vec![5]];
+    let counters = || lengths.iter().map(|lengths| Counter::new(lengths)).collect::<Vec<_>>();
+    let layout = layout(12);
+    let mut together = Worker::new(counters(), WithLowLevel::default(), Arc::clone(&layout), 0.1, 0, 3);
+    let alone = crate::forward_pass::OneByOne::new(WithLowLevel::default(), layout.shape());
+    let mut alone = Worker::new(counters(), alone, Arc::clone(&layout), 0.1, 0, 3);
+    together.adopt(&directive(0, Behaviour::Policy)).unwrap();
+    alone.adopt(&directive(0, Behaviour::Policy)).unwrap();
+    let payloads = |unrolls: Option<Vec<FinishedUnroll>>| {
+        unrolls.unwrap().into_iter().map(|unroll| unroll.payload).collect::<Vec<_>>()
+    };
+    let one = payloads(together.unroll(&|| false, &Progress::default()).unwrap());
+    assert_eq!(one, payloads(alone.unroll(&|| false, &Progress::default()).unwrap()));
+}
+
+#[test]
+fn a_demonstration_is_refused_where_a_low_level_acts() {
+    let mut worker = Worker::new(vec![Counter::new(&[4])], WithLowLevel::default(), layout(9), 0.1, 0, 3);
+    let refused = worker.adopt(&directive(1, Behaviour::Demonstration)).unwrap_err();
+    assert!(refused.to_string().contains("demonstration"), "{refused}");
+}

@@ -1,0 +1,34 @@
+//! The prior of the state: which latents are likely in a pose.
+
+use comic_experiment::{Network, PROPRIOCEPTION_SIZE};
+use tch::{Tensor, nn};
+
+use crate::gaussian::DiagonalGaussian;
+use crate::layers::{GaussianHead, GaussianHeadConfig, Torso};
+
+/// Least standard deviation of an entry of the latent (D).
+const MIN_STD: f64 = 1e-2;
+
+/// p(z | s), fitted to the latents of an encoder: normalised proprioception → torso → mean and σ of the latent. It begins near
+/// N(0, I).
+#[derive(Debug)]
+pub struct StatePrior {
+    torso: Torso,
+    head: GaussianHead,
+}
+
+impl StatePrior {
+    /// A prior for the latents of `network`, with its parameters in `path`. `hidden` has at least one layer.
+    pub fn new(path: &nn::Path, network: &Network, hidden: &[usize]) -> Self {
+        let torso = Torso::new(path, PROPRIOCEPTION_SIZE as i64, hidden);
+        let mean = vec![0.0; network.latent.size];
+        let start = GaussianHeadConfig { mean: &mean, initial_std: 1.0, min_std: MIN_STD, scale: 0.1 };
+        let head = GaussianHead::new(path, torso.output(), &start);
+        Self { torso, head }
+    }
+
+    /// The distribution of latents for normalised proprioception `[N, P]`.
+    pub fn forward(&self, proprioception: &Tensor) -> DiagonalGaussian {
+        self.head.forward(&self.torso.forward(proprioception))
+    }
+}
