@@ -5,8 +5,9 @@ use crate::document::Experiment;
 use crate::fault::{AT_LEAST_ONE, Fault, NOT_NEGATIVE, POSITIVE, ensure, not_negative, positive};
 use crate::network::{InitialPose, Network, Prior};
 use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
+use crate::svg0::Svg0;
 use crate::tasks::{TaskName, TerminationError, Vision};
-use crate::transfer::Transfer;
+use crate::transfer::{Transfer, TransferAlgorithm};
 
 /// The squared ratio of two float32 numbers overflows with a smaller deviation. The wire refuses a smaller one, too.
 const SMALLEST_STD: f64 = 1e-6;
@@ -24,6 +25,7 @@ pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
     experiment.clips.iter().enumerate().try_for_each(|(index, source)| clips(index, source))?;
     TaskName::ALL.into_iter().try_for_each(|task| experiment.parameters(task).check(task.section()))?;
     transfer(experiment)?;
+    svg0(experiment)?;
     network(&experiment.network)?;
     vmpo(&experiment.vmpo, &experiment.unroll)?;
     optimiser(&experiment.optimiser)?;
@@ -85,23 +87,53 @@ fn clips(index: usize, source: &ClipSource) -> Result<(), Fault> {
 /// Fields of a transfer, and fields that make no sense beside a frozen low level.
 fn transfer(experiment: &Experiment) -> Result<(), Fault> {
     let Experiment { transfer, network, vmpo, joint, .. } = experiment;
-    let Transfer { low_level: _, sha256, latent_limit, mean_scale, prior: _ } = transfer;
+    let Transfer { low_level: _, sha256, latent_limit, mean_scale, prior: _, algorithm: _ } = transfer;
     let holds = sha256.is_empty() || (sha256.len() == 64 && sha256.bytes().all(|byte| byte.is_ascii_hexdigit()));
     ensure("transfer.sha256", sha256, holds, "must be empty, or 64 hexadecimal digits")?;
     let in_range = |number: &f64| positive(*number) && *number <= LARGEST_LATENT;
     ensure("transfer.latent_limit", latent_limit, in_range(latent_limit), "must be positive, at most 1000")?;
     ensure("transfer.mean_scale", mean_scale, in_range(mean_scale), "must be positive, at most 1000")?;
-    if !transfer.is_on() {
+    if experiment.learns_low_level() {
         return Ok(());
     }
-    ensure("joint", joint.len(), joint.is_empty(), "must be empty with transfer.low_level")?;
+    ensure("joint", joint.len(), joint.is_empty(), "must be empty with transfer.low_level or SVG(0)")?;
     let pose = network.initial_pose;
-    let remedy = "must be \"mid-range\" with transfer.low_level: the policy's action is then a latent, and no pose";
+    let remedy = "must be \"mid-range\" with transfer.low_level or SVG(0)";
     ensure("network.initial_pose", pose, pose == InitialPose::MidRange, remedy)?;
-    let remedy = "must be 0 with transfer.low_level: the policy's action is then a latent";
+    let remedy = "must be 0 with transfer.low_level or SVG(0)";
     ensure("vmpo.action_gradient", vmpo.action_gradient, vmpo.action_gradient == 0.0, remedy)?;
     let steps = experiment.warm_start.steps;
     ensure("warm_start.steps", steps, steps == 0, remedy)
+}
+
+fn svg0(experiment: &Experiment) -> Result<(), Fault> {
+    let Svg0 { discount, learning_rate, target_period, lambda, action_samples, entropy, kl, .. } = &experiment.svg0;
+    ensure("svg0.discount", discount, (0.0..1.0).contains(discount), "must be in [0, 1)")?;
+    ensure("svg0.learning_rate", learning_rate, positive(*learning_rate), POSITIVE)?;
+    ensure("svg0.target_period", target_period, *target_period > 0, AT_LEAST_ONE)?;
+    ensure("svg0.lambda", lambda, (0.0..=1.0).contains(lambda), "must be in [0, 1]")?;
+    ensure("svg0.action_samples", action_samples, (1..=1024).contains(action_samples), "must be 1 to 1024")?;
+    ensure("svg0.entropy", entropy, not_negative(*entropy), NOT_NEGATIVE)?;
+    ensure("svg0.kl", kl, not_negative(*kl), NOT_NEGATIVE)?;
+    let Svg0 { minibatch_sequences, burn_in, encoder, core, policy, action_value, .. } = &experiment.svg0;
+    let sequences = *minibatch_sequences;
+    ensure("svg0.minibatch_sequences", sequences, (1..=65536).contains(&sequences), "must be 1 to 65536")?;
+    let length = experiment.unroll.length;
+    let uses = experiment.transfer.algorithm == TransferAlgorithm::Svg0;
+    ensure("svg0.burn_in", burn_in, !uses || *burn_in < length, "must be less than unroll.length")?;
+    let std = experiment.network.final_std;
+    ensure("network.final_std", std, !uses || std == 0.0, "must be 0 with transfer.algorithm = \"svg0\"")?;
+    for (field, sizes) in [("svg0.encoder", encoder), ("svg0.action_value", action_value)] {
+        let holds = !sizes.is_empty() && sizes.iter().all(|size| (1..=16384).contains(size)) && sizes.len() <= 64;
+        ensure(field, sizes, holds, "must be one or more layers of 1 to 16384 units")?;
+    }
+    for (field, units) in [("svg0.core", core), ("svg0.policy", policy)] {
+        ensure(field, units, (1..=16384).contains(units), "must be 1 to 16384 units")?;
+    }
+    let Svg0 { replay_steps, samples_per_insert, .. } = &experiment.svg0;
+    ensure("svg0.replay_steps", replay_steps, *replay_steps <= 1 << 32, "must be at most 4294967296")?;
+    let samples = *samples_per_insert;
+    ensure("svg0.samples_per_insert", samples, samples > 0.0 && samples <= 1e4, "must be positive, at most 10000")
 }
 
 fn network(network: &Network) -> Result<(), Fault> {

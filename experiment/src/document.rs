@@ -7,8 +7,9 @@ use crate::clips::ClipSource;
 use crate::for_each_task;
 use crate::network::Network;
 use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
+use crate::svg0::Svg0;
 use crate::tasks::{self, TaskName, TaskParameters};
-use crate::transfer::Transfer;
+use crate::transfer::{Transfer, TransferAlgorithm};
 
 macro_rules! document {
     ($($(#[$description:meta])* $task:ident, $section:ident, $name:literal;)*) => {
@@ -34,6 +35,8 @@ macro_rules! document {
             pub network: Network,
             /// Parameters of V-MPO.
             pub vmpo: Vmpo,
+            /// Parameters of SVG(0).
+            pub svg0: Svg0,
             /// Adam.
             pub optimiser: Optimiser,
             /// Unrolls and batches.
@@ -60,6 +63,7 @@ macro_rules! document {
                     transfer: Transfer::default(),
                     network: Network::default(),
                     vmpo: Vmpo::default(),
+                    svg0: Svg0::default(),
                     optimiser: Optimiser::default(),
                     unroll: Unroll::default(),
                     actor: Actor::default(),
@@ -106,18 +110,32 @@ impl Experiment {
         if self.transfer.is_on() { self.network.latent.size } else { ACTION_SIZE }
     }
 
+    /// Whether the policy has an encoder and a low level of its own, which it learns.
+    pub fn learns_low_level(&self) -> bool {
+        !self.transfer.is_on() && self.transfer.algorithm == TransferAlgorithm::Vmpo
+    }
+
     /// Length of the latent that the policy samples itself.
     pub fn latent_size(&self) -> usize {
-        if self.transfer.is_on() { 0 } else { self.network.latent.size }
+        if self.learns_low_level() { self.network.latent.size } else { 0 }
     }
 
     /// Gaussians in the distribution of the policy's action.
     pub fn components(&self) -> usize {
-        if self.transfer.is_on() { 1 } else { self.network.components() }
+        if self.learns_low_level() { self.network.components() } else { 1 }
     }
 
     /// Size of the policy's recurrent state. A frozen low level's state is not part of it.
     pub fn state_size(&self) -> usize {
-        if self.transfer.is_on() { 0 } else { self.network.state_size() }
+        match self.transfer.algorithm {
+            TransferAlgorithm::Svg0 => 2 * (self.svg0.core + self.svg0.policy),
+            TransferAlgorithm::Vmpo if self.transfer.is_on() => 0,
+            TransferAlgorithm::Vmpo => self.network.state_size(),
+        }
+    }
+
+    /// Size of the recurrent state of a frozen low level; 0 without one.
+    pub fn frozen_state_size(&self) -> usize {
+        if self.transfer.is_on() { self.network.state_size() } else { 0 }
     }
 }

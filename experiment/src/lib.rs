@@ -30,6 +30,7 @@ pub mod seed;
 mod settings;
 mod spec;
 pub mod statistics;
+mod svg0;
 mod tasks;
 mod transfer;
 mod vocabulary;
@@ -45,5 +46,6 @@ pub use network::{InitialPose, Latent, LowLevelName, Lstm, Mlp, Network, Primiti
 pub use resolve::resolve;
 pub use settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
 pub use spec::{TaskPart, TaskSpec};
+pub use svg0::Svg0;
 pub use tasks::*;
-pub use transfer::{Transfer, TransferPrior};
+pub use transfer::{Transfer, TransferAlgorithm, TransferPrior};

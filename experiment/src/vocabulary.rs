@@ -58,19 +58,26 @@ pub(crate) fn join(prefix: &str, key: &str) -> String {
     if prefix.is_empty() { key.to_string() } else { format!("{prefix}.{key}") }
 }
 
-/// Names the same field in another section, or else the nearest name in this section, or else all names of this section.
+/// Names the same field in other sections, or else the nearest name in this section, or else all names of this section.
 fn hint(prefix: &str, key: &str, known: &Table, everything: &Table) -> String {
-    let intended = elsewhere("", key, everything)
-        .or_else(|| nearest(key, known.keys().map(String::as_str)).map(|name| join(prefix, name)));
-    match intended {
-        Some(path) => format!("; did you mean `{path}`?"),
-        None => format!("; known here are {}", known.keys().cloned().collect::<Vec<_>>().join(", ")),
+    let mut intended = Vec::new();
+    elsewhere("", key, everything, &mut intended);
+    if intended.is_empty() {
+        intended.extend(nearest(key, known.keys().map(String::as_str)).map(|name| join(prefix, name)));
+    }
+    match &intended[..] {
+        [_, ..] => format!("; did you mean `{}`?", intended.join("` or `")),
+        [] => format!("; known here are {}", known.keys().cloned().collect::<Vec<_>>().join(", ")),
     }
 }
 
-fn elsewhere(prefix: &str, key: &str, table: &Table) -> Option<String> {
+fn elsewhere(prefix: &str, key: &str, table: &Table, found: &mut Vec<String>) {
     if table.contains_key(key) {
-        return Some(join(prefix, key));
+        found.push(join(prefix, key));
     }
-    table.iter().find_map(|(name, value)| elsewhere(&join(prefix, name), key, value.as_table()?))
+    for (name, value) in table {
+        if let Value::Table(section) = value {
+            elsewhere(&join(prefix, name), key, section, found);
+        }
+    }
 }

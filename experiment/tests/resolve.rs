@@ -193,7 +193,10 @@ fn an_unknown_field_of_a_clip_names_which_clip() {
 
 #[test]
 fn the_error_of_a_field_in_the_wrong_section_names_the_right_one() {
-    assert_eq!(refused_text("discount = 0.9"), "run.toml:1: unknown field `discount`; did you mean `vmpo.discount`?");
+    assert_eq!(
+        refused_text("discount = 0.9"),
+        "run.toml:1: unknown field `discount`; did you mean `svg0.discount` or `vmpo.discount`?"
+    );
     assert_eq!(
         refused_text("[vmpo]\nbeta = 0.1"),
         "run.toml:2: unknown field `vmpo.beta`; did you mean `network.latent.beta`?"

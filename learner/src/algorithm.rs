@@ -7,6 +7,7 @@
 //! - [`minibatch`]: unrolls as tensors, batch first, with the numbers of rows without a transition blanked. [`shape`] is
 //!   their sizes.
 //! - [`loss_report`]: what a gradient step reports, by name, read from the device once.
+//! - [`mod@masked_mean`]: the mean over rows with a transition. `stores` names the parameters of networks.
 //! - [`error`]: what an algorithm refuses.
 //!
 //! # A second algorithm
@@ -16,8 +17,10 @@
 
 pub mod error;
 pub mod loss_report;
+pub mod masked_mean;
 pub mod minibatch;
 pub mod shape;
+pub(crate) mod stores;
 
 use std::fmt::Debug;
 
@@ -44,6 +47,9 @@ pub trait Algorithm: Debug {
     /// # Errors
     /// As of [`step`](Self::step).
     fn regress(&mut self, minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error>;
+
+    /// Batches from one published version of the parameters to the next.
+    fn publish_period(&self) -> u64;
 
     /// Sets the statistics by which observations are normalised.
     ///

@@ -5,7 +5,8 @@
 //! - [`service`] is gRPC on tokio. [`publish`] encodes parameters for the actors. [`security`] is who may use the service.
 //! - [`train`] is the OS thread that owns the device: batches in, gradient steps, parameters out. [`device`] is where it
 //!   computes: CPU, CUDA or XLA.
-//! - [`algorithm`] is what the trainer needs of a learning algorithm. [`vmpo`] is V-MPO: its losses and its gradient step.
+//! - [`algorithm`] is what the trainer needs of a learning algorithm. [`vmpo`] is V-MPO, and [`svg0`] SVG(0): losses and gradient
+//!   step.
 //!   [`adam`] is its optimiser, and [`tensors`] reads and writes its state.
 //! - [`checkpoint`] is the run's checkpoint directory. No other module touches it.
 //! - [`observe`] is what people and Prometheus see of a run: metrics, telemetry and probes.
@@ -30,6 +31,7 @@ pub mod publish;
 pub mod run;
 pub mod security;
 pub mod service;
+pub mod svg0;
 pub mod tensors;
 pub mod train;
 pub mod vmpo;

@@ -14,9 +14,8 @@ mod learner;
 mod multipliers;
 mod report;
 mod returns;
-mod stores;
 
-pub use improvement::{Evidence, Improvement, KlLimits, masked_mean, policy_improvement};
+pub use improvement::{Evidence, Improvement, KlLimits, policy_improvement};
 pub use learner::VmpoLearner;
 pub use multipliers::{MULTIPLIER_FLOOR, Multipliers};
 pub use returns::returns;

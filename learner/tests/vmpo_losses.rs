@@ -2,7 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
-use comic_learner::vmpo::{Evidence, Improvement, KlLimits, Multipliers, masked_mean, policy_improvement};
+use comic_learner::algorithm::masked_mean::masked_mean;
+use comic_learner::vmpo::{Evidence, Improvement, KlLimits, Multipliers, policy_improvement};
 use comic_networks::DiagonalGaussian;
 use proptest::prelude::*;
 use tch::{Device, Kind, Tensor};

@@ -40,6 +40,7 @@ mod parameters;
 mod policy;
 mod prior;
 mod routing;
+mod svg0;
 mod value;
 
 pub use action::ActionDistribution;
@@ -53,4 +54,5 @@ pub use parameters::{from_safetensors, to_safetensors};
 pub use policy::{Acting, Policy};
 pub use prior::StatePrior;
 pub use routing::Routing;
+pub use svg0::{ActionValue, Core, LatentPolicy};
 pub use value::Value;

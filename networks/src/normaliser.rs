@@ -37,9 +37,24 @@ pub struct NormalisedObservation {
 impl NormalisedObservation {
     /// The first `steps` of observations `[B, T, ·]`: views `[B, steps, ·]`, no copy.
     pub fn first_steps(&self, steps: i64) -> Self {
+        self.steps(0, steps)
+    }
+
+    /// Observations `[B, T, ·]`; those of one step, `[B, ·]`, become `[B, 1, ·]`.
+    pub(crate) fn with_steps(&self) -> Self {
+        let stepped = |tensor: &Tensor| if tensor.dim() == 2 { tensor.unsqueeze(1) } else { tensor.shallow_clone() };
         Self {
-            proprioception: self.proprioception.narrow(1, 0, steps),
-            task: self.task.narrow(1, 0, steps),
+            proprioception: stepped(&self.proprioception),
+            task: stepped(&self.task),
+            routing: self.routing.shallow_clone(),
+        }
+    }
+
+    /// So many steps of observations `[B, T, ·]`, from the step `from` on: views, no copy.
+    pub fn steps(&self, from: i64, steps: i64) -> Self {
+        Self {
+            proprioception: self.proprioception.narrow(1, from, steps),
+            task: self.task.narrow(1, from, steps),
             routing: self.routing.shallow_clone(),
         }
     }

@@ -1,6 +1,6 @@
 //! The policy: normaliser, image encoder, and what decides: reference encoder and low level, or a transfer's high level.
 
-use comic_experiment::{Experiment, Network, TaskSpec, Transfer};
+use comic_experiment::{Experiment, Network, TaskSpec, Transfer, TransferAlgorithm};
 use tch::{Tensor, nn};
 
 use crate::action::ActionDistribution;
@@ -14,6 +14,7 @@ use crate::low_level::{self, LowLevel};
 use crate::lstm::RecurrentState;
 use crate::normaliser::{NormalisedObservation, Normaliser, NormaliserStatistics};
 use crate::routing::Routing;
+use crate::svg0::{Core, LatentPolicy};
 
 /// Largest standard deviation that a schedule can set, as the experiment's check has it.
 const LARGEST_STD: f64 = 1e3;
@@ -49,8 +50,10 @@ pub struct Policy {
 enum Decides {
     /// A latent, and from it the action.
     Skills { encoder: Encoder, low_level: Box<dyn LowLevel> },
-    /// In transfer: the action is the latent of a frozen low level.
+    /// In transfer with V-MPO: the action is the latent of a frozen low level.
     Latents(HighLevel),
+    /// With SVG(0).
+    Recurrent { core: Core, policy: LatentPolicy },
 }
 
 impl Policy {
@@ -61,10 +64,26 @@ impl Policy {
     /// [`Error::Length`] if `pose` is not an action of this task.
     pub fn of(store: &nn::Path, spec: &TaskSpec, experiment: &Experiment, pose: &[f32]) -> Result<Self, Error> {
         let Experiment { network, transfer, .. } = experiment;
-        if transfer.is_on() {
-            Ok(Self::of_transfer(store, spec, network, transfer))
-        } else {
-            Self::new(store, spec, network, pose)
+        match transfer.algorithm {
+            TransferAlgorithm::Svg0 => Ok(Self::of_svg0(store, spec, experiment)),
+            TransferAlgorithm::Vmpo if transfer.is_on() => Ok(Self::of_transfer(store, spec, network, transfer)),
+            TransferAlgorithm::Vmpo => Self::new(store, spec, network, pose),
+        }
+    }
+
+    fn of_svg0(store: &nn::Path, spec: &TaskSpec, experiment: &Experiment) -> Self {
+        let Experiment { network, svg0, transfer, .. } = experiment;
+        let (image_encoder, image_features) = encode_images(store, spec, network);
+        let core = Core::new(&(store / "core"), spec, image_features, svg0);
+        let policy = LatentPolicy::new(&(store / "latent_policy"), spec, network, svg0, transfer);
+        Self::assemble(store, "latent_policy", spec, network, image_encoder, Decides::Recurrent { core, policy })
+    }
+
+    /// Core and policy of SVG(0); `None` for any other policy.
+    pub fn recurrent(&self) -> Option<(&Core, &LatentPolicy)> {
+        match &self.decides {
+            Decides::Recurrent { core, policy } => Some((core, policy)),
+            Decides::Skills { .. } | Decides::Latents(_) => None,
         }
     }
 
@@ -154,6 +173,7 @@ impl Policy {
                 latent_posterior: None,
                 state: recurrent.state.shallow_clone(),
             },
+            Decides::Recurrent { core, policy } => act_recurrently(core, policy, observation, latent_noise, recurrent),
         };
         match &self.scheduled_std {
             Some(std) => {
@@ -192,4 +212,25 @@ fn encode_images(store: &nn::Path, spec: &TaskSpec, config: &Network) -> (Option
     let encoder = ImageEncoder::new(&(store / "image_encoder"), config.image_features as i64);
     let features = encoder.output();
     (Some(encoder), features)
+}
+
+/// One step of every environment, or all steps of unrolls; the state is the core's, followed by the policy's.
+fn act_recurrently(
+    core: &Core,
+    policy: &LatentPolicy,
+    observation: &NormalisedObservation,
+    latent_noise: &Tensor,
+    recurrent: RecurrentState<'_>,
+) -> Acting {
+    let own = core.state_size();
+    let states = [recurrent.state.narrow(1, 0, own), recurrent.state.narrow(1, own, policy.state_size())];
+    let of = |state| RecurrentState { state, first: recurrent.first };
+    let (features, core_state) = core.forward(&observation.with_steps(), of(&states[0]));
+    let (action, policy_state) = policy.forward(&features, of(&states[1]));
+    Acting {
+        latent: rows(latent_noise),
+        action: ActionDistribution::Gaussian(action),
+        latent_posterior: None,
+        state: Tensor::cat(&[core_state, policy_state], 1),
+    }
 }

@@ -7,6 +7,7 @@
 //! - [`Ledger`] has the account of every actor (its next sequence number) and the sums.
 //! - [`Accounting`] has the sums, [`TaskAccounting`] those of one task. [`LedgerSnapshot`] is the ledger in a
 //!   checkpoint.
+//! - [`Store`] is the replay of off-policy learning: the trainer inserts batches, and samples sequences.
 //!
 //! # The rules
 //! An actor process is an *incarnation*: a random number that it draws once. Joining opens an account, `(actor index,
@@ -51,6 +52,7 @@ mod config;
 mod ledger;
 mod phase;
 mod snapshot;
+mod store;
 mod streaming;
 mod tasks;
 
@@ -61,3 +63,4 @@ pub use config::{BatchOrder, Config};
 pub use ledger::{JoinError, Joined, Ledger};
 pub use phase::Phase;
 pub use snapshot::{Account, Error, LedgerSnapshot};
+pub use store::{Sample, Store, StoreError};

@@ -206,3 +206,53 @@ async fn a_prior_is_fitted_to_latents_and_a_policy_deviates_from_it() -> Result<
     normalised_reward(&deviates.run())?;
     Ok(())
 }
+
+/// Fields of SVG(0) with small networks, which learns from the second batch on.
+const SVG0: [&str; 10] = [
+    "transfer.algorithm=svg0",
+    "network.final_std=0",
+    "svg0.encoder=[16]",
+    "svg0.core=12",
+    "svg0.policy=10",
+    "svg0.action_value=[16]",
+    "svg0.burn_in=2",
+    "svg0.minibatch_sequences=8",
+    "svg0.begin_at=128",
+    "svg0.samples_per_insert=4",
+];
+
+/// The learner's part of the newest checkpoint.
+fn learned(system: &System, updates: u64) -> Result<Vec<u8>> {
+    let checkpoint = system.run().join(format!("checkpoints/checkpoint-{updates:010}"));
+    Ok(fs::read(checkpoint.join("learner.safetensors"))?)
+}
+
+#[tokio::test]
+async fn svg0_learns_from_its_replay_and_in_lockstep_the_seed_decides_every_parameter() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let file =
+        low_level(directory.path(), "low_level.safetensors", &["network.low_level=lstm", "network.lstm.units=[12, 8]"])
+            .await?;
+    let fields = [&SVG0[..], &["budget.updates=4"]].concat();
+    let mut one = transfer(&file, &fields)?;
+    train(&mut one).await?;
+    let mut other = transfer(&file, &fields)?;
+    train(&mut other).await?;
+    ensure!(learned(&one, 4)? == learned(&other, 4)?, "the same seed gave other parameters");
+    let metrics = fs::read_to_string(one.run().join("metrics.jsonl"))?;
+    ensure!(metrics.contains("retrace_target"), "no gradient step: {metrics}");
+
+    let policy = directory.path().join("policy.safetensors");
+    export(&one.run(), "policy", &policy)?;
+    let (from_file, from_run) = (normalised_reward(&policy)?, normalised_reward(&one.run())?);
+    ensure!(from_file == from_run && from_file["episodes"] == 2, "{from_file} and {from_run}");
+    export(&one.run(), "policy", &directory.path().join("policy.pt"))
+}
+
+#[tokio::test]
+async fn svg0_also_learns_without_a_low_level() -> Result<()> {
+    let plain = ["task=go-to-target", "vmpo.action_gradient=0", "network.initial_pose=mid-range", "warm_start.steps=0"];
+    let mut scratch = short(&[&plain[..], &SVG0, &["transfer.mean_scale=1", "budget.updates=3"]].concat())?;
+    train(&mut scratch).await?;
+    normalised_reward(&scratch.run()).map(drop)
+}

@@ -1,7 +1,7 @@
 //! What changes in training and decides its future: what a checkpoint holds and restores.
 
 use bytes::Bytes;
-use comic_experiment::{Experiment, TaskSpec};
+use comic_experiment::{Experiment, TaskSpec, TransferAlgorithm};
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
 use tch::Device;
@@ -10,6 +10,7 @@ use crate::algorithm::Algorithm;
 use crate::checkpoint::progress::{PROGRESS, Progress};
 use crate::checkpoint::snapshot::{self, Snapshot};
 use crate::error::{Error, Result};
+use crate::svg0::Svg0Learner;
 use crate::tensors;
 use crate::train::statistics::ObservationStatistics;
 use crate::vmpo::VmpoLearner;
@@ -43,7 +44,10 @@ impl State {
         epoch: u64,
     ) -> Result<Self> {
         tch::manual_seed(experiment.seed as i64);
-        let algorithm = Box::new(VmpoLearner::new(spec, experiment, pose, device)?);
+        let algorithm: Box<dyn Algorithm> = match experiment.transfer.algorithm {
+            TransferAlgorithm::Vmpo => Box::new(VmpoLearner::new(spec, experiment, pose, device)?),
+            TransferAlgorithm::Svg0 => Box::new(Svg0Learner::new(spec, experiment, device)?),
+        };
         let progress = Progress {
             run: Some(run),
             epoch,

@@ -7,7 +7,6 @@ use comic_proto::v1::Behaviour;
 use comic_replay::{Batch, Batcher, Next, Reason};
 
 use crate::algorithm::loss_report::{LossValues, Losses};
-use crate::algorithm::minibatch::MinibatchTensors;
 use crate::checkpoint::{Name, Snapshot, incompatible};
 use crate::device::Backend;
 use crate::error::{Error, Result};
@@ -15,7 +14,7 @@ use crate::service::TrainerHandle;
 use crate::service::memory::{Bounds, Sizes};
 use crate::train::budget::BudgetClock;
 use crate::train::checkpoints::Checkpoints;
-use crate::train::minibatches::{draw, to_device};
+use crate::train::experience::{Experience, experience};
 use crate::train::reports::Reports;
 use crate::train::setup::{Ending, Setup};
 use crate::train::skipped_steps::{REMEDIES, Recovery, SkippedSteps};
@@ -36,6 +35,7 @@ pub struct Trainer {
     backend: Backend,
     batcher: Batcher,
     state: State,
+    experience: Box<dyn Experience>,
     skipped_steps: SkippedSteps,
     budget: BudgetClock,
     versions: Versions,
@@ -58,7 +58,9 @@ impl Trainer {
         }
         let mut reports = Reports::open(&run, &spec, &experiment.learner, service.clone())?;
         reports.begin(&state.progress, batcher.accounting_by_task());
+        let experience = experience(&experiment, batcher.layout(), spec.tasks.len(), backend.device())?;
         let mut trainer = Self {
+            experience,
             skipped_steps: SkippedSteps::new(experiment.learner.restore_after),
             budget: BudgetClock::new(experiment.budget.clone(), state.progress.seconds),
             versions: Versions::new(batcher.clone(), publisher, experiment.unroll.lockstep),
@@ -121,13 +123,11 @@ impl Trainer {
     fn learn(&mut self, batch: Batch) -> Result<()> {
         let began = Instant::now();
         let _update = tracing::debug_span!("update", update = self.state.progress.updates + 1).entered();
-        let tensors = tracing::debug_span!("to_device")
-            .in_scope(|| to_device(&batch, self.spec.tasks.len(), self.backend.device()))?;
         if self.normalise_by(&batch)? {
             return self.skip_batch(batch);
         }
-        let losses = self.take_gradient_steps(tensors)?;
-        let publishes = (self.state.progress.updates + 1).is_multiple_of(self.experiment.vmpo.target_period);
+        let losses = self.take_gradient_steps(&batch)?;
+        let publishes = (self.state.progress.updates + 1).is_multiple_of(self.state.algorithm.publish_period());
         let restored = self.report_when_ready(losses, publishes || self.checkpoints.is_due())?;
         let version = self.state.progress.version;
         self.state.progress.updates += 1;
@@ -166,11 +166,12 @@ impl Trainer {
     }
 
     /// The gradient steps on a batch, and the mean of their losses.
-    fn take_gradient_steps(&mut self, tensors: MinibatchTensors) -> Result<Option<Losses>> {
+    fn take_gradient_steps(&mut self, batch: &Batch) -> Result<Option<Losses>> {
         self.state.algorithm.set_progress(self.budget.used(&self.state.progress));
         let mut losses = Vec::new();
-        for unrolls in draw(&self.experiment, &mut self.state.progress.random) {
-            let minibatch = tensors.select(&unrolls);
+        let random = &mut self.state.progress.random;
+        for step in 0..self.experience.take(batch, random)? {
+            let minibatch = self.experience.minibatch(step, random)?;
             if !losses.is_empty() {
                 self.backend.end_step()?;
             }
@@ -178,7 +179,7 @@ impl Trainer {
             losses.push(step?);
         }
         let losses = Losses::mean(&losses);
-        drop(tensors);
+        self.experience.release();
         self.backend.end_step()?;
         Ok(losses)
     }

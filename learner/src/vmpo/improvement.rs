@@ -3,6 +3,7 @@
 use comic_experiment::Vmpo;
 use tch::{Kind, Tensor};
 
+use crate::algorithm::masked_mean::masked_mean;
 use crate::vmpo::multipliers::Multipliers;
 
 /// The inputs of the losses: one number a step, every tensor of the same shape.
@@ -168,9 +169,4 @@ fn top(advantage: &Tensor, mask: &Tensor, fraction: f64) -> Tensor {
 
 fn constraint(kl: &Tensor, alpha: &Tensor, epsilon: f64) -> Tensor {
     alpha * (epsilon - kl.detach()) + alpha.detach() * kl
-}
-
-/// The mean of `values` over the steps where `valid` is 1; 0 where there is none.
-pub fn masked_mean(values: &Tensor, valid: &Tensor) -> Tensor {
-    values.where_scalarother(&valid.gt(0.5), 0.0).sum(Kind::Float) / valid.sum(Kind::Float).clamp_min(1.0)
 }

@@ -9,13 +9,14 @@ use crate::adam::{self, Adam};
 use crate::algorithm::Algorithm;
 use crate::algorithm::error::Error;
 use crate::algorithm::loss_report::Losses;
+use crate::algorithm::masked_mean::masked_mean;
 use crate::algorithm::minibatch::MinibatchTensors;
 use crate::algorithm::shape::MinibatchShape;
-use crate::vmpo::improvement::{Evidence, KlLimits, masked_mean, policy_improvement};
+use crate::algorithm::stores::{named, trainable};
+use crate::vmpo::improvement::{Evidence, KlLimits, policy_improvement};
 use crate::vmpo::multipliers::Multipliers;
 use crate::vmpo::report::{Descent, Pass, Terms, report};
 use crate::vmpo::returns::returns;
-use crate::vmpo::stores::{named, trainable};
 
 /// The online networks, the multipliers and Adam.
 ///
@@ -299,6 +300,10 @@ impl Algorithm for VmpoLearner {
             &self.multipliers,
         );
         Ok((losses, latents))
+    }
+
+    fn publish_period(&self) -> u64 {
+        self.experiment.vmpo.target_period
     }
 
     fn set_normaliser(&mut self, statistics: &NormaliserStatistics) -> Result<(), Error> {

@@ -4,7 +4,8 @@ use comic_networks::{Acting, ActionDistribution};
 use tch::{Kind, Tensor};
 
 use crate::algorithm::loss_report::Losses;
-use crate::vmpo::improvement::{Improvement, masked_mean};
+use crate::algorithm::masked_mean::masked_mean;
+use crate::vmpo::improvement::Improvement;
 use crate::vmpo::multipliers::Multipliers;
 
 /// One forward pass over a minibatch; N = B·T rows.

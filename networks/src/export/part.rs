@@ -49,7 +49,7 @@ impl Part {
     /// # Errors
     /// [`Error::NoTask`] if the experiment has no such task.
     pub(crate) fn of(self, experiment: &Experiment) -> Result<Experiment, Error> {
-        if experiment.transfer.is_on() && !matches!(self, Self::Policy(_)) {
+        if !experiment.learns_low_level() && !matches!(self, Self::Policy(_)) {
             return Err(Error::Transfer { part: self.to_string() });
         }
         let Some(task) = self.task() else { return Ok(experiment.clone()) };

@@ -36,14 +36,15 @@ impl Exported {
         // A tensor that requires a gradient cannot be a constant of a trace.
         store.freeze();
         let frozen = self.frozen_low_level()?;
-        let (latent, state) = (self.experiment.latent_size() as i64, self.experiment.network.state_size() as i64);
+        let own = &self.experiment;
+        let memory = [own.latent_size(), own.state_size(), own.frozen_state_size()].map(|size| size as i64);
         let row = |size: i64, kind| Tensor::zeros([1, size], (kind, store.device()));
-        let widths = [sizes.proprioception as i64, sizes.task as i64, latent + state];
+        let widths = [sizes.proprioception as i64, sizes.task as i64, memory.iter().sum()];
         let mut inputs: Vec<Tensor> = widths.into_iter().map(|width| row(width, Kind::Float)).collect();
         if sizes.image > 0 {
             inputs.push(row(sizes.image as i64, Kind::Uint8));
         }
-        let mut forward = |inputs: &[Tensor]| vec![step(&policy, frozen.as_ref(), inputs, latent)];
+        let mut forward = |inputs: &[Tensor]| vec![step(&policy, frozen.as_ref(), inputs, memory)];
         let module = tch::no_grad(|| CModule::create_by_tracing("Policy", "forward", &inputs, &mut forward))?;
         module.save(path)?;
         self.enclose(path).map_err(Error::File)
@@ -63,16 +64,19 @@ impl Exported {
     }
 }
 
-/// One step without noise: the action within its bounds, the latent, and the state.
-fn step(policy: &Policy, frozen: Option<&FrozenLowLevel>, inputs: &[Tensor], latent: i64) -> Tensor {
+/// One step without noise: the action within its bounds, the latent, and the states. `memory` has the sizes of the latent, of
+/// the policy's state and of a frozen low level's.
+fn step(policy: &Policy, frozen: Option<&FrozenLowLevel>, inputs: &[Tensor], memory: [i64; 3]) -> Tensor {
     let observation = policy.normalise(&inputs[0], &inputs[1], inputs.get(3), &Routing::single());
+    let [latent, state, low_level] = memory;
     let previous = inputs[2].narrow(1, 0, latent);
-    let state = inputs[2].narrow(1, latent, inputs[2].size()[1] - latent);
+    let [state, low_level] =
+        [(latent, state), (latent + state, low_level)].map(|(start, size)| inputs[2].narrow(1, start, size));
     let acting =
         policy.act(&observation, &previous, &previous.zeros_like(), RecurrentState { state: &state, first: None });
-    let (action, state) = match frozen {
-        Some(frozen) => frozen.act(&acting.action.mode(), &inputs[0], &state),
-        None => (acting.action.mode(), acting.state),
+    let (action, low_level) = match frozen {
+        Some(frozen) => frozen.act(&acting.action.mode(), &inputs[0], &low_level),
+        None => (acting.action.mode(), low_level),
     };
-    Tensor::cat(&[action.clamp(-1.0, 1.0), acting.latent, state], 1)
+    Tensor::cat(&[action.clamp(-1.0, 1.0), acting.latent, acting.state, low_level], 1)
 }

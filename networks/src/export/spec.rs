@@ -178,9 +178,13 @@ fn observations(experiment: &Experiment, sizes: &TaskSpec) -> Result<Vec<Vector>
 }
 
 fn policy(experiment: &Experiment, sizes: &TaskSpec) -> Result<(Vec<Vector>, Vec<Vector>), Error> {
-    let network = &experiment.network;
     let recurrent = || {
-        let entries = [("latent", experiment.latent_size()), ("state", network.state_size())];
+        let entries = [
+            ("latent", experiment.latent_size()),
+            ("state", experiment.state_size()),
+            ("low_level_state", experiment.frozen_state_size()),
+        ];
+        let entries = entries.into_iter().filter(|(name, size)| *name != "low_level_state" || *size > 0);
         let entries = entries.map(|(name, size)| (name.to_string(), size));
         Vector::of("recurrent_state", entries, "output of the previous step; zeros at the first step of an episode")
     };

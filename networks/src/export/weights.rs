@@ -1,6 +1,6 @@
 //! The number of weights of an experiment's networks, without building them.
 
-use comic_experiment::{Experiment, Network, TaskSpec};
+use comic_experiment::{Experiment, Network, TaskSpec, TransferAlgorithm};
 
 use super::part::Part;
 use crate::low_level::{Layer, Sizes, low_level_layers};
@@ -9,9 +9,11 @@ use crate::low_level::{Layer, Sizes, low_level_layers};
 /// file, so that a small file cannot describe networks that need huge memory. `prior` has the hidden sizes of a prior. A
 /// transfer's frozen low level is a file of its own inside, which is counted when that file is read.
 pub(super) fn count(part: Part, prior: &[usize], spec: &TaskSpec, experiment: &Experiment) -> u64 {
-    let (network, transfer) = (&experiment.network, experiment.transfer.is_on());
-    if transfer {
-        return high_level(spec, network);
+    let network = &experiment.network;
+    match experiment.transfer.algorithm {
+        TransferAlgorithm::Svg0 => return recurrent(spec, experiment),
+        TransferAlgorithm::Vmpo if experiment.transfer.is_on() => return high_level(spec, network),
+        TransferAlgorithm::Vmpo => {}
     }
     let encoders = || spec.tasks.iter().map(|task| encoder(spec, task.observation, network)).sum();
     match part {
@@ -24,7 +26,8 @@ pub(super) fn count(part: Part, prior: &[usize], spec: &TaskSpec, experiment: &E
 /// Whether [`count`] counts a tensor of this name and shape.
 pub(super) fn is_counted(name: &str, shape: &[usize]) -> bool {
     let matrix = shape.len() > 1 && !name.ends_with("biases");
-    matrix && ["encoder.", "low_level.", "high_level.", "prior."].iter().any(|part| name.starts_with(part))
+    let parts = ["encoder.", "low_level.", "high_level.", "prior.", "core.", "latent_policy."];
+    matrix && parts.iter().any(|part| name.starts_with(part))
 }
 
 /// The number of weights of hidden layers, and the width of the last layer.
@@ -46,6 +49,19 @@ fn high_level(spec: &TaskSpec, network: &Network) -> u64 {
     let image_features = if spec.image > 0 { network.image_features } else { 0 };
     let (weights, width) = hidden((spec.proprioception + spec.task + image_features) as u64, &network.encoder);
     weights + width * 2 * spec.action as u64
+}
+
+/// Core and policy of SVG(0).
+fn recurrent(spec: &TaskSpec, experiment: &Experiment) -> u64 {
+    let (svg0, network) = (&experiment.svg0, &experiment.network);
+    let image_features = if spec.image > 0 { network.image_features as u64 } else { 0 };
+    let (mut weights, mut width) = (0, image_features);
+    for input in [spec.proprioception, spec.task].into_iter().filter(|input| *input > 0) {
+        let (own, output) = hidden(input as u64, &svg0.encoder);
+        (weights, width) = (weights + own, width + output);
+    }
+    let lstm = |input: u64, units: usize| 4 * units as u64 * (input + units as u64);
+    weights + lstm(width, svg0.core) + lstm(svg0.core as u64, svg0.policy) + svg0.policy as u64 * 2 * spec.action as u64
 }
 
 /// `prior` is empty if there is none.

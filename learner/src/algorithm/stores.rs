@@ -3,7 +3,7 @@
 use tch::{Tensor, nn};
 
 /// The parameters of `store`, trained or not, as `prefix.name`, sorted by name.
-pub(super) fn named(prefix: &str, store: &nn::VarStore) -> Vec<(String, Tensor)> {
+pub(crate) fn named(prefix: &str, store: &nn::VarStore) -> Vec<(String, Tensor)> {
     let mut variables: Vec<(String, Tensor)> =
         store.variables().into_iter().map(|(name, tensor)| (format!("{prefix}.{name}"), tensor)).collect();
     variables.sort_by(|a, b| a.0.cmp(&b.0));
@@ -11,6 +11,6 @@ pub(super) fn named(prefix: &str, store: &nn::VarStore) -> Vec<(String, Tensor)>
 }
 
 /// The trained parameters among [`named`].
-pub(super) fn trainable(prefix: &str, store: &nn::VarStore) -> Vec<(String, Tensor)> {
+pub(crate) fn trainable(prefix: &str, store: &nn::VarStore) -> Vec<(String, Tensor)> {
     named(prefix, store).into_iter().filter(|(_, tensor)| tensor.requires_grad()).collect()
 }
