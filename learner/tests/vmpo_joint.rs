@@ -250,3 +250,33 @@ fn a_batch_of_other_tasks_is_refused() {
     let error = learner.step(&unrolls.minibatch()).unwrap_err().to_string();
     assert!(error.contains("tasks: 3"), "{error}");
 }
+
+#[test]
+fn the_simulators_derivative_is_divided_by_the_temperature_of_its_own_task() {
+    let mut experiment = vmpo_support::experiment();
+    experiment.vmpo.action_gradient = 1.0;
+    let mut base = unrolls(&learner(&experiment), &experiment, 8);
+    base.action_gradient = vec![0.0; base.action.len()];
+    let mut getting_up = base.clone();
+    let width = base.action.len() / (COUNT * LENGTH);
+    for (row, derivative) in getting_up.action_gradient.chunks_exact_mut(width).enumerate() {
+        derivative.fill(if TASKS[row / LENGTH] == 1 { 1.0 } else { 0.0 });
+    }
+    // What the derivative of getting up adds to the loss.
+    let added = |temperatures: [f32; 2]| {
+        let total = |unrolls: &Unrolls| {
+            let mut learner = learner(&experiment);
+            let mut state = learner.state();
+            let (_, multipliers) = state.iter_mut().find(|(name, _)| name == "multipliers").unwrap();
+            for (task, temperature) in temperatures.into_iter().enumerate() {
+                let _ = multipliers.get(task as i64).fill_(f64::from(temperature));
+            }
+            learner.load_state(&state).unwrap();
+            learner.step(&unrolls.minibatch()).unwrap().to_values().get("total_loss").unwrap()
+        };
+        total(&getting_up) - total(&base)
+    };
+    let (even, other, own) = (added([1.0, 1.0]), added([2.0, 1.0]), added([1.0, 2.0]));
+    assert!(even.abs() > 1e-3, "{even}");
+    assert!((other - even).abs() < 1e-5 && (2.0 * own - even).abs() < 1e-5, "{even} {other} {own}");
+}

@@ -1,6 +1,6 @@
 //! Networks, multipliers and optimiser, stepped together.
 
-use comic_experiment::{Experiment, Prior, TaskName, TaskSpec};
+use comic_experiment::{Experiment, Prior, TaskSpec};
 use comic_networks::{ActionDistribution, NormaliserStatistics, Policy, RecurrentState, Value, to_safetensors};
 use comic_proto::{Field, UnrollShape};
 use tch::{Device, Kind, Tensor, nn};
@@ -187,6 +187,14 @@ impl VmpoLearner {
         }
     }
 
+    /// η of each row: that of its task. The groups are those of [`groups`](Self::groups).
+    fn temperature_of_rows(&self, groups: &[Tensor]) -> Tensor {
+        let temperatures = self.multipliers.temperatures().detach();
+        let of_group =
+            |(index, group): (usize, &Tensor)| group.to_kind(Kind::Float) * temperatures.select(0, index as i64);
+        groups.iter().enumerate().map(of_group).sum()
+    }
+
     /// `valid` without the rows that only warm up a recurrent value function.
     fn learnt_from(&self, valid: &Tensor) -> Tensor {
         let burnt = self.experiment.vmpo.value_burn_in as i64;
@@ -251,14 +259,11 @@ impl Algorithm for VmpoLearner {
         let mut total =
             improvement.total() + &pass.value_loss * vmpo.value_weight + &pass.latent_kl * network.latent.beta;
         if vmpo.action_gradient != 0.0 {
-            // Divided by η, as the advantages are: L_π is about the reward divided by η. Only tracking has a derivative.
-            let temperatures = self.multipliers.temperatures().detach();
-            let tracking = self.spec.tasks.iter().position(|task| task.name == TaskName::Tracking.name());
-            let own = tracking.unwrap_or(0).min(temperatures.numel().saturating_sub(1));
-            let eta = temperatures.select(0, own as i64);
-            let gain =
-                (rows(&minibatch[Field::ActionGradient]) * policy.mean()).sum_dim_intlist(-1i64, false, Kind::Float);
-            total = &total - masked_mean(&gain, &pass.valid) / eta * vmpo.action_gradient;
+            let derivative = rows(&minibatch[Field::ActionGradient]);
+            let gain = (derivative * policy.mean()).sum_dim_intlist(-1i64, false, Kind::Float);
+            // Divided by η, as the advantages are: L_π is about the reward divided by η.
+            let gain = gain / self.temperature_of_rows(&pass.groups);
+            total = &total - masked_mean(&gain, &pass.valid) * vmpo.action_gradient;
         }
         if vmpo.entropy != 0.0 {
             // A new tensor: an in-place sum would write over what the graph holds.
