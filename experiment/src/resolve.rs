@@ -19,14 +19,20 @@ use crate::vocabulary::{Unknown, refuse_unknown};
 /// [`Error`], naming file, line and field.
 pub fn resolve(document: &str, overrides: &[String]) -> Result<Experiment, Error> {
     let (origin, text) = read(document)?;
-    let mut experiment = decode(&origin, &text)?;
-    for argument in overrides {
-        experiment = apply_override(&experiment, argument)?;
-    }
+    overridden(decode(&origin, &text)?, overrides, |field| at(&origin, &text, field))
+}
+
+/// Applies and checks overrides. `origin` says where a field stands that none of them names.
+fn overridden(
+    experiment: Experiment,
+    overrides: &[String],
+    origin: impl Fn(&str) -> String,
+) -> Result<Experiment, Error> {
+    let apply = |experiment: Experiment, argument: &String| apply_override(&experiment, argument);
+    let experiment = overrides.iter().try_fold(experiment, apply)?;
     check(&experiment).map_err(|fault| {
-        let overridden = overrides.iter().rev().find(|argument| names(argument, &fault.field));
-        let origin =
-            overridden.map_or_else(|| at(&origin, &text, &fault.field), |argument| format!("--set {argument}"));
+        let argument = overrides.iter().rev().find(|argument| names(argument, &fault.field));
+        let origin = argument.map_or_else(|| origin(&fault.field), |argument| format!("--set {argument}"));
         Error::Value { origin, field: fault.field, value: fault.value, remedy: fault.remedy }
     })?;
     Ok(experiment)
@@ -41,6 +47,14 @@ impl Experiment {
             self.clips = sources.iter().map(|source| ClipSource::parse(source)).collect();
         }
         self
+    }
+
+    /// The experiment with overrides, as [`resolve`] applies them.
+    ///
+    /// # Errors
+    /// [`Error`], naming the override and the field.
+    pub fn with_overrides(self, overrides: &[String]) -> Result<Self, Error> {
+        overridden(self, overrides, |_| "the checkpoint's experiment".into())
     }
 
     /// Reads a resolved document, for instance one from the wire. Errors call it `origin`.

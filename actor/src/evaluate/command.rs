@@ -57,8 +57,9 @@ pub struct Evaluate {
     /// The experiment to evaluate without a checkpoint: a preset's name or a TOML file.
     #[arg(long, value_name = "NAME|FILE", conflicts_with = "checkpoint")]
     preset: Option<String>,
-    /// Overrides a field of the preset, for instance `--set tracking.termination_threshold=0.5`.
-    #[arg(long, value_name = "FIELD=VALUE", requires = "preset")]
+    /// Overrides a field of the preset's or the checkpoint's experiment, for instance
+    /// `--set tracking.termination_threshold=0.5` or `--set get_up.lying_share=1`.
+    #[arg(long, value_name = "FIELD=VALUE", conflicts_with_all = ["watch", "learner"])]
     set: Vec<String>,
     /// The policy with its initial parameters.
     #[arg(long)]
@@ -211,6 +212,7 @@ impl Evaluate {
             let found = checkpoint::read(path)?;
             tracing::info!(checkpoint = %found.path.display(), "evaluating");
             let Checkpoint { experiment, policy, low_level, position, .. } = found;
+            let experiment = experiment.with_overrides(&self.set)?;
             return Ok(Subject { experiment, parameters: Some(policy), low_level, position });
         }
         let preset = self.preset.as_deref().unwrap_or_default();
