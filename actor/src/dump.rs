@@ -350,8 +350,8 @@ impl Environment for Watched {
         self.environment.episode()
     }
 
-    fn record_gradients(&mut self) {
-        self.environment.record_gradients();
+    fn record_gradients(&mut self) -> Result<(), comic_tasks::Error> {
+        self.environment.record_gradients()
     }
 
     fn take_gradients(&mut self) -> Vec<[f32; 56]> {

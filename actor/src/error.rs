@@ -86,6 +86,14 @@ pub enum Error {
         /// What was wrong.
         reason: String,
     },
+    /// An environment gave a number of derivatives that its unroll has no place for.
+    #[error("an unroll with {transitions} transitions got {derivatives} derivatives; please report this defect")]
+    Derivatives {
+        /// Steps of the environment in the unroll.
+        transitions: usize,
+        /// Derivatives of the environment.
+        derivatives: usize,
+    },
     /// A file or directory.
     #[error("cannot use {}", path.display())]
     File {

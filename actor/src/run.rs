@@ -178,7 +178,7 @@ fn build(
             Pace::Lockstep => Box::new(OneByOne::new(policy, joined.layout.shape())),
         };
         let noise = experiment.warm_start.noise as f32;
-        workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), noise, first, joined.seed));
+        workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), noise, first, joined.seed)?);
     }
     Ok((workers, parameters))
 }

@@ -90,6 +90,9 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     ///
     /// `demonstration_noise` is the standard deviation around the servo action in demonstrations. The environments are
     /// numbered from `first` on. `seed` and its number decide the noise of an environment's latents and actions.
+    ///
+    /// # Errors
+    /// The unrolls have a place for derivatives, and an environment's body has none.
     pub fn new(
         environments: Vec<E>,
         forward: F,
@@ -97,18 +100,18 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         demonstration_noise: f32,
         first: u32,
         seed: u64,
-    ) -> Self {
+    ) -> Result<Self, Error> {
         let (length, records) = (layout.shape().length, layout.shape().action_gradient > 0);
         let mut acting = ActingLoop::new(environments, layout.shape(), forward.low_level());
         let recorder = UnrollRecorder::new(layout, (first..).take(acting.rollouts.len()), seed);
         for (index, rollout) in acting.rollouts.iter_mut().enumerate() {
             if records {
-                rollout.environment.record_gradients();
+                rollout.environment.record_gradients()?;
             }
             rollout.environment.reset();
             rollout.begin_episode(&mut acting.batch.row(index));
         }
-        Self { acting, recorder, forward, length, first, demonstration_noise, directive: None }
+        Ok(Self { acting, recorder, forward, length, first, demonstration_noise, directive: None })
     }
 
     /// Acts by the newest directive and sends every full unroll to `unrolls`, until the mailbox or the channel is closed.
@@ -198,10 +201,10 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         }
         recorder.t = *length;
         acting.observe(recorder)?;
-        Ok(Some(self.finish()))
+        self.finish().map(Some)
     }
 
-    fn finish(&mut self) -> Vec<FinishedUnroll> {
+    fn finish(&mut self) -> Result<Vec<FinishedUnroll>, Error> {
         let (learner_epoch, version, behaviour) = self
             .directive
             .as_ref()
@@ -209,7 +212,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         let ActingLoop { rollouts, batch } = &mut self.acting;
         let mut unrolls = Vec::with_capacity(rollouts.len());
         for ((index, rollout), environment) in rollouts.iter_mut().enumerate().zip(self.first..) {
-            self.recorder.write_gradients(index, &rollout.environment.take_gradients());
+            self.recorder.write_gradients(index, &rollout.environment.take_gradients())?;
             let RecordedUnroll { payload, episodes, task } = self.recorder.take(index);
             if rollout.ended {
                 rollout.environment.reset();
@@ -227,7 +230,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
                 ticket,
             });
         }
-        unrolls
+        Ok(unrolls)
     }
 }
 

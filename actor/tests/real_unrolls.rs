@@ -38,7 +38,7 @@ fn record(setup: &Setup, behaviour: Behaviour) -> Vec<Vec<FinishedUnroll>> {
     let environments =
         (0..ENVIRONMENTS as u64).map(|seed| Arc::clone(&setup.task).environment(seed).unwrap()).collect();
     let policy = TorchPolicy::untrained(setup.task.spec(), &setup.experiment, None, 6, || Ok([0.0; 56])).unwrap();
-    let mut worker = Worker::new(environments, policy, Arc::clone(&setup.layout), 0.1, 0, 9);
+    let mut worker = Worker::new(environments, policy, Arc::clone(&setup.layout), 0.1, 0, 9).unwrap();
     let parameters = Bytes::from(setup.policy.to_parameters().unwrap());
     worker.adopt(&Arc::new(Directive { learner_epoch: 2, version: 4, behaviour, parameters })).unwrap();
     (0..2).map(|_| worker.unroll(&|| false, &Progress::default()).unwrap().unwrap()).collect()

@@ -4,7 +4,7 @@ use crate::clips::{ClipSource, SUBSETS};
 use crate::document::Experiment;
 use crate::fault::{AT_LEAST_ONE, Fault, NOT_NEGATIVE, POSITIVE, ensure, not_negative, positive};
 use crate::network::{InitialPose, Network, Prior};
-use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
+use crate::settings::{Actor, Budget, LONGEST_UNROLL, Learner, Optimiser, Unroll, Vmpo, WarmStart};
 use crate::svg0::Svg0;
 use crate::tasks::{TaskName, TerminationError, Vision};
 use crate::transfer::{Transfer, TransferAlgorithm};
@@ -231,7 +231,7 @@ fn optimiser(optimiser: &Optimiser) -> Result<(), Fault> {
 }
 
 fn unroll(unroll: &Unroll) -> Result<(), Fault> {
-    ensure("unroll.length", unroll.length, (1..=4096).contains(&unroll.length), "must be 1 to 4096")?;
+    ensure("unroll.length", unroll.length, (1..=LONGEST_UNROLL).contains(&unroll.length), "must be 1 to 4096")?;
     ensure("unroll.batch", unroll.batch, (1..=65536).contains(&unroll.batch), "must be 1 to 65536")?;
     let rows = unroll.batch * unroll.length;
     ensure("unroll.batch", unroll.batch, rows <= 1 << 20, "times unroll.length must be at most 1048576 rows")?;

@@ -44,7 +44,9 @@ pub use fields::{Difference, find_field};
 pub use nearest::nearest;
 pub use network::{InitialPose, Latent, LowLevelName, Lstm, Mlp, Network, Primitives, Prior};
 pub use resolve::resolve;
-pub use settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
+pub use settings::{
+    Actor, Budget, LARGEST_ACTION_GRADIENT, LONGEST_UNROLL, Learner, Optimiser, Unroll, Vmpo, WarmStart,
+};
 pub use spec::{TaskPart, TaskSpec};
 pub use svg0::Svg0;
 pub use tasks::*;

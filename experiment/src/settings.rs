@@ -47,13 +47,20 @@ pub struct Vmpo {
     pub control_variate: f64,
     /// Weight w of the simulator's derivative of the reward with respect to the actions (D): the policy loss has the term
     /// −w/η · mean over valid steps of derivative · mean action. The actors compute the derivative, as `tracking.gradient`
-    /// and `get_up.gradient_decay` say; other tasks have none. 0 is off.
+    /// and `get_up.gradient` say; other tasks have none. 0 is off.
     pub action_gradient: f64,
     /// Weight of the value loss (D).
     pub value_weight: f64,
     /// Rows at the start of an unroll that only build up the recurrent state of the value function. No loss uses them (D).
     pub value_burn_in: usize,
 }
+
+/// The longest unroll.
+pub const LONGEST_UNROLL: usize = 4096;
+
+/// The largest entry of the simulator's derivative that an actor sends and a learner takes (D). Usual entries are below 1. A
+/// larger one comes from a simulation that is about to diverge, and would outweigh its whole minibatch.
+pub const LARGEST_ACTION_GRADIENT: f32 = 1e3;
 
 impl Default for Vmpo {
     fn default() -> Self {

@@ -19,7 +19,7 @@ use crate::fault::{Fault, Section};
 pub use ball_catch::BallCatch;
 pub use corridor::Corridor;
 pub use gaps::Gaps;
-pub use get_up::{GetUp, LyingPose};
+pub use get_up::{GetUp, GradientOfStanding, LyingPose};
 pub use go_to_target::GoToTarget;
 pub use shared::{StartPose, Vision};
 pub use tracking::{

@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use comic_experiment::LARGEST_ACTION_GRADIENT;
 use thiserror::Error;
 
 use crate::field::Field;
@@ -178,7 +179,7 @@ pub fn validate(
         (Field::Action, LARGEST_NUMBER, "within ±1e6"),
         (Field::Mean, LARGEST_NUMBER, "within ±1e6"),
         (Field::LogWeights, LARGEST_NUMBER, "within ±1e6"),
-        (Field::ActionGradient, LARGEST_NUMBER, "within ±1e6"),
+        (Field::ActionGradient, LARGEST_ACTION_GRADIENT, "within ±1e3"),
         (Field::Reward, LARGEST_NUMBER, "within ±1e6"),
         (Field::State, LARGEST_NUMBER, "within ±1e6"),
     ] {

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use bytes::Bytes;
+use comic_experiment::LARGEST_ACTION_GRADIENT;
 use comic_proto::v1::{Behaviour, EpisodeEnd, EpisodeStatistics, UnrollHeader, UnrollMessage};
 use comic_proto::{Expected, Field, Invalid, MAX_SEQUENCE, Pieces, UnrollBuffer, UnrollLayout, UnrollShape, validate};
 use proptest::prelude::*;
@@ -204,8 +205,14 @@ fn numbers_that_are_not_finite_are_refused_in_every_field() {
 
 #[test]
 fn numbers_outside_the_range_of_their_field_are_refused() {
-    let cases =
-        [(Field::Std, 0.0), (Field::Std, -1.0), (Field::Discount, 1.5), (Field::Valid, 0.5), (Field::First, 2.0)];
+    let cases = [
+        (Field::Std, 0.0),
+        (Field::Std, -1.0),
+        (Field::Discount, 1.5),
+        (Field::Valid, 0.5),
+        (Field::First, 2.0),
+        (Field::ActionGradient, 1.1 * LARGEST_ACTION_GRADIENT),
+    ];
     for (name, number) in cases {
         let refused = payload_refusal(|unroll| unroll.row_mut(name, 3)[0] = number);
         let expected = matches!(

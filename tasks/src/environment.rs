@@ -74,9 +74,14 @@ pub trait Environment: Debug + Send {
     /// The start of the current episode.
     fn episode(&self) -> Episode;
 
-    /// From now on records what [`take_gradients`](Self::take_gradients) needs, about 40 kB a step. Only tracking and
+    /// From now on records what [`take_gradients`](Self::take_gradients) needs, about 20 kB a step. Only tracking and
     /// get-up do.
-    fn record_gradients(&mut self) {}
+    ///
+    /// # Errors
+    /// [`Error::NoDerivative`]: this body has none.
+    fn record_gradients(&mut self) -> Result<(), Error> {
+        Ok(())
+    }
 
     /// For each control step since the last call, oldest first: the derivative of the rewards of that step and the later ones
     /// with respect to the action; 0 for a step that diverged. Steps before [`record_gradients`](Self::record_gradients) have none.
@@ -121,8 +126,8 @@ impl<E: Environment + ?Sized> Environment for Box<E> {
         (**self).episode()
     }
 
-    fn record_gradients(&mut self) {
-        (**self).record_gradients();
+    fn record_gradients(&mut self) -> Result<(), Error> {
+        (**self).record_gradients()
     }
 
     fn take_gradients(&mut self) -> Vec<[f32; 56]> {

@@ -44,6 +44,12 @@ pub enum Error {
         /// The message of the window's library.
         reason: String,
     },
+    /// The simulator's derivative was asked of a model that it cannot differentiate.
+    #[error(
+        "vmpo.action_gradient: the derivative is of the V2020 humanoid alone, integrated by Euler's method with implicit \
+         damping; set it to 0"
+    )]
+    NoDerivative,
     /// There is nothing to track.
     #[error("clips: no clip to track; name at least one source that has clips")]
     NoClips,

@@ -1,20 +1,28 @@
 //! The derivative of a task's reward with respect to the actions, through the simulation.
 //!
 //! For every control step t it gives Σ_k δ^k ∂R_{t+k} / ∂a_t, the sum over the coming steps of the same episode up to the end
-//! of the unroll, with later actions held fixed. The task says what R is. It is computed backwards over recorded steps (an
-//! adjoint), at a fraction of the cost of the simulation.
+//! of the unroll, with later actions held fixed. The task says what R is. It is computed backwards over recorded physics
+//! steps (an adjoint), at a fraction of the cost of the simulation. `docs/derivative.md` has the formulas, the comparison
+//! with finite differences, and the relatives of this method.
 //!
 //! # What is exact and what is not
-//! ∂R/∂q and ∂R/∂v are exact. The dynamics are approximated (D): the inertia, the contacts and their state are those at the
-//! start of the control step. The torque limits, and the derivatives of gravity, of Coriolis forces and of a contact's place
-//! are left out. MuJoCo's own derivative by finite differences has them, but where contacts start and end it is up to fifty
-//! times as large as elsewhere, and of no use for learning.
+//! ∂R/∂q and ∂R/∂v are exact. Every third physics step is linearised with its own inertia and contacts, whose set and place are
+//! held fixed (D). The torque limits, and the derivatives of gravity, of Coriolis forces and of a contact's place are left
+//! out. MuJoCo's own derivative by finite differences has them, but where contacts start and end it is up to fifty times as
+//! large as elsewhere, and of no use for learning.
 
-use mujoco_rs::mujoco_c::{mju_cholFactor, mju_cholSolve};
-use mujoco_rs::prelude::*;
+mod constraints;
+mod dynamics;
+mod forces;
 
+use comic_experiment::{LARGEST_ACTION_GRADIENT, LONGEST_UNROLL};
+use mujoco_rs::prelude::MjModel;
+
+use crate::error::Error;
 use crate::humanoid::walker::{ROOT_VELOCITIES, Walker};
 use crate::physics::Data;
+use dynamics::{Constants, Constraint, PhysicsStep};
+pub(crate) use forces::Forces;
 
 /// Velocities of the humanoid: six of the root, and its joints.
 pub(crate) const VELOCITIES: usize = 62;
@@ -33,50 +41,17 @@ impl RewardDerivative {
     pub(crate) const ZERO: Self = Self { position: [0.0; VELOCITIES], velocity: [0.0; VELOCITIES] };
 }
 
-/// The parts of the model that no step changes.
-#[derive(Clone, Debug)]
-struct Constants {
-    /// Length of a physics step, s, and physics steps in a control step.
-    timestep: f64,
-    substeps: usize,
-    /// Of each velocity: damping, and stiffness of the joint and of its servo.
-    damping: [f64; VELOCITIES],
-    stiffness: [f64; VELOCITIES],
-    /// Of each servo: torque for a filter state of 1, and the share of the control that the filter takes in a physics step.
-    gain: [f64; ACTIONS],
-    share: f64,
-}
-
-/// Limit of the factorisation's pivots (D). The matrix is positive definite, so it is never reached.
-const SMALLEST_PIVOT: f64 = 1e-10;
-
-/// A control step: the dynamics at its start, and the derivative of its reward.
+/// A control step: its physics steps, its action, and the derivative of its reward.
 #[derive(Debug)]
-struct Linearisation {
-    /// Cholesky factor of M + h·damping + Jᵀ D J, `[62, 62]`; empty for a step that diverged.
-    factor: Vec<f64>,
-    /// J, the active constraints, `[n, 62]`.
-    constraints: Vec<f64>,
-    /// D times stiffness and D times damping of each of them.
-    forces: Vec<[f64; 2]>,
+struct ControlStep {
+    /// The number of physics steps, and where the recorded ones begin.
+    physics_steps: usize,
+    begin: usize,
     control: [f64; ACTIONS],
     /// Of R after the step.
     reward: RewardDerivative,
     /// Whether the episode ended with the step.
     ended: bool,
-}
-
-impl Default for Linearisation {
-    fn default() -> Self {
-        Self {
-            factor: Vec::new(),
-            constraints: Vec::new(),
-            forces: Vec::new(),
-            control: [0.0; ACTIONS],
-            reward: RewardDerivative::ZERO,
-            ended: false,
-        }
-    }
 }
 
 /// Records control steps, and computes the derivative when asked.
@@ -85,81 +60,42 @@ pub(crate) struct GradientTape {
     constants: Constants,
     /// δ.
     decay: f64,
-    steps: Vec<Linearisation>,
+    steps: Vec<ControlStep>,
+    /// The physics steps of all control steps. Those from `recorded` on hold memory that is used again.
+    physics: Vec<PhysicsStep>,
+    recorded: usize,
 }
 
 impl GradientTape {
-    /// `None` for the V2019 body, whose servos have no filters, and for a model with other bodies that move.
-    pub(crate) fn new(model: &MjModel, substeps: usize, decay: f64) -> Option<Self> {
-        // The arrays of columns that `begin_step` reads exist only with sparse constraints.
-        if model.na() != ACTIONS as i64 || model.nv() != VELOCITIES as i64 || !model.is_sparse() {
-            return None;
-        }
-        let timestep = model.opt().timestep;
-        let (mut damping, mut stiffness) = ([0.0; VELOCITIES], [0.0; VELOCITIES]);
-        damping.copy_from_slice(&model.dof_damping()[..VELOCITIES]);
-        for (index, place) in stiffness.iter_mut().enumerate().skip(ROOT_VELOCITIES) {
-            *place = model.jnt_stiffness()[model.dof_jntid()[index] as usize];
-        }
-        let mut gain = [0.0; ACTIONS];
-        for (servo, joint) in Walker::servo_joints().into_iter().enumerate() {
-            gain[servo] = model.actuator_gainprm()[servo][0];
-            stiffness[ROOT_VELOCITIES + joint] -= model.actuator_biasprm()[servo][1];
-        }
-        let share = timestep / model.actuator_dynprm()[0][0];
-        let constants = Constants { timestep, substeps, damping, stiffness, gain, share };
-        Some(Self { constants, decay, steps: Vec::new() })
+    /// # Errors
+    /// [`Error::NoDerivative`] for the V2019 body, whose servos have no filters, and for any other model that the formulas do
+    /// not describe.
+    pub(crate) fn new(model: &MjModel, decay: f64) -> Result<Self, Error> {
+        let constants = Constants::new(model)?;
+        Ok(Self { constants, decay, steps: Vec::new(), physics: Vec::new(), recorded: 0 })
     }
 
-    /// Before a control step. The simulation has just computed everything that follows from its state.
-    #[allow(unsafe_code)]
-    pub(crate) fn begin_step(&mut self, data: &Data, control: &[f64; ACTIONS]) {
-        if self.steps.len() >= LONGEST {
-            self.steps.clear();
+    /// Before a control step.
+    pub(crate) fn begin_step(&mut self, control: &[f64; ACTIONS]) {
+        // Nobody reads this tape.
+        if self.steps.len() >= LONGEST_UNROLL {
+            self.clear();
         }
-        let mut factor = vec![0.0; VELOCITIES * VELOCITIES];
-        // The matrix has this size, so this cannot fail.
-        let _ = data.full_m(&mut factor);
-        for (index, damping) in self.constants.damping.iter().enumerate() {
-            factor[index * (VELOCITIES + 1)] += self.constants.timestep * damping;
+        let (begin, reward) = (self.recorded, RewardDerivative::ZERO);
+        self.steps.push(ControlStep { physics_steps: 0, begin, control: *control, reward, ended: false });
+    }
+
+    /// After each physics step of the control step, of which it keeps every third. MuJoCo's arrays are then those of the state before the physics step.
+    pub(crate) fn record(&mut self, data: &Data) {
+        let Some(step) = self.steps.last_mut() else { return };
+        if step.physics_steps.is_multiple_of(STRIDE) {
+            if self.recorded == self.physics.len() {
+                self.physics.push(PhysicsStep::default());
+            }
+            self.physics[self.recorded].read(&self.constants, data);
+            self.recorded += 1;
         }
-        let (mut constraints, mut forces) = (Vec::new(), Vec::new());
-        // SAFETY: MuJoCo wrote these arrays in the forward pass that ended the last control step or the reset, and the
-        // constraints are sparse (see `new`).
-        let (states, impedances, weights, counts, starts, columns) = unsafe {
-            let (counts, starts) = (data.efc_j_rownnz(), data.efc_j_rowadr());
-            (data.efc_state(), data.efc_kbip(), data.efc_d(), counts, starts, data.efc_j_colind())
-        };
-        for (row, state) in states.iter().enumerate() {
-            let [stiffness, damping, impedance, _] = impedances[row];
-            // A contact that slides resists only in its normal direction, the one with a stiffness.
-            let active = match state {
-                MjtConstraintState::mjCNSTRSTATE_QUADRATIC => true,
-                MjtConstraintState::mjCNSTRSTATE_CONE => stiffness != 0.0,
-                _ => false,
-            };
-            if !active {
-                continue;
-            }
-            let start = constraints.len();
-            constraints.resize(start + VELOCITIES, 0.0);
-            let (weight, dense) = (weights[row], &mut constraints[start..]);
-            let place = starts[row] as usize..starts[row] as usize + counts[row] as usize;
-            let entries = columns[place.clone()].iter().map(|column| *column as usize).zip(&data.efc_j()[place]);
-            for (column, value) in entries.clone() {
-                dense[column] = *value;
-            }
-            for (column, value) in entries {
-                let scaled = weight * value;
-                for (place, other) in factor[column * VELOCITIES..][..VELOCITIES].iter_mut().zip(dense.iter()) {
-                    *place += scaled * other;
-                }
-            }
-            forces.push([weight * stiffness * impedance, weight * damping]);
-        }
-        // SAFETY: `factor` has n × n numbers for n = VELOCITIES.
-        unsafe { mju_cholFactor(factor.as_mut_ptr(), VELOCITIES as i32, SMALLEST_PIVOT) };
-        self.steps.push(Linearisation { factor, constraints, forces, control: *control, ..Linearisation::default() });
+        step.physics_steps += 1;
     }
 
     /// After the control step, with the derivative of its reward.
@@ -170,10 +106,11 @@ impl GradientTape {
 
     /// A control step that diverged has no derivative. `began` says whether it was recorded.
     pub(crate) fn diverge(&mut self, began: bool) {
-        if began {
-            self.steps.pop();
+        if began && let Some(step) = self.steps.pop() {
+            self.recorded = step.begin;
         }
-        self.steps.push(Linearisation { ended: true, ..Linearisation::default() });
+        self.begin_step(&[0.0; ACTIONS]);
+        self.end_episode();
     }
 
     /// The episode ends with the last step.
@@ -189,12 +126,12 @@ impl GradientTape {
         let mut adjoint = Adjoint::default();
         for (step, gradient) in self.steps.iter().zip(&mut gradients).rev() {
             adjoint = if step.ended { Adjoint::default() } else { adjoint.scaled(self.decay) };
-            if step.factor.is_empty() {
-                continue;
-            }
             add(&mut adjoint.position, &step.reward.position);
             add(&mut adjoint.velocity, &step.reward.velocity);
-            let mut control = adjoint.step_back(&self.constants, step);
+            let mut control = [0.0; ACTIONS];
+            for index in (0..step.physics_steps).rev() {
+                adjoint.step_back(&self.constants, &self.physics[step.begin + index / STRIDE], &mut control);
+            }
             for (derivative, action) in control.iter_mut().zip(step.control) {
                 // The simulator clips an action beyond ±1, so moving it further out changes nothing.
                 if action.abs() >= 1.0 && *derivative * action > 0.0 {
@@ -202,21 +139,25 @@ impl GradientTape {
                 }
             }
             // A simulation that is about to diverge can give any number.
-            if control.iter().all(|value| value.abs() < LARGEST) {
+            if control.iter().all(|value| value.abs() <= f64::from(LARGEST_ACTION_GRADIENT)) {
                 *gradient = control.map(|value| value as f32);
             } else {
                 adjoint = Adjoint::default();
             }
         }
-        self.steps.clear();
+        self.clear();
         gradients
+    }
+
+    fn clear(&mut self) {
+        self.steps.clear();
+        self.recorded = 0;
     }
 }
 
-/// A derivative with an entry above this is left out (D). Usual entries are below 1.
-const LARGEST: f64 = 1e3;
-/// A tape that nobody reads is emptied after this many steps: the longest unroll.
-const LONGEST: usize = 4096;
+/// Physics steps that one linearisation stands for (D). With 1 an actor is 6 % slower, and cosines against finite differences
+/// are higher by at most 0.011 (`docs/derivative.md`).
+const STRIDE: usize = 3;
 
 /// The derivative of the coming rewards with respect to the state: positions (as velocities), velocities, filters.
 #[derive(Clone, Debug)]
@@ -241,45 +182,35 @@ impl Adjoint {
         self
     }
 
-    /// From after a control step to before it; returns the derivative with respect to the control.
+    /// From after a physics step to before it; adds the derivative with respect to the control to `control`.
     ///
-    /// A physics step is, with H the factorised matrix: f' = f + s (u − f); v' = v + h H⁻¹ (gain f − stiffness q −
-    /// damping v − Jᵀ D (stiffness_c J q + damping_c J v) + …); q' = q + h v'.
-    #[allow(unsafe_code)]
-    fn step_back(&mut self, constants: &Constants, step: &Linearisation) -> [f64; ACTIONS] {
-        let Constants { timestep, substeps, damping, stiffness, gain, share } = constants;
-        let mut control = [0.0; ACTIONS];
-        let mut scaled = [0.0; VELOCITIES];
+    /// A physics step is f' = f + s (u − f); v' = v + h H⁻¹ (gain f − stiffness q − damping v − Jᵀ D (stiffness_c J q +
+    /// damping_c J v) + …); q' = q + h v'.
+    fn step_back(&mut self, constants: &Constants, step: &PhysicsStep, control: &mut [f64; ACTIONS]) {
+        let Constants { timestep, damping, stiffness, gain, share, .. } = constants;
         let mut force = [0.0; VELOCITIES];
-        for _ in 0..*substeps {
-            for ((velocity, position), scaled) in self.velocity.iter_mut().zip(&self.position).zip(&mut scaled) {
-                *velocity += timestep * position;
-                *scaled = timestep * *velocity;
-            }
-            // SAFETY: the factor has n × n numbers and the vectors have n, for n = VELOCITIES.
-            unsafe {
-                mju_cholSolve(force.as_mut_ptr(), step.factor.as_ptr(), scaled.as_ptr(), VELOCITIES as i32);
-            }
-            for (servo, joint) in Walker::servo_joints().into_iter().enumerate() {
-                let filter = &mut self.filter[servo];
-                control[servo] += share * *filter;
-                *filter = *filter * (1.0 - share) + gain[servo] * force[ROOT_VELOCITIES + joint];
-            }
-            for index in 0..VELOCITIES {
-                self.velocity[index] -= damping[index] * force[index];
-                self.position[index] -= stiffness[index] * force[index];
-            }
-            for (row, [of_position, of_velocity]) in
-                step.constraints.as_chunks::<VELOCITIES>().0.iter().zip(&step.forces)
-            {
-                let along: f64 = row.iter().zip(&force).map(|(a, b)| a * b).sum();
-                for (index, value) in row.iter().enumerate() {
-                    self.velocity[index] -= of_velocity * along * value;
-                    self.position[index] -= of_position * along * value;
-                }
+        for ((velocity, position), force) in self.velocity.iter_mut().zip(&self.position).zip(&mut force) {
+            *velocity += timestep * position;
+            *force = timestep * *velocity;
+        }
+        step.solve(constants, &mut force);
+        for (servo, joint) in Walker::servo_joints().into_iter().enumerate() {
+            let filter = &mut self.filter[servo];
+            control[servo] += share * *filter;
+            *filter = *filter * (1.0 - share) + gain[servo] * force[ROOT_VELOCITIES + joint];
+        }
+        for index in 0..VELOCITIES {
+            self.velocity[index] -= damping[index] * force[index];
+            self.position[index] -= stiffness[index] * force[index];
+        }
+        for Constraint { entries, stiffness, damping, .. } in &step.constraints {
+            let row = step.columns[entries.clone()].iter().zip(&step.values[entries.clone()]);
+            let along: f64 = row.clone().map(|(column, value)| value * force[*column]).sum();
+            for (column, value) in row {
+                self.position[*column] -= stiffness * along * value;
+                self.velocity[*column] -= damping * along * value;
             }
         }
-        control
     }
 }
 
@@ -288,3 +219,6 @@ fn add(sum: &mut [f64; VELOCITIES], other: &[f64; VELOCITIES]) {
         *sum += other;
     }
 }
+
+#[cfg(test)]
+mod tests;

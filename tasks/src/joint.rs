@@ -139,10 +139,8 @@ impl Environment for JointEnvironment {
         Episode { clip: first + episode.clip, task: self.current, ..episode }
     }
 
-    fn record_gradients(&mut self) {
-        for environment in &mut self.environments {
-            environment.record_gradients();
-        }
+    fn record_gradients(&mut self) -> Result<(), Error> {
+        self.environments.iter_mut().try_for_each(Environment::record_gradients)
     }
 
     /// All steps of an unroll belong to one task, so at most one environment has any.

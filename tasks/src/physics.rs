@@ -39,11 +39,6 @@ impl Models {
         self.substeps as f64 * self.active.opt().timestep
     }
 
-    /// Physics steps in a control step.
-    pub(crate) fn substeps(&self) -> usize {
-        self.substeps
-    }
-
     /// A new simulation state. It reserves 18 MB, of which the operating system commits only the used part.
     pub(crate) fn data(&self) -> Data {
         Data::new(Arc::clone(&self.active))
@@ -79,10 +74,18 @@ impl Models {
     /// faster than `mj_step` alone: the `mj_forward` at the end of the last control step is the first half of the first
     /// step. The accelerometer, touch and torque sensors need this `mj_forward`.
     pub(crate) fn step(&self, data: &mut Data, control: &[f64; 56]) {
+        self.step_and(data, control, |_| {});
+    }
+
+    /// [`Models::step`]. It calls `record` after each physics step, when the state is new and everything else is that of the
+    /// state before.
+    pub(crate) fn step_and(&self, data: &mut Data, control: &[f64; 56], mut record: impl FnMut(&Data)) {
         data.ctrl_mut().copy_from_slice(control);
         data.step2();
+        record(data);
         for _ in 1..self.substeps {
             data.step();
+            record(data);
         }
         data.forward();
     }

@@ -253,7 +253,7 @@ fn unsafe_code_is_in_these_files_only() -> Result<()> {
         "learner/src/device/cuda.rs",
         "replay/src/streaming.rs",
         "tasks/src/arenas",
-        "tasks/src/gradient.rs",
+        "tasks/src/gradient/constraints.rs",
         "tasks/src/humanoid/body.rs",
         "tasks/src/silence.rs",
         "tasks/tests/parity/model.rs",

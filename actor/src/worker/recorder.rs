@@ -61,15 +61,23 @@ impl UnrollRecorder {
 
     /// Writes the derivatives of the transitions of an environment's unroll, in their order. A task without derivatives has
     /// none, and the rows stay 0.
-    pub(super) fn write_gradients(&mut self, index: usize, gradients: &[[f32; 56]]) {
+    ///
+    /// # Errors
+    /// [`Error::Derivatives`]: there is not one for each transition.
+    pub(super) fn write_gradients(&mut self, index: usize, gradients: &[[f32; 56]]) -> Result<(), Error> {
+        if gradients.is_empty() {
+            return Ok(());
+        }
         let buffer = &mut self.unrolls[index].buffer;
         let length = buffer.layout().shape().length;
         let transitions: Vec<usize> = (0..length).filter(|t| buffer.row(Field::Valid, *t)[0] == 1.0).collect();
-        if transitions.len() == gradients.len() {
-            for (t, gradient) in transitions.into_iter().zip(gradients) {
-                buffer.row_mut(Field::ActionGradient, t).copy_from_slice(gradient);
-            }
+        if transitions.len() != gradients.len() {
+            return Err(Error::Derivatives { transitions: transitions.len(), derivatives: gradients.len() });
         }
+        for (t, gradient) in transitions.into_iter().zip(gradients) {
+            buffer.row_mut(Field::ActionGradient, t).copy_from_slice(gradient);
+        }
+        Ok(())
     }
 
     /// The full unroll of an environment. An empty one replaces it.

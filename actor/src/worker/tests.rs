@@ -7,6 +7,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::forward_pass::ActingBatch;
 
+mod derivatives;
 mod running;
 mod transfer;
 
@@ -20,11 +21,14 @@ struct Counter {
     episodes: usize,
     step: usize,
     last_action: f32,
+    /// Derivatives for each unroll, of any number.
+    derivatives: usize,
 }
 
 impl Counter {
     fn new(lengths: &[usize]) -> Self {
-        Self { lengths: lengths.to_vec(), tasks: Vec::new(), episodes: 0, step: 0, last_action: 0.0 }
+        let lengths = lengths.to_vec();
+        Self { lengths, tasks: Vec::new(), episodes: 0, step: 0, last_action: 0.0, derivatives: 0 }
     }
     fn task(&self) -> usize {
         if self.tasks.is_empty() { 0 } else { self.tasks[(self.episodes - 1) % self.tasks.len()] }
@@ -41,6 +45,9 @@ impl Environment for Counter {
     }
     fn reset_to(&mut self, _clip: usize, _start: usize) -> Result<(), comic_tasks::Error> {
         Ok(())
+    }
+    fn take_gradients(&mut self) -> Vec<[f32; 56]> {
+        (1..=self.derivatives).map(|number| [number as f32; 56]).collect()
     }
     fn step(&mut self, action: &[f32]) -> Step {
         assert!(self.step < self.length(), "an episode was stepped beyond its end");
@@ -160,7 +167,7 @@ fn record_from(
 ) -> (Arc<UnrollLayout>, Vec<Vec<FinishedUnroll>>) {
     let layout = layout(length);
     let counters = environments.iter().map(|lengths| Counter::new(lengths)).collect();
-    let mut worker = Worker::new(counters, Plain::default(), Arc::clone(&layout), 0.1, first, 3);
+    let mut worker = Worker::new(counters, Plain::default(), Arc::clone(&layout), 0.1, first, 3).unwrap();
     worker.adopt(&directive(0, Behaviour::Policy)).unwrap();
     let mut recorded = vec![Vec::new(); environments.len()];
     for _ in 0..unrolls {
@@ -176,7 +183,7 @@ fn record_from(
 fn record_tasks(length: usize, lengths: &[usize], tasks: &[usize]) -> (Arc<UnrollLayout>, Vec<FinishedUnroll>) {
     let layout = layout(length);
     let environment = Counter { tasks: tasks.to_vec(), ..Counter::new(lengths) };
-    let mut worker = Worker::new(vec![environment], Plain::default(), Arc::clone(&layout), 0.1, 0, 3);
+    let mut worker = Worker::new(vec![environment], Plain::default(), Arc::clone(&layout), 0.1, 0, 3).unwrap();
     worker.adopt(&directive(0, Behaviour::Policy)).unwrap();
     let unrolls = (0..12).flat_map(|_| worker.unroll(&|| false, &Progress::default()).unwrap().unwrap()).collect();
     (layout, unrolls)
@@ -374,7 +381,8 @@ proptest! {
 #[test]
 fn the_unroll_records_the_unclipped_action_and_the_simulator_sees_the_clipped_one() {
     let layout = layout(32);
-    let mut worker = Worker::new(vec![Counter::new(&[1000])], Plain::default(), Arc::clone(&layout), 0.1, 0, 3);
+    let mut worker =
+        Worker::new(vec![Counter::new(&[1000])], Plain::default(), Arc::clone(&layout), 0.1, 0, 3).unwrap();
     worker.adopt(&directive(1, Behaviour::Policy)).unwrap();
     let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
     let rows = Rows { layout: &layout, payload: &unroll.payload };
@@ -390,7 +398,7 @@ fn the_unroll_records_the_unclipped_action_and_the_simulator_sees_the_clipped_on
 #[test]
 fn parameters_change_at_unroll_boundaries_only_and_the_header_names_them() {
     let layout = layout(5);
-    let mut worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), Arc::clone(&layout), 0.1, 0, 3);
+    let mut worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), Arc::clone(&layout), 0.1, 0, 3).unwrap();
     for version in 1..4 {
         worker.adopt(&directive(version, Behaviour::Policy)).unwrap();
         let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
@@ -403,7 +411,7 @@ fn parameters_change_at_unroll_boundaries_only_and_the_header_names_them() {
 #[test]
 fn a_demonstration_is_the_servo_action_with_noise_and_no_latent() {
     let layout = layout(8);
-    let mut worker = Worker::new(vec![Counter::new(&[5])], Plain::default(), Arc::clone(&layout), 0.25, 0, 3);
+    let mut worker = Worker::new(vec![Counter::new(&[5])], Plain::default(), Arc::clone(&layout), 0.25, 0, 3).unwrap();
     worker.adopt(&directive(9, Behaviour::Demonstration)).unwrap();
     let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
     let rows = Rows { layout: &layout, payload: &unroll.payload };

@@ -11,6 +11,7 @@ use comic_actor::forward_pass::ForwardPass;
 use comic_actor::mailbox::Directive;
 use comic_actor::policy::TorchPolicy;
 use comic_actor::worker::{Progress, Worker};
+use comic_clips::Catalogue;
 use comic_experiment::seed::derive;
 use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
@@ -35,6 +36,23 @@ pub(super) fn policy(subject: &Subject) -> Result<Figure> {
     let note = "one thread, 16 environments, the paper's networks, unrolls written; floor: the same controls through \
                 6 x mj_step + mj_forward";
     Ok(Figure::new("actor.policy", "steps/s", medians, note))
+}
+
+/// Steps/s of one thread with the quickstart's sizes that differentiates the simulation, against one that does not.
+pub(super) fn gradient(subject: &Subject) -> Result<Figure> {
+    let quickstart = |overrides: &[&str]| {
+        let overrides: Vec<String> = overrides.iter().map(|field| (*field).to_owned()).collect();
+        let experiment = comic_experiment::resolve("quickstart", &overrides)?;
+        let task = comic_tasks::build(&experiment, &Catalogue::open(&experiment.clips)?)?;
+        let subject = Subject { experiment, task, budget: subject.budget };
+        worker(&subject, environments(&subject, 1)?, 1)
+    };
+    let (mut with, mut without) = (quickstart(&[])?, quickstart(&["vmpo.action_gradient=0"])?);
+    let medians =
+        interleave(subject.budget, || Ok::<_, anyhow::Error>((unroll_rate(&mut with)?, unroll_rate(&mut without)?)))?;
+    let note =
+        "one thread, 16 environments, the quickstart's networks, untrained; floor: the same without the derivative";
+    Ok(Figure::new("actor.gradient", "steps/s", medians, note))
 }
 
 /// Steps/s of two threads, against one.
@@ -63,7 +81,7 @@ fn worker<E: Environment>(subject: &Subject, environments: Vec<E>, seed: u64) ->
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, experiment)));
     let policy = TorchPolicy::untrained(spec, experiment, None, seed, || Ok([0.0; 56]))?;
     let parameters = Bytes::from(policy.to_parameters()?);
-    let mut worker = Worker::new(environments, policy, layout, 0.0, 0, seed);
+    let mut worker = Worker::new(environments, policy, layout, 0.0, 0, seed)?;
     worker.adopt(&Arc::new(Directive { learner_epoch: 1, version: 1, behaviour: Behaviour::Policy, parameters }))?;
     Ok(worker)
 }

@@ -87,8 +87,8 @@ impl Environment for Recorded {
     fn episode(&self) -> Episode {
         self.environment.episode()
     }
-    fn record_gradients(&mut self) {
-        self.environment.record_gradients();
+    fn record_gradients(&mut self) -> Result<(), comic_tasks::Error> {
+        self.environment.record_gradients()
     }
     fn take_gradients(&mut self) -> Vec<[f32; 56]> {
         self.environment.take_gradients()

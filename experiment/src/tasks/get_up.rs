@@ -34,8 +34,30 @@ pub struct GetUp {
     /// second, and lies for the rest of the episode: shorter episodes give more experience of standing. Evaluations last
     /// `time_limit`.
     pub training_time_limit: f64,
-    /// δ of the simulator's derivative of the coming rewards (`vmpo.action_gradient`): each later step counts this much less.
-    pub gradient_decay: f64,
+    /// What actors differentiate if `vmpo.action_gradient` is not 0.
+    pub gradient: GradientOfStanding,
+}
+
+/// What the simulator's derivative of `vmpo.action_gradient` is the derivative of (D): the rewards of the coming steps, and
+/// three terms of standing. A body begins to fall long before its head is lower, so the reward alone says nothing of balance.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GradientOfStanding {
+    /// δ: each later step counts this much less.
+    pub decay: f64,
+    /// Weight w of w exp(−½ (d / 0.2 m)²), for the horizontal distance d from the middle of the feet to the centre of mass
+    /// where its velocity carries it in 0.32 s: the extrapolated centre of mass (Hof 2005), with the root's velocity.
+    pub balance: f64,
+    /// Weight w of w exp(−½ Σ (v / scale)²) for the root's velocities; the scales are 0.5 m/s and 2 rad/s.
+    pub stillness: f64,
+    /// Weight w of w exp(−½ Σ q² / 56 / (0.3 rad)²) for the joint angles q, which are 0 in the upright pose.
+    pub pose: f64,
+}
+
+impl Default for GradientOfStanding {
+    fn default() -> Self {
+        Self { decay: 0.95, balance: 0.5, stillness: 0.2, pose: 0.3 }
+    }
 }
 
 impl Default for GetUp {
@@ -52,7 +74,7 @@ impl Default for GetUp {
             start_pose: StartPose::Upright,
             time_limit: 8.0,
             training_time_limit: 0.0,
-            gradient_decay: 0.9,
+            gradient: GradientOfStanding::default(),
         }
     }
 }
@@ -81,8 +103,13 @@ impl TaskParameters for GetUp {
         let (training, longest) = (self.training_time_limit, self.time_limit);
         let remedy = "must be 0, which is time_limit, or positive seconds up to time_limit";
         section.ensure("training_time_limit", training, (0.0..=longest).contains(&training), remedy)?;
-        let decay = self.gradient_decay;
-        section.ensure("gradient_decay", decay, (0.0..=1.0).contains(&decay), "must be in [0, 1]")
+        let GradientOfStanding { decay, balance, stillness, pose } = self.gradient;
+        section.ensure("gradient.decay", decay, (0.0..=1.0).contains(&decay), "must be in [0, 1]")?;
+        for (name, weight) in [("balance", balance), ("stillness", stillness), ("pose", pose)] {
+            let holds = weight >= 0.0 && weight.is_finite();
+            section.ensure(&format!("gradient.{name}"), weight, holds, "must be 0 or more")?;
+        }
+        Ok(())
     }
 
     fn reward_terms(&self) -> &'static [&'static str] {

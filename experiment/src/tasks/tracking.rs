@@ -41,7 +41,7 @@ pub struct Tracking {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GradientOfReward {
-    /// δ: each later step counts this much less. The approximation of the dynamics is good for a few steps only.
+    /// δ: each later step counts this much less.
     pub decay: f64,
     /// p of the term `appendages`.
     pub appendages: f64,
@@ -59,7 +59,7 @@ pub struct GradientOfReward {
 impl Default for GradientOfReward {
     fn default() -> Self {
         Self {
-            decay: 0.8,
+            decay: 0.95,
             appendages: 0.25,
             body_quaternions: 1.0,
             center_of_mass: 1.0,

@@ -9,7 +9,7 @@ use rand_pcg::Pcg64;
 
 use super::interface::{Rules, Verdict};
 use super::poses::Pose;
-use super::stage::{CONTROL_TIMESTEP, SUBSTEPS, Stage};
+use super::stage::{CONTROL_TIMESTEP, Stage};
 use crate::environment::{ClipStarts, Environment, Episode, Outcome, Scenery, Simulated, Step, Task, control};
 use crate::error::Error;
 use crate::gradient::GradientTape;
@@ -172,10 +172,11 @@ impl<R: Rules> Environment for RuledEnvironment<R> {
         Episode { clip: 0, start: self.start, steps_left: self.max_steps, task: 0 }
     }
 
-    fn record_gradients(&mut self) {
+    fn record_gradients(&mut self) -> Result<(), Error> {
         let model = self.stage.arena.models.shared();
         let decay = self.task.rules.gradient_decay();
-        self.tape = decay.and_then(|decay| GradientTape::new(&model, SUBSTEPS, decay));
+        self.tape = decay.map(|decay| GradientTape::new(&model, decay)).transpose()?;
+        Ok(())
     }
 
     fn take_gradients(&mut self) -> Vec<[f32; 56]> {
@@ -196,10 +197,14 @@ impl<R: Rules> Simulated for RuledEnvironment<R> {
         if self.diverged || !control.iter().all(|value| value.is_finite()) {
             return self.diverge(false);
         }
-        if let Some(tape) = &mut self.tape {
-            tape.begin_step(&self.stage.data, control);
+        match &mut self.tape {
+            None => self.stage.step(control),
+            Some(tape) => {
+                tape.begin_step(control);
+                let Stage { arena, data } = &mut self.stage;
+                arena.models.step_and(data, control, |data| tape.record(data));
+            }
         }
-        self.stage.step(control);
         self.steps += 1;
         if !is_healthy(&self.stage.data) {
             return self.diverge(true);
@@ -214,7 +219,7 @@ impl<R: Rules> Simulated for RuledEnvironment<R> {
             Outcome::Running
         };
         if let Some(tape) = &mut self.tape {
-            tape.end_step(self.task.rules.differentiate(&mut self.stage), outcome != Outcome::Running);
+            tape.end_step(self.task.rules.differentiate(&self.stage), outcome != Outcome::Running);
         }
         let discount = if failed { 0.0 } else { 1.0 };
         Step { reward_terms, discount, outcome, head_height: self.stage.head_height() }

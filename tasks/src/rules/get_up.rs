@@ -17,7 +17,7 @@ use std::sync::Arc;
 
 use comic_clips::spatial::normalize;
 use comic_clips::{Catalogue, JOINT_RANGES};
-use comic_experiment::{GetUp, LyingPose};
+use comic_experiment::{GetUp, GradientOfStanding, LyingPose};
 use rand::Rng as _;
 use rand_distr::{Distribution as _, StandardNormal};
 use rand_pcg::Pcg64;
@@ -30,9 +30,10 @@ use crate::arenas::floor;
 use crate::build_task::{BuildTask, Context};
 use crate::environment::Task;
 use crate::error::Error;
-use crate::gradient::RewardDerivative;
+use crate::gradient::{ACTIONS, Forces, RewardDerivative};
 use crate::humanoid;
 use crate::humanoid::observation::{Number, fill};
+use crate::humanoid::walker::{ROOT_COORDINATES, ROOT_VELOCITIES};
 use crate::physics::is_healthy;
 
 /// Standard deviation of the joints of a pose that is dropped, rad.
@@ -172,28 +173,83 @@ impl Rules for GetUpRules {
     }
 
     fn gradient_decay(&self) -> Option<f64> {
-        Some(self.config.gradient_decay)
+        Some(self.config.gradient.decay)
     }
 
-    /// ∂R/∂h is −2 (h − h_target) R.
-    fn differentiate(&self, stage: &mut Stage) -> RewardDerivative {
+    /// Of the reward and of the terms of [`GradientOfStanding`].
+    fn differentiate(&self, stage: &Stage) -> RewardDerivative {
+        let mut derivative = RewardDerivative::ZERO;
+        let RewardDerivative { position, velocity } = &mut derivative;
+        let GradientOfStanding { balance, stillness, pose, .. } = self.config.gradient;
+        // ∂R/∂h is −2 (h − h_target) R.
         let (height, target) = (stage.head_height(), self.config.target_height);
         let slope = -2.0 * (height - target) * standing_reward(height, target);
-        let [.., head] = stage.arena.walker.appendages;
-        let point = stage.data.xpos()[head];
-        let mut derivative = RewardDerivative::ZERO;
-        // The body exists and the vector has a place for each velocity, so this cannot fail.
-        let _ = stage.data.apply_ft(&[0.0, 0.0, slope], &[0.0; 3], &point, head, &mut derivative.position);
+        let [_, _, right, left, head] = stage.arena.walker.appendages;
+        let (data, frame) = (&stage.data, stage.arena.walker.frame);
+        let mut forces = Forces::new(data, frame);
+        forces.push(head, data.xpos()[head], [0.0, 0.0, slope]);
+        let distance = imbalance(stage);
+        let term = balance * bell(&distance.map(|entry| entry / BALANCE_SCALE));
+        let [x, y] = distance.map(|entry| -term * entry / (BALANCE_SCALE * BALANCE_SCALE));
+        for foot in [right, left] {
+            forces.push(foot, data.xipos()[foot], [-0.5 * x, -0.5 * y, 0.0]);
+        }
+        forces.push_center_of_mass(data, frame, [x, y, 0.0]);
+        (velocity[0], velocity[1]) = (FALL_TIME * x, FALL_TIME * y);
+        let scaled = scaled_root_velocity(stage);
+        let term = stillness * bell(&scaled);
+        for ((place, scaled), scale) in velocity.iter_mut().zip(scaled).zip(ROOT_VELOCITY_SCALES) {
+            *place -= term * scaled / scale;
+        }
+        let joints = scaled_joints(stage);
+        let term = pose * bell(&joints);
+        for (place, joint) in position[ROOT_VELOCITIES..].iter_mut().zip(joints) {
+            *place -= term * joint / JOINT_SCALE;
+        }
+        forces.add_to(data, &mut derivative);
         derivative
     }
 }
 
+/// exp(−½ Σ x²).
+fn bell(values: &[f64]) -> f64 {
+    (-0.5 * values.iter().map(|value| value * value).sum::<f64>()).exp()
+}
+
+/// From the middle of the feet to the extrapolated centre of mass, x and y, m.
+fn imbalance(stage: &Stage) -> [f64; 2] {
+    let [_, _, right, left, _] = stage.arena.walker.appendages;
+    let (mass, feet) =
+        (stage.data.subtree_com()[stage.arena.walker.frame], [right, left].map(|foot| stage.data.xipos()[foot]));
+    let velocity = stage.data.qvel();
+    std::array::from_fn(|axis| mass[axis] + FALL_TIME * velocity[axis] - 0.5 * (feet[0][axis] + feet[1][axis]))
+}
+
+fn scaled_root_velocity(stage: &Stage) -> [f64; ROOT_VELOCITIES] {
+    std::array::from_fn(|index| stage.data.qvel()[index] / ROOT_VELOCITY_SCALES[index])
+}
+
+fn scaled_joints(stage: &Stage) -> [f64; ACTIONS] {
+    std::array::from_fn(|joint| stage.data.qpos()[ROOT_COORDINATES + joint] / JOINT_SCALE)
+}
+
+/// Scale of the term of balance (D), m: a little less than a foot's length.
+const BALANCE_SCALE: f64 = 0.2;
+/// √(l / g) for a centre of mass l = 1 m above the ground, s.
+const FALL_TIME: f64 = 0.32;
+/// Scales of the term of stillness (D), m/s and rad/s.
+const ROOT_VELOCITY_SCALES: [f64; ROOT_VELOCITIES] = [0.5, 0.5, 0.5, 2.0, 2.0, 2.0];
+/// Scale of one of 56 joint angles in the term of the pose (D), rad: √56 × 0.3 rad.
+const JOINT_SCALE: f64 = 2.245;
+
 #[cfg(test)]
 mod tests {
+    use comic_clips::spatial::{about_vector, multiply};
     use comic_experiment::{ClipSource, StartPose};
     use rand::SeedableRng as _;
 
     use super::*;
+    use crate::gradient::VELOCITIES;
 
     fn rules(config: &GetUp) -> GetUpRules {
         GetUpRules::new(config, &Catalogue::open(&[ClipSource::whole("builtin:stand")]).unwrap()).unwrap()
@@ -219,6 +275,15 @@ mod tests {
         assert!(heights.iter().all(|height| *height < 0.6 || *height > 1.5), "no other starts");
     }
 
+    /// The reward and the terms of standing, of the current state.
+    fn differentiated(stage: &Stage, config: &GetUp) -> f64 {
+        let GradientOfStanding { balance, stillness, pose, .. } = config.gradient;
+        standing_reward(stage.head_height(), config.target_height)
+            + balance * bell(&imbalance(stage).map(|entry| entry / BALANCE_SCALE))
+            + stillness * bell(&scaled_root_velocity(stage))
+            + pose * bell(&scaled_joints(stage))
+    }
+
     #[test]
     fn the_rewards_derivative_equals_finite_differences() {
         let (config, mut random) = (GetUp { lying_share: 0.0, ..GetUp::default() }, Pcg64::seed_from_u64(5));
@@ -226,36 +291,41 @@ mod tests {
         let mut stage = rules.stage(&mut random).unwrap();
         rules.begin(&mut stage, &mut State, &mut random);
         // Below the target, where the reward has a slope.
-        let mut qpos = stage.data.qpos().to_vec();
+        let (mut qpos, qvel) = (stage.data.qpos().to_vec(), stage.data.qvel().to_vec());
         qpos[2] -= 0.5;
-        stage.place(&qpos, &[0.0; 62]);
-        let found = rules.differentiate(&mut stage);
-        assert_eq!(found.velocity, [0.0; 62]);
-        // The root's position and the joints; the root's rotation has other coordinates than velocities.
-        for (index, coordinate) in (0..3).map(|index| (index, index)).chain((6..62).map(|index| (index, index + 1))) {
-            let mut at = |change: f64| {
-                let mut qpos = qpos.clone();
-                qpos[coordinate] += change;
-                stage.place(&qpos, &[0.0; 62]);
-                standing_reward(stage.head_height(), config.target_height)
-            };
-            let expected = (at(1e-5) - at(-1e-5)) / 2e-5;
-            assert!(
-                (found.position[index] - expected).abs() < 1e-6,
-                "{index}: {} is not {expected}",
-                found.position[index]
-            );
+        stage.place(&qpos, &qvel);
+        let found = rules.differentiate(&stage);
+        let mut at = |index: usize, change: f64| {
+            let (mut qpos, mut qvel) = (qpos.clone(), qvel.clone());
+            match index {
+                0..3 => qpos[index] += change,
+                // MuJoCo turns the root by velocities in its own frame.
+                3..6 => {
+                    let axis = std::array::from_fn(|axis| f64::from(u8::from(axis == index - 3)));
+                    let turned = multiply([qpos[3], qpos[4], qpos[5], qpos[6]], about_vector(axis, change));
+                    qpos[3..7].copy_from_slice(&turned);
+                }
+                6..VELOCITIES => qpos[index + 1] += change,
+                _ => qvel[index - VELOCITIES] += change,
+            }
+            stage.place(&qpos, &qvel);
+            differentiated(&stage, &config)
+        };
+        for (index, found) in found.position.iter().chain(&found.velocity).enumerate() {
+            let expected = (at(index, 1e-5) - at(index, -1e-5)) / 2e-5;
+            assert!((found - expected).abs() < 1e-6, "{index}: {found} is not {expected}");
         }
     }
 
     #[test]
     fn every_step_has_a_derivative_and_a_step_along_it_lifts_the_head() {
         use crate::environment::Environment as _;
-        let config = GetUp { lying_share: 1.0, gradient_decay: 1.0, ..GetUp::default() };
+        let gradient = GradientOfStanding { decay: 1.0, balance: 0.0, stillness: 0.0, pose: 0.0 };
+        let config = GetUp { lying_share: 1.0, gradient, ..GetUp::default() };
         let spec = comic_experiment::TaskSpec::default();
         let task: Arc<dyn Task> = Arc::new(RuledTask::new(rules(&config), spec));
         let mut environment = task.environment(3).unwrap();
-        environment.record_gradients();
+        environment.record_gradients().unwrap();
         // The sum of the rewards of five steps with this action.
         let mut rewards = |action: &[f32; 56]| {
             environment.reset_to(0, 7).unwrap();

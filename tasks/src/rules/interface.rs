@@ -45,7 +45,7 @@ pub(crate) trait Rules: Debug + Send + Sync + 'static {
     }
 
     /// The derivative of the reward of the control step that was just simulated with respect to the state after it.
-    fn differentiate(&self, _: &mut Stage) -> RewardDerivative {
+    fn differentiate(&self, _: &Stage) -> RewardDerivative {
         RewardDerivative::ZERO
     }
 

@@ -206,9 +206,10 @@ impl Environment for TrackingEnvironment {
         Episode { clip: self.clip, start: reference.first + self.start, steps_left, task: 0 }
     }
 
-    fn record_gradients(&mut self) {
+    fn record_gradients(&mut self) -> Result<(), Error> {
         let TrackingTask { models, config, .. } = self.task.as_ref();
-        self.tape = GradientTape::new(&models.shared(), models.substeps(), config.gradient.decay);
+        self.tape = Some(GradientTape::new(&models.shared(), config.gradient.decay)?);
+        Ok(())
     }
 
     fn take_gradients(&mut self) -> Vec<[f32; 56]> {
@@ -243,10 +244,13 @@ impl Simulated for TrackingEnvironment {
             return self.diverge(false);
         }
         self.previous.copy_from_slice(self.data.qpos());
-        if let Some(tape) = &mut self.tape {
-            tape.begin_step(&self.data, control);
+        match &mut self.tape {
+            None => self.task.models.step(&mut self.data, control),
+            Some(tape) => {
+                tape.begin_step(control);
+                self.task.models.step_and(&mut self.data, control, |data| tape.record(data));
+            }
         }
-        self.task.models.step(&mut self.data, control);
         self.frame += 1;
         if !is_healthy(&self.data) {
             return self.diverge(true);

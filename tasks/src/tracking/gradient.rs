@@ -1,12 +1,12 @@
 //! The derivative of tracking's reward with respect to the state. It has softer exponents and a term for the root's velocity
 //! ([`GradientOfReward`]).
 
-use comic_clips::spatial::{FlatMatrix, Vector, cross, normalize, rotated, rotation_between, scale, subtract};
+use comic_clips::spatial::{FlatMatrix, Vector, normalize, rotated, rotation_between, scale, subtract};
 use comic_experiment::{GradientOfReward, TRACKING_TERM_LIMITS};
 
 use super::reference::Reference;
 use super::reward::EXPONENTS;
-use crate::gradient::{ACTIONS, RewardDerivative, VELOCITIES};
+use crate::gradient::{ACTIONS, Forces, RewardDerivative};
 use crate::humanoid::features::appendages;
 use crate::humanoid::walker::{ROOT_COORDINATES, ROOT_VELOCITIES, Walker};
 use crate::physics::Data;
@@ -17,7 +17,7 @@ const ROOT_VELOCITY_SCALES: [f64; ROOT_VELOCITIES] = [0.3, 0.3, 0.3, 1.5, 1.5, 1
 /// The derivative of the current state, at frame `frame` of the reference. `threshold` is τ, the termination threshold.
 pub(super) fn differentiate(
     walker: &Walker,
-    data: &mut Data,
+    data: &Data,
     reference: &Reference,
     frame: usize,
     threshold: f64,
@@ -53,34 +53,21 @@ pub(super) fn differentiate(
     for (place, difference) in position[ROOT_VELOCITIES..].iter_mut().zip(&differences.joints) {
         *place = distance / differences.joints.len() as f64 * sign(*difference);
     }
-    let mut push = |data: &mut Data, force: Vector, torque: Vector, body: usize| {
-        let point = data.xpos()[body];
-        // The body exists and the vector has a place for each velocity, so this cannot fail.
-        let _ = data.apply_ft(&force, &torque, &point, body, position);
-    };
+    let mut forces = Forces::new(data, walker.frame);
     for (index, body) in walker.tracked.clone().enumerate() {
         let force = differences.positions[index].map(|difference| distance / bodies * sign(difference));
-        push(data, force, scale(rotations, differences.rotations[index]), body);
+        forces.push(body, data.xpos()[body], force);
+        forces.turn(body, scale(rotations, differences.rotations[index]));
     }
-    // An appendage is seen from the root, so a force on it has its opposite on the root.
+    // An appendage is seen from the root, so a force on it has its opposite on the root, at the same point.
     let rotation = data.xmat()[walker.root];
-    let (mut on_root, mut torque_on_root) = ([0.0; 3], [0.0; 3]);
     for (difference, body) in differences.appendages.iter().zip(walker.appendages) {
-        let force = into_world(&rotation, scale(appendages, *difference));
-        let arm = subtract(data.xpos()[body], data.xpos()[walker.root]);
-        on_root = subtract(on_root, force);
-        torque_on_root = subtract(torque_on_root, cross(arm, force));
-        push(data, force, [0.0; 3], body);
+        let (force, point) = (into_world(&rotation, scale(appendages, *difference)), data.xpos()[body]);
+        forces.push(body, point, force);
+        forces.push(walker.root, point, scale(-1.0, force));
     }
-    push(data, on_root, torque_on_root, walker.root);
-    let mut jacobian = [0.0; 3 * VELOCITIES];
-    // The body exists and the matrix has its size, so this cannot fail.
-    let _ = data.try_jac_subtree_com_into(walker.frame, &mut jacobian);
-    for (row, difference) in jacobian.as_chunks::<VELOCITIES>().0.iter().zip(differences.center_of_mass) {
-        for (place, entry) in position.iter_mut().zip(row) {
-            *place += center * difference * entry;
-        }
-    }
+    forces.push_center_of_mass(data, walker.frame, scale(center, differences.center_of_mass));
+    forces.add_to(data, &mut derivative);
     derivative
 }
 

@@ -5,7 +5,7 @@ use super::*;
 #[test]
 fn in_lockstep_a_version_makes_one_unroll_of_every_environment() {
     let environments = vec![Counter::new(&[3]), Counter::new(&[4])];
-    let worker = Worker::new(environments, Plain::default(), layout(4), 0.1, 0, 3);
+    let worker = Worker::new(environments, Plain::default(), layout(4), 0.1, 0, 3).unwrap();
     let mailbox = Mailbox::default();
     let publish = |learner_epoch, version| {
         mailbox.publish(Directive {
@@ -41,7 +41,7 @@ fn in_lockstep_a_version_makes_one_unroll_of_every_environment() {
 #[test]
 fn a_closed_mailbox_ends_the_worker_and_a_full_channel_holds_it() {
     let layout = layout(4);
-    let worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), layout, 0.1, 0, 3);
+    let worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), layout, 0.1, 0, 3).unwrap();
     let mailbox = Mailbox::default();
     mailbox.publish(Directive {
         learner_epoch: 1,
