@@ -100,7 +100,7 @@ fn contradictory_fields_are_refused() {
     let error = refused(&["network.low_level=mixture"]);
     assert!(error.contains("vmpo.control_variate = 1.0: must be 0") && error.contains("mixture"), "{error}");
     let error = refused(&["tracking.termination_error=supplement"]);
-    assert!(error.contains("vmpo.action_gradient = 15.0: must be 0"), "{error}");
+    assert!(error.contains("vmpo.action_gradient = 40.0: must be 0"), "{error}");
     let mixture = ["network.low_level=mixture", "network.latent.size=0", "vmpo.control_variate=0"];
     resolve("quickstart", &mixture.map(String::from)).unwrap();
 }
@@ -305,6 +305,17 @@ fn the_error_of_an_override_of_the_wrong_type_names_it_and_the_field() {
     assert!(message.starts_with("--set name.first=x: invalid type: map"), "{message}");
 }
 
+#[test]
+fn an_experiment_takes_overrides_as_a_document_does() {
+    let overrides = |argument: &str| [argument.to_owned()];
+    let checkpoint = || resolve("get-up", &[]).unwrap();
+    let changed = checkpoint().with_overrides(&overrides("get_up.lying_share=1")).unwrap();
+    assert_eq!(changed, resolve("get-up", &overrides("get_up.lying_share=1")).unwrap());
+    assert_eq!(checkpoint().with_overrides(&[]).unwrap(), checkpoint());
+    let error = checkpoint().with_overrides(&overrides("get_up.lying_share=2")).unwrap_err().to_string();
+    assert!(error.contains("--set get_up.lying_share=2") && error.contains("must be in [0, 1]"), "{error}");
+}
+
 // Values
 
 #[test]
@@ -320,6 +331,8 @@ fn meaningless_values_are_refused_with_field_and_remedy() {
         ("tracking.gradient.appendages=0.0", "must be in (0, 1]"),
         ("tracking.gradient.decay=1.5", "must be in [0, 1]"),
         ("tracking.gradient.root_velocity=-1.0", "must be 0 or more"),
+        ("get_up.gradient.decay=1.5", "must be in [0, 1]"),
+        ("get_up.gradient.balance=-1.0", "must be 0 or more"),
         ("network.final_std=0.0001", "must be 0, which is off, or from network.min_std to network.initial_std"),
         ("vmpo.control_variate=-1.0", "must be 0 or more"),
         ("tracking.min_steps=0", "must be 1 to 100000"),
