@@ -221,4 +221,4 @@ fn add(sum: &mut [f64; VELOCITIES], other: &[f64; VELOCITIES]) {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

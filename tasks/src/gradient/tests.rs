@@ -1,6 +1,7 @@
 //! What the tape keeps of a physics step. `tracking/gradient/tests.rs` compares the derivative with finite differences.
 
 use comic_clips::WalkerModel;
+use comic_clips::spatial::{about_vector, multiply};
 use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 
@@ -29,6 +30,23 @@ pub(super) fn fall(control_steps: usize, amplitude: f64, mut check: impl FnMut(&
             }
         });
     }
+}
+
+/// A state that is moved along one of its 62 positions, as velocities, or 62 velocities.
+pub(crate) fn moved(qpos: &[f64], qvel: &[f64], index: usize, change: f64) -> (Vec<f64>, Vec<f64>) {
+    let (mut qpos, mut qvel) = (qpos.to_vec(), qvel.to_vec());
+    match index {
+        0..3 => qpos[index] += change,
+        // MuJoCo turns the root by velocities in its own frame.
+        3..6 => {
+            let axis = std::array::from_fn(|axis| f64::from(u8::from(axis == index - 3)));
+            let turned = multiply([qpos[3], qpos[4], qpos[5], qpos[6]], about_vector(axis, change));
+            qpos[3..7].copy_from_slice(&turned);
+        }
+        6..VELOCITIES => qpos[index + 1] += change,
+        _ => qvel[index - VELOCITIES] += change,
+    }
+    (qpos, qvel)
 }
 
 pub(super) fn newest(tape: &GradientTape) -> &PhysicsStep {

@@ -1,13 +1,12 @@
 //! Starts, the reward, and its derivative.
 
-use comic_clips::spatial::{about_vector, multiply};
 use comic_experiment::{ClipSource, StartPose};
 use rand::SeedableRng as _;
 
 use super::super::environment::RuledEnvironment;
 use super::*;
 use crate::environment::{Environment as _, Simulated as _};
-use crate::gradient::VELOCITIES;
+use crate::gradient::tests::moved;
 
 fn rules(config: &GetUp) -> GetUpRules {
     GetUpRules::new(config, &Catalogue::open(&[ClipSource::whole("builtin:stand")]).unwrap()).unwrap()
@@ -54,18 +53,7 @@ fn the_rewards_derivative_equals_finite_differences() {
     stage.place(&qpos, &qvel);
     let found = rules.differentiate(&stage);
     let mut at = |index: usize, change: f64| {
-        let (mut qpos, mut qvel) = (qpos.clone(), qvel.clone());
-        match index {
-            0..3 => qpos[index] += change,
-            // MuJoCo turns the root by velocities in its own frame.
-            3..6 => {
-                let axis = std::array::from_fn(|axis| f64::from(u8::from(axis == index - 3)));
-                let turned = multiply([qpos[3], qpos[4], qpos[5], qpos[6]], about_vector(axis, change));
-                qpos[3..7].copy_from_slice(&turned);
-            }
-            6..VELOCITIES => qpos[index + 1] += change,
-            _ => qvel[index - VELOCITIES] += change,
-        }
+        let (qpos, qvel) = moved(&qpos, &qvel, index, change);
         stage.place(&qpos, &qvel);
         differentiated(&stage, &config)
     };

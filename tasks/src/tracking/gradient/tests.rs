@@ -3,12 +3,12 @@
 use std::sync::Arc;
 
 use comic_clips::Catalogue;
-use comic_clips::spatial::{about_vector, multiply, norm};
+use comic_clips::spatial::norm;
 use comic_experiment::{ClipSource, TRACKING_TERM_LIMITS, Tracking};
 
 use super::*;
 use crate::environment::{Environment as _, Simulated as _};
-use crate::gradient::VELOCITIES;
+use crate::gradient::tests::moved;
 use crate::tracking::environment::TrackingEnvironment;
 use crate::tracking::reward;
 use crate::tracking::task::TrackingTask;
@@ -65,18 +65,7 @@ fn the_rewards_derivative_equals_finite_differences() {
     let derivative = differentiate(&task.walker, data, &task.references[0], frame, 0.3, &task.config.gradient);
     let (qpos, qvel) = (data.qpos().to_vec(), data.qvel().to_vec());
     let mut at = |index: usize, change: f64| {
-        let (mut qpos, mut qvel) = (qpos.clone(), qvel.clone());
-        match index {
-            0..3 => qpos[index] += change,
-            // MuJoCo turns the root by velocities in its own frame.
-            3..6 => {
-                let axis = std::array::from_fn(|axis| f64::from(u8::from(axis == index - 3)));
-                let turned = multiply([qpos[3], qpos[4], qpos[5], qpos[6]], about_vector(axis, change));
-                qpos[3..7].copy_from_slice(&turned);
-            }
-            6..VELOCITIES => qpos[index + 1] += change,
-            _ => qvel[index - VELOCITIES] += change,
-        }
+        let (qpos, qvel) = moved(&qpos, &qvel, index, change);
         data.qpos_mut().copy_from_slice(&qpos);
         data.qvel_mut().copy_from_slice(&qvel);
         data.forward();
