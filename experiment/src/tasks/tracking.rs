@@ -34,10 +34,10 @@ pub struct Tracking {
 }
 
 /// What the simulator's derivative of `vmpo.action_gradient` is the derivative of (D): the rewards of the coming steps, with
-/// softer exponents and a term for the root's velocity.
+/// softer exponents, a barrier before the termination threshold, and a term for the root's velocity.
 ///
 /// A reward term w exp(−c Δ²) counts as w exp(−c p Δ²). A power p below 1 gives it a slope where the error is so large that
-/// the term itself is flat.
+/// the term itself is flat. The termination term ½ (1 − ε / τ) counts as ½ ln(1 − ε / τ), which falls steeply before a fall.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GradientOfReward {
@@ -70,7 +70,7 @@ impl Default for GradientOfReward {
 }
 
 impl GradientOfReward {
-    /// p of every term, in the order of [`TRACKING_REWARD_TERMS`]. The term `termination` is linear.
+    /// p of every term, in the order of [`TRACKING_REWARD_TERMS`]. The term `termination` has none.
     pub fn powers(&self) -> [f64; TRACKING_REWARD_TERMS.len()] {
         let Self { appendages, body_quaternions, center_of_mass, joints_velocity, .. } = self;
         [*appendages, *body_quaternions, *center_of_mass, *joints_velocity, 1.0]

@@ -268,8 +268,7 @@ impl Simulated for TrackingEnvironment {
             Outcome::Running
         };
         if let Some(tape) = tape {
-            let (threshold, gradient) = (config.termination_threshold, &config.gradient);
-            let reward = differentiate(&task.walker, data, reference, *frame, threshold, gradient);
+            let reward = differentiate(&task.walker, data, reference, *frame, self.error, config);
             tape.end_step(reward, outcome != Outcome::Running);
         }
         let discount = if outcome == Outcome::Terminated { 0.0 } else { 1.0 };

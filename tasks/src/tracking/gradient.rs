@@ -1,8 +1,8 @@
-//! The derivative of tracking's reward with respect to the state. It has softer exponents and a term for the root's velocity
-//! ([`GradientOfReward`]).
+//! The derivative of tracking's reward with respect to the state. It has softer exponents, a barrier before the termination
+//! threshold, and a term for the root's velocity ([`GradientOfReward`](comic_experiment::GradientOfReward)).
 
 use comic_clips::spatial::{FlatMatrix, Vector, normalize, rotated, rotation_between, scale, subtract};
-use comic_experiment::{GradientOfReward, TRACKING_TERM_LIMITS};
+use comic_experiment::{TRACKING_TERM_LIMITS, Tracking};
 
 use super::reference::Reference;
 use super::reward::EXPONENTS;
@@ -14,18 +14,21 @@ use crate::physics::Data;
 /// R has the term w exp(−½ Σ (Δ / scale)²) for the root's velocity (D): the scales, m/s and rad/s.
 const ROOT_VELOCITY_SCALES: [f64; ROOT_VELOCITIES] = [0.3, 0.3, 0.3, 1.5, 1.5, 1.5];
 
-/// The derivative of the current state, at frame `frame` of the reference. `threshold` is τ, the termination threshold.
+/// The barrier ½ ln(1 − ε / τ) goes on as its tangent where 1 − ε / τ is below this (D). So it is finite when an episode ends.
+const STEEPEST: f64 = 0.1;
+
+/// The derivative of the current state, at frame `frame` of the reference, where the termination error is `error`.
 pub(super) fn differentiate(
     walker: &Walker,
     data: &Data,
     reference: &Reference,
     frame: usize,
-    threshold: f64,
-    config: &GradientOfReward,
+    error: f64,
+    config: &Tracking,
 ) -> RewardDerivative {
     let mut derivative = RewardDerivative::ZERO;
     let RewardDerivative { position, velocity } = &mut derivative;
-    let powers = config.powers();
+    let powers = config.gradient.powers();
     let differences = Differences::new(walker, data, reference, frame);
     // A term w exp(−c Δ²): its derivative with respect to Δ² is −c times the term.
     let slope = |term: usize, squares: f64| {
@@ -45,17 +48,20 @@ pub(super) fn differentiate(
     let scales = ROOT_VELOCITY_SCALES;
     let size: f64 = root.iter().zip(scales).map(|(difference, scale)| (difference / scale).powi(2)).sum();
     for ((place, difference), scale) in velocity.iter_mut().zip(root).zip(scales) {
-        *place = -config.root_velocity * (-0.5 * size).exp() * difference / (scale * scale);
+        *place = -config.gradient.root_velocity * (-0.5 * size).exp() * difference / (scale * scale);
     }
-    // The termination term, 0.5 (1 − ε / τ), is linear in every distance.
-    let bodies = differences.positions.len() as f64 * 3.0;
-    let distance = -0.5 * 0.5 / threshold;
+    // The termination term, ½ (1 − ε / τ), has one slope everywhere. The barrier has the same slope at the reference, and a
+    // steeper one before a fall. ε is linear in every distance.
+    let threshold = config.termination_threshold;
+    let barrier = -0.5 / threshold / (1.0 - error / threshold).max(STEEPEST);
+    let coordinate = barrier * 0.5 / (3 * differences.positions.len()) as f64;
+    let joint = barrier * 0.5 / differences.joints.len() as f64;
     for (place, difference) in position[ROOT_VELOCITIES..].iter_mut().zip(&differences.joints) {
-        *place = distance / differences.joints.len() as f64 * sign(*difference);
+        *place = joint * sign(*difference);
     }
     let mut forces = Forces::new(data, walker.frame);
     for (index, body) in walker.tracked.clone().enumerate() {
-        let force = differences.positions[index].map(|difference| distance / bodies * sign(difference));
+        let force = differences.positions[index].map(|difference| coordinate * sign(difference));
         forces.push(body, data.xpos()[body], force);
         forces.turn(body, scale(rotations, differences.rotations[index]));
     }

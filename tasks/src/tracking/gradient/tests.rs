@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use comic_clips::Catalogue;
 use comic_clips::spatial::norm;
-use comic_experiment::{ClipSource, TRACKING_TERM_LIMITS, Tracking};
+use comic_experiment::{ClipSource, GradientOfReward, TRACKING_TERM_LIMITS, Tracking};
 
 use super::*;
 use crate::environment::{Environment as _, Simulated as _};
@@ -26,18 +26,30 @@ fn task_with(decay: f64) -> Arc<TrackingTask> {
     Arc::new(TrackingTask::new(&config, &catalogue).unwrap())
 }
 
+/// ε of the current state.
+fn termination_error(task: &TrackingTask, data: &Data, frame: usize) -> f64 {
+    let kind = task.config.termination_error;
+    reward::termination_error(kind, &task.walker, data, &task.references[0], frame)
+}
+
 /// R of the current state.
 fn softened(task: &TrackingTask, data: &Data, frame: usize) -> f64 {
     let (config, reference) = (&task.config, &task.references[0]);
-    let error = reward::termination_error(config.termination_error, &task.walker, data, reference, frame);
+    let error = termination_error(task, data, frame);
     let terms = reward::terms(&task.walker, data, reference, frame, error, config.termination_threshold);
-    let softened = terms.iter().zip(TRACKING_TERM_LIMITS).zip(config.gradient.powers());
+    // The last term is the termination's.
+    let softened = terms[..4].iter().zip(TRACKING_TERM_LIMITS).zip(config.gradient.powers());
     let rewards: f64 = softened
         .map(|((term, limit), power)| if power == 1.0 { *term } else { limit * (term / limit).powf(power) })
         .sum();
     let difference = |index: usize| data.qvel()[index] - reference.qvel(frame)[index];
     let size: f64 = (0..6).map(|index| (difference(index) / ROOT_VELOCITY_SCALES[index]).powi(2)).sum();
-    rewards + config.gradient.root_velocity * (-0.5 * size).exp()
+    rewards + barrier(1.0 - error / config.termination_threshold) + config.gradient.root_velocity * (-0.5 * size).exp()
+}
+
+/// In place of the termination term, for 1 − ε / τ.
+fn barrier(left: f64) -> f64 {
+    0.5 * if left > STEEPEST { left.ln() } else { STEEPEST.ln() + left / STEEPEST - 1.0 }
 }
 
 fn cosine(a: &[f64], b: &[f64]) -> f64 {
@@ -62,18 +74,28 @@ fn the_rewards_derivative_equals_finite_differences() {
     let mut environment = walking(&task);
     let frame = environment.frame();
     let data = environment.simulation_mut();
-    let derivative = differentiate(&task.walker, data, &task.references[0], frame, 0.3, &task.config.gradient);
     let (qpos, qvel) = (data.qpos().to_vec(), data.qvel().to_vec());
-    let mut at = |index: usize, change: f64| {
-        let (qpos, qvel) = moved(&qpos, &qvel, index, change);
-        data.qpos_mut().copy_from_slice(&qpos);
-        data.qvel_mut().copy_from_slice(&qvel);
-        data.forward();
-        softened(&task, data, frame)
-    };
-    for (index, found) in derivative.position.iter().chain(&derivative.velocity).enumerate() {
-        let expected = (at(index, 1e-5) - at(index, -1e-5)) / 2e-5;
-        assert!((found - expected).abs() < 1e-6 * norm(&[1.0, expected]), "{index}: {found} is not {expected}");
+    // Near the reference, farther away, and where the episode is about to end.
+    for lifted in [0.0, 0.9, 1.7] {
+        let set = |data: &mut Data, index: usize, change: f64| {
+            let (mut qpos, qvel) = moved(&qpos, &qvel, index, change);
+            qpos[2] += lifted;
+            data.qpos_mut().copy_from_slice(&qpos);
+            data.qvel_mut().copy_from_slice(&qvel);
+            data.forward();
+        };
+        set(data, 0, 0.0);
+        let error = termination_error(&task, data, frame);
+        let derivative = differentiate(&task.walker, data, &task.references[0], frame, error, &task.config);
+        let mut at = |index: usize, change: f64| {
+            set(data, index, change);
+            softened(&task, data, frame)
+        };
+        for (index, found) in derivative.position.iter().chain(&derivative.velocity).enumerate() {
+            let expected = (at(index, 1e-5) - at(index, -1e-5)) / 2e-5;
+            let close = (found - expected).abs() < 1e-6 * norm(&[1.0, expected]);
+            assert!(close, "{index} at ε = {error}: {found} is not {expected}");
+        }
     }
 }
 
