@@ -13,7 +13,7 @@ fn the_joint_presets_have_the_papers_probabilities() {
 #[test]
 fn meaningless_joint_tasks_are_refused() {
     let refused = |joint: &str, other: &str| {
-        let overrides = [format!("joint=[{joint}]"), other.to_string()];
+        let overrides = [format!("joint=[{joint}]"), other.to_string(), "warm_start.steps=1".into()];
         resolve("quickstart", &overrides).unwrap_err().to_string()
     };
     let get_up = r#"{task="get-up", probability=0.1}"#;

@@ -85,7 +85,7 @@ fn contradictory_fields_are_refused() {
         let overrides: Vec<String> = overrides.iter().map(ToString::to_string).collect();
         resolve("quickstart", &overrides).unwrap_err().to_string()
     };
-    let error = refused(&["network.low_level=product"]);
+    let error = refused(&["network.low_level=product", "warm_start.steps=1"]);
     assert!(error.contains("warm_start.steps") && error.contains("product"), "{error}");
     let error = refused(&["vmpo.value_burn_in=2"]);
     assert!(error.contains("network.value_lstm"), "{error}");
