@@ -1,5 +1,5 @@
 //! Learning curves as pictures: single runs over wall-clock time and over environment steps, or groups of runs as mean and
-//! bootstrap interval over environment steps. A run's evaluations without noise are drawn beside its training.
+//! bootstrap interval. A run's evaluations without noise are drawn beside its training.
 
 mod bootstrap;
 mod curve;
@@ -17,10 +17,11 @@ use crate::metrics::Line;
 use panel::{Kind, Series, panel};
 use pool::pool;
 
+pub(crate) use curve::Axis;
 pub(crate) use heat_map::draw as draw_clips;
 
-/// The label of the x axis that all runs have.
-const STEPS: &str = "million environment steps";
+/// Both axes of a picture.
+const BOTH: [Axis; 2] = [Axis::WallClock, Axis::EnvironmentSteps];
 
 /// A quantity that curves show.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -117,7 +118,7 @@ impl Source {
 pub(crate) fn run(metrics: &[String], quantities: &[Quantity], seeds: bool, out: &Path) -> Result<()> {
     let sources: Vec<Source> = metrics.iter().map(|argument| Source::parse(argument)).collect();
     if seeds {
-        draw_groups(&by_label(sources), quantities, out)?;
+        draw_groups(&by_label(sources), quantities, &BOTH, out)?;
     } else {
         draw_runs(&sources, quantities, out)?;
     }
@@ -140,61 +141,65 @@ fn by_label(sources: Vec<Source>) -> Vec<(String, Vec<Source>)> {
 
 /// Draws each run over wall-clock time and over environment steps; a row for each quantity.
 pub(crate) fn draw_runs(sources: &[Source], quantities: &[Quantity], out: &Path) -> Result<()> {
-    let rows = quantities.iter().map(|quantity| Ok((*quantity, over_both(sources, *quantity)?)));
-    draw(&rows.collect::<Result<Vec<_>>>()?, out)
+    draw(quantities, &BOTH, |quantity, axis| single(sources, quantity, axis), out)
 }
 
-/// The curves of one quantity over wall-clock time, and over environment steps.
-fn over_both(sources: &[Source], quantity: Quantity) -> Result<Vec<Panel>> {
-    let (mut over_time, mut over_steps) = (Vec::new(), Vec::new());
+/// The curves of one quantity, for each run its training and its evaluation.
+fn single(sources: &[Source], quantity: Quantity, axis: Axis) -> Result<Vec<Series>> {
+    let mut series = Vec::new();
     for (colour, source) in sources.iter().enumerate() {
         let training = curve::training(source, quantity)?;
         let evaluated = curve::evaluated(source, quantity)?;
         for (kind, points) in [(Kind::Training, training), (Kind::Evaluation, evaluated)] {
-            if points.is_empty() {
-                continue;
+            if !points.is_empty() {
+                let line = points.iter().map(|point| (point.on(axis), point.value));
+                series.push(Series::new(&source.name(), kind, colour).with_line(line));
             }
-            let series = || Series::new(&source.name(), kind, colour);
-            over_time.push(series().with_line(points.iter().map(|point| (point.minutes, point.value))));
-            over_steps.push(series().with_line(points.iter().map(|point| (point.steps, point.value))));
-        }
-    }
-    Ok(vec![("minutes of wall clock", over_time), (STEPS, over_steps)])
-}
-
-/// Draws each group of runs as their mean over environment steps, with the 95 % bootstrap interval of the mean as a band; a
-/// row for each quantity.
-pub(crate) fn draw_groups(groups: &[(String, Vec<Source>)], quantities: &[Quantity], out: &Path) -> Result<()> {
-    let rows = quantities.iter().map(|quantity| Ok((*quantity, vec![(STEPS, pooled(groups, *quantity)?)])));
-    draw(&rows.collect::<Result<Vec<_>>>()?, out)
-}
-
-/// The curves of one quantity, for each group its training and its evaluation.
-fn pooled(groups: &[(String, Vec<Source>)], quantity: Quantity) -> Result<Vec<Series>> {
-    let mut series = Vec::new();
-    for (colour, (name, sources)) in groups.iter().enumerate() {
-        let training = sources.iter().map(|source| curve::training(source, quantity)).collect::<Result<Vec<_>>>()?;
-        let evaluated = sources.iter().map(|source| curve::evaluated(source, quantity)).collect::<Result<Vec<_>>>()?;
-        series.push(pool(Series::new(name, Kind::Training, colour), &training));
-        // The mean over a part of the runs could not be compared with that of training.
-        if !evaluated.is_empty() && evaluated.iter().all(|points| !points.is_empty()) {
-            series.push(pool(Series::new(name, Kind::Evaluation, colour), &evaluated));
         }
     }
     Ok(series)
 }
 
-/// The label of the x axis, and the series.
-type Panel = (&'static str, Vec<Series>);
+/// Draws each group of runs as their mean, with the 95 % bootstrap interval of the mean as a band; a row for each quantity.
+pub(crate) fn draw_groups(
+    groups: &[(String, Vec<Source>)],
+    quantities: &[Quantity],
+    axes: &[Axis],
+    out: &Path,
+) -> Result<()> {
+    draw(quantities, axes, |quantity, axis| pooled(groups, quantity, axis), out)
+}
 
-/// Draws a row of panels for each quantity.
-fn draw(rows: &[(Quantity, Vec<Panel>)], out: &Path) -> Result<()> {
-    let root = SVGBackend::new(out, (1000, 400 * rows.len() as u32)).into_drawing_area();
+/// The curves of one quantity, for each group its training and its evaluation.
+fn pooled(groups: &[(String, Vec<Source>)], quantity: Quantity, axis: Axis) -> Result<Vec<Series>> {
+    let mut series = Vec::new();
+    for (colour, (name, sources)) in groups.iter().enumerate() {
+        let training = sources.iter().map(|source| curve::training(source, quantity)).collect::<Result<Vec<_>>>()?;
+        let evaluated = sources.iter().map(|source| curve::evaluated(source, quantity)).collect::<Result<Vec<_>>>()?;
+        series.push(pool(Series::new(name, Kind::Training, colour), &training, axis));
+        // The mean over a part of the runs could not be compared with that of training.
+        if !evaluated.is_empty() && evaluated.iter().all(|points| !points.is_empty()) {
+            series.push(pool(Series::new(name, Kind::Evaluation, colour), &evaluated, axis));
+        }
+    }
+    Ok(series)
+}
+
+/// Draws a row of panels for each quantity, with a panel for each axis.
+fn draw(
+    quantities: &[Quantity],
+    axes: &[Axis],
+    series: impl Fn(Quantity, Axis) -> Result<Vec<Series>>,
+    out: &Path,
+) -> Result<()> {
+    let row = |quantity: &Quantity| axes.iter().map(|axis| series(*quantity, *axis)).collect::<Result<Vec<_>>>();
+    let rows = quantities.iter().map(row).collect::<Result<Vec<_>>>()?;
+    let root = SVGBackend::new(out, (1000, 400 * quantities.len() as u32)).into_drawing_area();
     let drawn = || -> Result<()> {
         root.fill(&WHITE).map_err(|error| anyhow!("{error}"))?;
-        for (row, (quantity, panels)) in root.split_evenly((rows.len(), 1)).iter().zip(rows) {
-            for (area, (x_label, series)) in row.split_evenly((1, panels.len())).iter().zip(panels) {
-                panel(area, series, x_label, quantity.label())?;
+        for ((area, quantity), panels) in root.split_evenly((quantities.len(), 1)).iter().zip(quantities).zip(&rows) {
+            for ((area, axis), series) in area.split_evenly((1, axes.len())).iter().zip(axes).zip(panels) {
+                panel(area, series, axis.label(), quantity.label())?;
             }
         }
         root.present().map_err(|error| anyhow!("{error}"))
@@ -278,7 +283,8 @@ mod tests {
         let out = directory.path().join("curves.svg");
         let draw = || {
             let sources = runs.iter().cloned().map(Source::of).collect();
-            draw_groups(&[("beta=0".into(), sources)], &[Quantity::EpisodeReturn], &out).unwrap();
+            draw_groups(&[("beta=0".into(), sources)], &[Quantity::EpisodeReturn], &[Axis::EnvironmentSteps], &out)
+                .unwrap();
             std::fs::read_to_string(&out).unwrap()
         };
         let picture = draw();

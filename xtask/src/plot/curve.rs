@@ -9,6 +9,22 @@ use crate::metrics;
 /// Points of a smoothing window. The learner writes a line every few seconds.
 const SMOOTHED_OVER: usize = 5;
 
+/// What a quantity is drawn over.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Axis {
+    WallClock,
+    EnvironmentSteps,
+}
+
+impl Axis {
+    pub(super) fn label(self) -> &'static str {
+        match self {
+            Self::WallClock => "minutes of wall clock",
+            Self::EnvironmentSteps => "million environment steps",
+        }
+    }
+}
+
 /// A quantity's value at a moment of a run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Point {
@@ -16,6 +32,15 @@ pub(super) struct Point {
     /// Environment steps, millions.
     pub(super) steps: f64,
     pub(super) value: f64,
+}
+
+impl Point {
+    pub(super) fn on(&self, axis: Axis) -> f64 {
+        match axis {
+            Axis::WallClock => self.minutes,
+            Axis::EnvironmentSteps => self.steps,
+        }
+    }
 }
 
 /// The smoothed values of training's episodes.

@@ -149,7 +149,9 @@ impl Sweep {
                 (point.name(), runs.map(|run| plot::Source::of(run.job.metrics())).collect())
             })
             .collect();
-        plot::draw_groups(&groups, &[plot::Quantity::NormalisedReward], &self.directory.join("curves.svg"))
+        // Runs of a sweep may share the machine, so their wall-clock times do not compare.
+        let (quantities, axes) = ([plot::Quantity::NormalisedReward], [plot::Axis::EnvironmentSteps]);
+        plot::draw_groups(&groups, &quantities, &axes, &self.directory.join("curves.svg"))
     }
 }
 
