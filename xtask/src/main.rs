@@ -80,6 +80,9 @@ enum Command {
     Film(film::Options),
     /// Make the tests' fixtures again with the scripts in tests/python
     Fixtures(python::FixtureOptions),
+    /// Become a program that gets SIGTERM when the process PARENT ends
+    #[command(hide = true)]
+    Child(train::child::Options),
 }
 
 fn main() -> ExitCode {
@@ -95,6 +98,7 @@ fn main() -> ExitCode {
         Command::Plot { metrics, quantities, seeds, out } => plot::run(&metrics, &quantities, seeds, &out),
         Command::Film(options) => film::run(&options),
         Command::Fixtures(options) => python::fixtures(&options),
+        Command::Child(options) => train::child::run(&options),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

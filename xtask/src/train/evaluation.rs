@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 
 use anyhow::{Context, Result, bail};
 use comic_setup::Interrupt;
 
-use super::Job;
 use super::display::Display;
+use super::{Job, child};
 use crate::evaluations::{ClipEvaluation, Evaluation};
 use crate::workspace;
 
@@ -48,15 +48,15 @@ pub(crate) fn read(directory: &Path) -> Result<BTreeMap<String, Evaluation>> {
 }
 
 fn evaluate(checkpoint: &Path, episodes: Option<u32>, stderr: Stdio) -> Result<Evaluation> {
-    let mut command = Command::new(workspace::program("comic-actor")?);
+    let mut command = child::command(&workspace::program("comic-actor")?);
     command.args(["evaluate", "--deterministic", "--json", "--checkpoint"]).arg(checkpoint);
     if let Some(episodes) = episodes {
         command.arg("--episodes").arg(episodes.to_string());
     }
     let output = command.stdin(Stdio::null()).stderr(stderr).output();
-    let output = output.with_context(|| format!("cannot start {}", workspace::describe(&command)))?;
+    let output = output.context("cannot start comic-actor")?;
     if !output.status.success() {
-        bail!("{} ended with {}", workspace::describe(&command), output.status);
+        bail!("comic-actor evaluate ended with {}", output.status);
     }
     serde_json::from_slice(&output.stdout)
         .with_context(|| format!("unreadable output of {}", workspace::describe(&command)))

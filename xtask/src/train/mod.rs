@@ -1,5 +1,6 @@
 //! `cargo xtask train`: one learner and its actors on this machine, from the start to the evaluation.
 
+pub(crate) mod child;
 pub(crate) mod display;
 pub(crate) mod evaluation;
 mod process;

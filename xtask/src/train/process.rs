@@ -33,7 +33,7 @@ impl Process {
             .stderr(output)
             .process_group(0)
             .spawn()
-            .with_context(|| format!("cannot start {name} ({})", Path::new(command.get_program()).display()))?;
+            .with_context(|| format!("cannot start {name}"))?;
         Ok(Self { name, log, log_start, child, started: Instant::now() })
     }
 
@@ -110,9 +110,10 @@ pub(super) struct Tail {
 }
 
 impl Tail {
-    /// Begins at the file's present end.
+    /// Begins after the last line that the file has. The learner removes what a kill left of a line behind it.
     pub(super) fn new(path: PathBuf) -> Self {
-        let position = fs::metadata(&path).map_or(0, |metadata| metadata.len());
+        let text = fs::read(&path).unwrap_or_default();
+        let position = text.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end as u64 + 1);
         Self { path, position }
     }
 

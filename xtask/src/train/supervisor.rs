@@ -1,15 +1,14 @@
 //! Starts, watches, restarts and stops the processes of a run.
 
-use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail};
 use comic_experiment::Experiment;
 use comic_setup::Interrupt;
 
-use super::Job;
 use super::display::Display;
 use super::process::{Process, Tail};
+use super::{Job, child};
 use crate::{evaluations, workspace};
 
 /// The time in which the learner must begin to serve. It opens the clips and builds the networks first.
@@ -51,7 +50,7 @@ impl<'a> Supervisor<'a> {
         let metrics = Tail::new(job.directory.metrics());
         let evaluations = Tail::new(job.directory.evaluations());
         let log = Tail::new(job.directory.log("learner"));
-        let mut command = Command::new(workspace::program("comic-learner")?);
+        let mut command = child::command(&workspace::program("comic-learner")?);
         command.args(&job.document).args(["--address", "127.0.0.1", "--port", &port.to_string()]);
         command.arg("--run").arg(job.directory.path());
         let mut learner = Process::start("comic-learner", &mut command, job.directory.log("learner"))?;
@@ -83,13 +82,13 @@ impl<'a> Supervisor<'a> {
     }
 
     fn start_evaluator(&self) -> Result<Process> {
-        let mut command = Command::new(workspace::program("comic-actor")?);
+        let mut command = child::command(&workspace::program("comic-actor")?);
         command.args(["evaluate", "--learner", &self.address(), "--watch"]);
         Process::start("evaluator", &mut command, self.job.directory.log("evaluator"))
     }
 
     fn start_actor(&self, number: usize) -> Result<Process> {
-        let mut command = Command::new(workspace::program("comic-actor")?);
+        let mut command = child::command(&workspace::program("comic-actor")?);
         command.args(["--learner", &self.address()]);
         let Experiment { unroll, actor, .. } = &self.job.experiment;
         if unroll.lockstep {
