@@ -1,6 +1,8 @@
 //! The errors of an actor.
 
+use std::io::ErrorKind;
 use std::path::PathBuf;
+use std::time::Duration;
 
 /// An actor's errors. A variant's message does not repeat its source. [`Error::is_configuration`] says whether a restart
 /// cannot help.
@@ -141,6 +143,16 @@ pub enum Error {
     /// libtorch.
     #[error("libtorch failed")]
     Torch(#[from] tch::TchError),
+    /// The learner did not answer for the time of `--give-up-after`.
+    #[error("the learner at {learner} has not answered for {} s: {reason}", after.as_secs_f64())]
+    GaveUp {
+        /// Its address.
+        learner: String,
+        /// The time.
+        after: Duration,
+        /// What the last attempt met.
+        reason: String,
+    },
     /// A worker thread ended by a panic; its message went to stderr.
     #[error("a worker thread panicked")]
     WorkerPanicked,
@@ -150,27 +162,76 @@ pub enum Error {
 }
 
 impl Error {
-    /// Whether the configuration is wrong, so that a restart cannot help (exit code 2 instead of 1).
+    /// The exit code of a program that ends with this error: 3 after giving up on the learner, 2 if the configuration is
+    /// wrong, 1 otherwise.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Self::GaveUp { .. } => 3,
+            _ if self.is_configuration() => 2,
+            _ => 1,
+        }
+    }
+
+    /// Whether the configuration is wrong, so that neither a restart nor another machine can help (exit code 2). A disk that
+    /// cannot be read and a missing OpenGL are this machine's.
     pub fn is_configuration(&self) -> bool {
-        matches!(
-            self,
+        match self {
             Self::Access(_)
-                | Self::Unwelcome { .. }
-                | Self::Refused { .. }
-                | Self::Experiment(_)
-                | Self::Spec(_)
-                | Self::Disagreement { .. }
-                | Self::Misfit { .. }
-                | Self::NoCache
-                | Self::Checkpoint { .. }
-                | Self::Usage(_)
-                | Self::Clips(_)
-                | Self::Task(_)
-        )
+            | Self::Unwelcome { .. }
+            | Self::Refused { .. }
+            | Self::Experiment(_)
+            | Self::Spec(_)
+            | Self::Disagreement { .. }
+            | Self::Misfit { .. }
+            | Self::NoCache
+            | Self::Checkpoint { .. }
+            | Self::Usage(_) => true,
+            Self::Clips(error) | Self::Task(comic_tasks::Error::Clips(error)) => match error {
+                comic_clips::Error::Unreadable { reason, .. } => {
+                    matches!(reason.kind(), ErrorKind::NotFound | ErrorKind::IsADirectory)
+                }
+                _ => true,
+            },
+            Self::Task(error) => !matches!(error, comic_tasks::Error::Graphics { .. }),
+            Self::Unreachable { .. }
+            | Self::Dismissed { .. }
+            | Self::Superseded { .. }
+            | Self::Changed
+            | Self::Stopped
+            | Self::Asset { .. }
+            | Self::Parameters { .. }
+            | Self::Derivatives { .. }
+            | Self::File { .. }
+            | Self::Download { .. }
+            | Self::Defects { .. }
+            | Self::Torch(_)
+            | Self::GaveUp { .. }
+            | Self::WorkerPanicked
+            | Self::Thread(_) => false,
+        }
     }
 
     pub(crate) fn file(path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
         move |source| Self::File { path, source }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_another_machine_may_not_meet_is_no_configuration_error() {
+        let unreadable =
+            |reason: ErrorKind| comic_clips::Error::Unreadable { path: "walks.h5".into(), reason: reason.into() };
+        let failing = || unreadable(ErrorKind::Other);
+        let graphics = comic_tasks::Error::Graphics { reason: "no EGL display".into() };
+        for error in [Error::Clips(failing()), Error::Task(failing().into()), Error::Task(graphics)] {
+            assert_eq!(error.exit_code(), 1, "{error}");
+        }
+        for error in [comic_clips::Error::NoSources, unreadable(ErrorKind::NotFound)] {
+            assert_eq!(Error::Clips(error).exit_code(), 2);
+        }
     }
 }

@@ -3,6 +3,7 @@
 use std::io::IsTerminal as _;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::time::Duration;
 
 use anyhow::Context as _;
 use clap::{Args, CommandFactory as _, Parser, Subcommand, ValueEnum};
@@ -22,8 +23,8 @@ use tracing_subscriber::fmt::format::FmtSpan;
 
 const EXIT_CODES: &str = "\
 Exit codes: 0 when the run is over, 2 when the configuration is wrong and starting again cannot help (a token or a
-certificate that is not accepted, another release), 1 otherwise (told to stop before the run was over, or the learner now
-serves another experiment).
+certificate that is not accepted, another release), 3 when the learner did not answer for the time of --give-up-after, 1
+otherwise (told to stop before the run was over, or the learner now serves another experiment).
 Logs go to standard error; RUST_LOG chooses what (default: info).";
 
 /// Steps humanoids for a learner; it needs only the learner's address.
@@ -82,6 +83,10 @@ struct Act {
     /// Where files from the learner are kept; `comic` in the user's cache directory unless given.
     #[arg(long, value_name = "DIR", env = "COMIC_CACHE")]
     cache: Option<PathBuf>,
+    /// End with exit code 3 when the learner has not answered for so long. Never unless given.
+    #[arg(long, value_name = "SECONDS", env = "COMIC_GIVE_UP_AFTER")]
+    #[arg(value_parser = clap::value_parser!(u32).range(1..))]
+    give_up_after: Option<u32>,
     /// Write episodes whose simulation diverged into this directory, at most 16; see `comic-actor replay`.
     #[arg(long, value_name = "DIR")]
     dump_diverged: Option<PathBuf>,
@@ -108,8 +113,7 @@ fn main() -> ExitCode {
                 Some(stopped @ Error::Stopped) => tracing::info!("{stopped}"),
                 _ => tracing::error!("{error:#}"),
             }
-            let configuration = known.is_some_and(Error::is_configuration);
-            ExitCode::from(if configuration { 2 } else { 1 })
+            ExitCode::from(known.map_or(1, Error::exit_code))
         }
     }
 }
@@ -126,13 +130,25 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
         Some(Command::Health(health)) => health.run(),
         Some(Command::Manual(manual)) => manual.write(Arguments::command()).context("cannot write the manual"),
         None => {
-            let Act { learner, access, name, threads, environments, cache, dump_diverged, liveness } = arguments.act;
+            let Act { learner, access, name, threads, environments, cache, give_up_after, dump_diverged, liveness } =
+                arguments.act;
             let learner = learner.ok_or_else(|| {
                 Error::Usage("no learner: give its address with --learner http://host:7070, or see --help".into())
             })?;
             let (threads, environments) = (threads.map(usize::from), environments.map(usize::from));
-            run::run(&run::Options { learner, access, name, threads, environments, cache, dump_diverged, liveness })
-                .context("cannot act")
+            let give_up_after = give_up_after.map(|seconds| Duration::from_secs(seconds.into()));
+            let options = run::Options {
+                learner,
+                access,
+                name,
+                threads,
+                environments,
+                cache,
+                give_up_after,
+                dump_diverged,
+                liveness,
+            };
+            run::run(&options).context("cannot act")
         }
     }
 }

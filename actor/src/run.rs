@@ -48,6 +48,8 @@ pub struct Options {
     pub environments: Option<usize>,
     /// Directory of the asset cache; the user's cache directory when absent.
     pub cache: Option<PathBuf>,
+    /// How long to go on while the learner does not answer; for ever when absent.
+    pub give_up_after: Option<Duration>,
     /// Directory for episodes that diverged, if they are kept.
     pub dump_diverged: Option<PathBuf>,
     /// File that is written while environments are stepped, for a health check.
@@ -60,7 +62,7 @@ type TaskWorker = Worker<Watched, Box<dyn ForwardPass + Send>>;
 ///
 /// # Errors
 /// [`Error::Stopped`] when the process was told to stop before that (SIGTERM, SIGINT, SIGHUP) and has sent its finished
-/// unrolls. A lost connection is no error.
+/// unrolls, and [`Error::GaveUp`]. A lost connection is no error.
 pub fn run(options: &Options) -> Result<(), Error> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
@@ -87,6 +89,7 @@ fn act(runtime: &Runtime, options: &Options) -> Result<(), Error> {
         name: options.name.clone(),
         threads: options.threads,
         environments: options.environments,
+        give_up_after: options.give_up_after,
     };
     let joined = runtime.block_on(session::join(&session, stop.clone()))?;
     let threads = options.threads.unwrap_or(joined.experiment.actor.threads).max(1);

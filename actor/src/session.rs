@@ -1,12 +1,12 @@
 //! The connection to the learner, for the whole time of the process.
 //!
 //! [`join`] asks the learner for this actor's index and for the experiment. [`Joined::run`] then sends unrolls and receives
-//! parameters. It reconnects after every loss, with back-off and without a limit, and sends unrolls without
-//! acknowledgement again, in order. It ends only when the experiment changes, when the learner refuses the actor, or when
-//! the run is over.
+//! parameters. It reconnects after every loss, with back-off, and sends unrolls without acknowledgement again, in order. It
+//! ends only when the experiment changes, when the learner refuses the actor, when the learner has not answered for
+//! [`JoinSettings::give_up_after`], or when the run is over.
 //!
-//! A refused token or certificate ends an actor that has never joined. An actor that has joined before retries: the files
-//! are read for every connection and may be renewed.
+//! A refused token or certificate ends an actor that has never joined, after some minutes. An actor that has joined before
+//! retries: the files are read for every connection and may be renewed.
 
 mod assets;
 mod backoff;
@@ -60,6 +60,8 @@ pub struct JoinSettings {
     pub threads: Option<usize>,
     /// Environments a thread; the experiment's number when absent.
     pub environments: Option<usize>,
+    /// How long to go on while the learner does not answer; for ever when absent.
+    pub give_up_after: Option<Duration>,
 }
 
 /// ExchangeLimits of an exchange.
@@ -91,6 +93,7 @@ pub struct Joined {
     /// The experiment's clip sources and, in transfer, its low level, with their files on this machine.
     pub assets: HashMap<String, PathBuf>,
     terms: Terms,
+    give_up_after: Option<Duration>,
     connector: Connector,
     link: Link,
 }
@@ -128,21 +131,21 @@ fn lasting(document: &str) -> String {
     experiment.to_toml().unwrap_or_else(|_| document.to_string())
 }
 
-/// Joins the learner, retrying without a limit, and fetches the assets that this machine lacks.
+/// Joins the learner, and fetches the assets that this machine lacks.
 ///
 /// # Errors
-/// A refusal, an experiment that cannot be used, no cache directory, a full disk; [`Error::Stopped`] when `stop` became
-/// true first.
+/// [`Error::GaveUp`], a refusal, an experiment that cannot be used, no cache directory, a full disk; [`Error::Stopped`] when
+/// `stop` became true first.
 pub async fn join(options: &JoinSettings, mut stop: watch::Receiver<bool>) -> Result<Joined, Error> {
     tokio::select! {
-        joined = join_for_ever(options) => joined,
+        joined = join_patiently(options) => joined,
         _ = stop.wait_for(|stop| *stop) => Err(Error::Stopped),
     }
 }
 
-async fn join_for_ever(options: &JoinSettings) -> Result<Joined, Error> {
+async fn join_patiently(options: &JoinSettings) -> Result<Joined, Error> {
     let mut connector = Connector::new(options)?;
-    let mut backoff = Backoff::default();
+    let mut backoff = Backoff::new(options.give_up_after);
     loop {
         match attempt(options, &mut connector).await {
             Ok((link, CheckedReply { experiment, spec, layout, environments }, assets)) => {
@@ -156,12 +159,12 @@ async fn join_for_ever(options: &JoinSettings) -> Result<Joined, Error> {
                     environments,
                     assets,
                     terms: Terms::of(reply),
+                    give_up_after: options.give_up_after,
                     connector,
                     link,
                 });
             }
-            Err(Failure::Fatal(error)) => return Err(error),
-            Err(Failure::Lost(reason)) => backoff.wait(&options.learner, &reason).await,
+            Err(failure) => backoff.retry(&options.learner, failure).await?,
         }
     }
 }
@@ -171,7 +174,8 @@ type Reply = (Link, CheckedReply, HashMap<String, PathBuf>);
 async fn attempt(options: &JoinSettings, connector: &mut Connector) -> Result<Reply, Failure> {
     let mut link = connector.connect(0).await?;
     let checked = read_reply(&link.reply).map_err(Failure::Fatal)?;
-    let assets = assets::fetch(&mut link.client, &link.reply.assets, options.cache.as_deref()).await?;
+    let assets = assets::fetch(&mut link.client, &link.reply.assets, options.cache.as_deref()).await;
+    let assets = assets.map_err(Failure::after_an_answer)?;
     Ok((link, checked, assets))
 }
 
@@ -220,7 +224,7 @@ impl Joined {
     /// acknowledged; both are `Ok`. When `stop` becomes true it sends the finished unrolls, for at most `limits.flush`.
     ///
     /// # Errors
-    /// [`Error::Changed`], a refusal at a reconnect.
+    /// [`Error::Changed`], [`Error::GaveUp`], a refusal at a reconnect.
     pub async fn run(
         self,
         limits: ExchangeLimits,
@@ -247,7 +251,7 @@ impl Joined {
         mailbox: Arc<Mailbox>,
         outbox: &mut Outbox,
     ) -> Result<bool, Error> {
-        let mut backoff = Backoff::default();
+        let mut backoff = Backoff::new(self.give_up_after);
         let mut link = Some(self.link);
         loop {
             if unrolls.is_closed() && unrolls.is_empty() && outbox.is_empty() {
@@ -257,8 +261,9 @@ impl Joined {
                 Some(link) => Ok(link),
                 None => self.connector.reconnect(&self.terms, outbox.acknowledged()).await,
             };
-            let reason = match attempt {
+            let failure = match attempt {
                 Ok(link) => {
+                    backoff.answered();
                     let since = Instant::now();
                     let exchange = Exchange { unrolls: &mut unrolls, outbox, mailbox: &mailbox, limits };
                     match exchange.run(link, self.connector.incarnation()).await {
@@ -266,16 +271,15 @@ impl Joined {
                         Ended::Over => return Ok(true),
                         Ended::Lost(reason) => {
                             if since.elapsed() > STABLE {
-                                backoff = Backoff::default();
+                                backoff.reset();
                             }
-                            reason
+                            Failure::Lost(reason)
                         }
                     }
                 }
-                Err(Failure::Fatal(error)) => return Err(error),
-                Err(Failure::Lost(reason)) => reason,
+                Err(failure) => failure,
             };
-            backoff.wait(self.connector.address(), &reason).await;
+            backoff.retry(self.connector.address(), failure).await?;
         }
     }
 }

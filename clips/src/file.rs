@@ -210,10 +210,23 @@ fn hdf5(storage: &Arc<dyn Storage>) -> Result<Hdf5File, Hdf5Error> {
 fn guarded<T>(path: &Path, item: &str, read: impl FnOnce() -> Result<T, Hdf5Error>) -> Result<T, Error> {
     let reason = match catch_unwind(AssertUnwindSafe(read)) {
         Ok(Ok(value)) => return Ok(value),
-        Ok(Err(error)) => reason(&error),
+        Ok(Err(error)) => match fault_of_the_disk(error) {
+            Ok(reason) => return Err(Error::Unreadable { path: path.into(), reason }),
+            Err(error) => reason(&error),
+        },
         Err(_) => "damaged: the HDF5 reader failed; get the file again".into(),
     };
     Err(Error::Malformed { path: path.into(), item: item.into(), reason })
+}
+
+/// The operating system's error, if the disk is at fault, and not the file's content.
+fn fault_of_the_disk(error: Hdf5Error) -> Result<std::io::Error, Hdf5Error> {
+    use std::io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
+    match error {
+        Hdf5Error::Io(error) if !matches!(error.kind(), InvalidData | InvalidInput | UnexpectedEof) => Ok(error),
+        Hdf5Error::Context { source, .. } => fault_of_the_disk(*source),
+        error => Err(error),
+    }
 }
 
 fn reason(error: &Hdf5Error) -> String {
@@ -294,5 +307,25 @@ impl Walker<'_> {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io;
+
+    use super::*;
+
+    #[test]
+    fn a_disk_that_fails_is_told_from_a_damaged_file() {
+        let failed = |error: io::Error| {
+            let context = Hdf5Error::Context { path: "walk".into(), source: Box::new(error.into()) };
+            guarded::<()>(Path::new("walks.h5"), "/", || Err(context)).unwrap_err()
+        };
+        // EIO
+        let disk = failed(io::Error::from_raw_os_error(5));
+        assert!(matches!(disk, Error::Unreadable { .. }), "{disk}");
+        let damage = failed(io::ErrorKind::UnexpectedEof.into());
+        assert!(matches!(damage, Error::Malformed { .. }), "{damage}");
     }
 }

@@ -20,13 +20,20 @@ pub struct Project {
     files: &'static [&'static str],
     /// Options of the learner in addition to those of the file.
     options: String,
+    /// For how many seconds actors and the evaluator wait for a learner that does not answer.
+    pub patience: u32,
 }
 
 impl Project {
     /// Makes a project of these files in `deploy`. It starts nothing.
     pub fn new(purpose: &str, files: &'static [&'static str]) -> Self {
         // The files name the preset themselves.
-        Self { name: format!("comic-{purpose}-{}", std::process::id()), files, options: SMALL[2..].join(" ") }
+        Self {
+            name: format!("comic-{purpose}-{}", std::process::id()),
+            files,
+            options: SMALL[2..].join(" "),
+            patience: 600,
+        }
     }
 
     /// Adds an option for the next start of the learner.
@@ -51,6 +58,7 @@ impl Project {
         }
         command.env("COMIC_OPTIONS", &self.options).env("COMIC_METRICS_PORT", "").env("COMIC_TENSORBOARD_PORT", "");
         command.env("COMIC_LEARNER_CPUS", "1").env("COMIC_ACTOR_CPUS", "0.5");
+        command.env("COMIC_GIVE_UP_AFTER", self.patience.to_string());
         run(&mut command)
     }
 

@@ -18,14 +18,11 @@ use tempfile::TempDir;
 use crate::process::{POLL, Process};
 use crate::repository::root;
 
-/// Environment variables of the user that would change how the programs reach the learner.
-const SETTINGS: [&str; 7] =
-    ["COMIC_LIVENESS", "COMIC_LEARNER", "COMIC_CA", "COMIC_CERT", "COMIC_KEY", "COMIC_TOKEN_FILE", "COMIC_TOKEN"];
 /// Limit of a status call.
 const CALL_LIMIT: Duration = Duration::from_secs(5);
 
 /// Options of a learner with a small experiment: an update takes milliseconds.
-pub const SMALL: [&str; 32] = [
+pub const SMALL: [&str; 30] = [
     "--preset",
     "quickstart",
     "--clips",
@@ -51,8 +48,6 @@ pub const SMALL: [&str; 32] = [
     "--set",
     "actor.environments=2",
     "--set",
-    "warm_start.steps=0",
-    "--set",
     "learner.checkpoint_seconds=0.5",
     "--set",
     "learner.metrics_seconds=0.2",
@@ -76,6 +71,14 @@ pub fn program(name: &str) -> Result<PathBuf> {
         path.display()
     );
     Ok(path)
+}
+
+/// Removes the user's settings, which would change how the programs reach the learner. Where the humanoid lies stays.
+fn without_settings(command: &mut Command) {
+    let settings = std::env::vars_os().map(|(name, _)| name.to_string_lossy().into_owned());
+    for name in settings.filter(|name| name.starts_with("COMIC_") && name != "COMIC_DM_CONTROL_DIR") {
+        command.env_remove(name);
+    }
 }
 
 /// The help text of a command.
@@ -313,9 +316,7 @@ impl System {
     pub fn ask(&self, command: &[&str]) -> Result<Output> {
         let mut asking = Command::new(program("comic-learner")?);
         asking.args(command).args(["--learner", &self.url()]).args(flags(&self.access));
-        for name in SETTINGS {
-            asking.env_remove(name);
-        }
+        without_settings(&mut asking);
         asking.output().context("cannot start comic-learner")
     }
 
@@ -327,9 +328,7 @@ impl System {
         let home = self.directory.path().join("home");
         fs::create_dir_all(&home).context("cannot make a home directory")?;
         command.env("HOME", &home).env("XDG_CACHE_HOME", home.join("cache")).env("NO_COLOR", "1");
-        for name in SETTINGS {
-            command.env_remove(name);
-        }
+        without_settings(&mut command);
         if !command.get_envs().any(|(name, _)| name == "RUST_LOG") {
             command.env_remove("RUST_LOG");
         }

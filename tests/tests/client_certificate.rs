@@ -1,5 +1,5 @@
-//! When the learner requires client certificates, an actor without one ends at first contact with exit code 2: a retry
-//! would not help. The same holds for an actor that does not trust the learner's certificate.
+//! When the learner requires client certificates, an actor without one tries for three minutes, or for `--give-up-after` if
+//! that is shorter, and ends with exit code 2. The same holds for an actor that does not trust the learner's certificate.
 
 use std::time::Duration;
 
@@ -25,7 +25,9 @@ async fn an_actor_without_an_accepted_certificate_ends_and_one_with_it_joins() -
     others.ca = own.access(None).ca;
     let distrustful = foreign.access(None);
     for access in [own.access(None), others, distrustful] {
-        let mut refused = system.start_actor_with(&access, |_| {})?;
+        let mut refused = system.start_actor_with(&access, |actor| {
+            actor.args(["--give-up-after", "1"]);
+        })?;
         let status = refused.until_it_ends(LIMIT).await?;
         ensure!(status.code() == Some(2), "{access:?}: {status}: {}", refused.log());
     }

@@ -12,6 +12,8 @@ use serde_json::Value;
 
 /// Long enough for two slow cores. A step ends as soon as its condition holds.
 const LIMIT: Duration = Duration::from_secs(180);
+/// Docker waits longer and longer between two starts, in all for two minutes, and without a network a name is looked up slowly.
+const ELEVEN_STARTS: Duration = Duration::from_secs(900);
 /// More unrolls than removed containers can have in flight.
 const BEYOND_WHAT_IS_LEFT: u64 = 100;
 
@@ -197,7 +199,7 @@ async fn containers_with_a_wrong_configuration_are_restarted_ten_times_only() ->
 async fn containers_end_when_the_run_is_over() -> Result<()> {
     let mut project = Project::new("over", &["compose.yaml"]);
     project.tell("--set budget.updates=200");
-    // The learner answers for 1.5 s after the end, so everyone has to be connected by then.
+    // Nobody waits at the end for an actor that has never joined, so everyone has to be connected by then.
     project.up(0)?;
     project.container("evaluator")?.until_log_holds("following the learner's checkpoints", LIMIT).await?;
     project.up(2)?;
@@ -208,5 +210,25 @@ async fn containers_end_when_the_run_is_over() -> Result<()> {
         container.until_is(".State.Status", "exited", LIMIT).await?;
         ensure!(container.inspect(".State.ExitCode")? == "0", "{}", container.log()?);
     }
+    Ok(())
+}
+
+#[tokio::test]
+async fn containers_end_when_they_missed_the_end_of_the_run() -> Result<()> {
+    let mut project = Project::new("missed", &["compose.yaml"]);
+    project.patience = 1;
+    project.tell("--set budget.updates=1000");
+    project.up(1)?;
+    let [learner, actor] = [project.container("learner")?, project.container("actor")?];
+    actor.until_log_holds("joined the learner", LIMIT).await?;
+    docker(&["network", "disconnect", &project.network(), &actor.inspect(".Id")?])?;
+    // A second actor brings the run to its end.
+    project.up(2)?;
+    learner.until_is(".State.Status", "exited", LIMIT).await?;
+    ensure!(learner.inspect(".State.ExitCode")? == "0", "{}", learner.log()?);
+    // Docker starts it again ten times.
+    actor.until_is(".RestartCount", "10", ELEVEN_STARTS).await?;
+    actor.until_is(".State.Status", "exited", LIMIT).await?;
+    ensure!(actor.inspect(".State.ExitCode")? == "3", "{}", actor.log()?);
     Ok(())
 }

@@ -96,3 +96,14 @@ async fn an_evaluator_with_a_wrong_configuration_ends_with_2_and_says_what_is_wr
     ensure!(status.code() == Some(2) && evaluator.log().contains("--ca"), "{status}: {}", evaluator.log());
     Ok(())
 }
+
+#[tokio::test]
+async fn actors_and_evaluators_that_give_up_on_the_learner_end_with_3() -> Result<()> {
+    let mut system = System::new(&SMALL)?;
+    for command in [&["evaluate", "--watch"][..], &[]] {
+        let mut program = system.start("comic-actor", &[command, &["--give-up-after", "1"]].concat())?;
+        let status = program.until_it_ends(LIMIT).await?;
+        ensure!(status.code() == Some(3) && program.log().contains("has not answered for 1 s"), "{}", program.log());
+    }
+    Ok(())
+}

@@ -172,8 +172,9 @@ fn actors_are_an_indexed_job_that_follows_their_exit_codes() -> Result<()> {
         let pod = cluster.actor_pod()?;
         let name = option(container(pod)?, "--name")?;
         ensure!(name.contains("$(JOB_COMPLETION_INDEX)"), "{name}: each pod would replace the others");
-        let actions = [action_after(job, 1)?, action_after(job, 2)?];
-        ensure!(actions == [Some("Ignore"), Some("FailJob")], "{actions:?}");
+        let actions = [action_after(job, 1)?, action_after(job, 2)?, action_after(job, 3)?];
+        ensure!(actions == [Some("Ignore"), Some("FailJob"), Some("FailIndex")], "{actions:?}");
+        ensure!(job.backoff_limit.is_none() && job.backoff_limit_per_index.is_some(), "one index delays the others");
 
         let budget = cluster.budget.spec.as_ref().context("no spec")?;
         ensure!(
@@ -219,13 +220,14 @@ fn the_evaluator_is_a_small_job_with_the_access_of_actors() -> Result<()> {
     each(|cluster| {
         let job = cluster.evaluator.spec.as_ref().context("no spec")?;
         ensure!(job.parallelism.is_none() && job.completions.is_none(), "more than one evaluator");
-        let actions = [action_after(job, 1)?, action_after(job, 2)?];
-        ensure!(actions == [None, Some("FailJob")], "{actions:?}");
+        let actions = [action_after(job, 1)?, action_after(job, 2)?, action_after(job, 3)?];
+        ensure!(actions == [None, Some("FailJob"), Some("FailJob")], "{actions:?}");
         let evaluator = container(cluster.evaluator_pod()?)?;
         let args = evaluator.args.as_deref().unwrap_or_default();
         ensure!(args.starts_with(&["evaluate".to_owned(), "--watch".to_owned()]), "{args:?}");
         let mut access = environment(container(cluster.actor_pod()?)?);
         access.remove("COMIC_LEARNER");
+        ensure!(access.contains_key("COMIC_GIVE_UP_AFTER"), "an actor waits for ever: {access:?}");
         ensure!(environment(evaluator) == access, "{:?}", evaluator.env);
         let limits = evaluator.resources.as_ref().and_then(|resources| resources.limits.as_ref());
         ensure!(amount(&limits.context("no limits")?["cpu"])? < 1.0, "{limits:?}");

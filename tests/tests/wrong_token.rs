@@ -1,5 +1,5 @@
-//! An actor with a wrong token ends at first contact with exit code 2: a retry would not help. An actor that had joined
-//! before waits for the renewed token.
+//! An actor with a wrong token tries for three minutes, or for `--give-up-after` if that is shorter, and ends with exit code 2.
+//! An actor that had joined before waits for the renewed token.
 
 use std::fs;
 use std::time::Duration;
@@ -11,7 +11,7 @@ use comic_tests::system::{SMALL, System};
 const LIMIT: Duration = Duration::from_secs(120);
 
 #[tokio::test]
-async fn a_wrong_token_ends_an_actor_unless_it_had_joined_before() -> Result<()> {
+async fn a_wrong_token_ends_an_actor_unless_it_is_renewed_in_time_or_it_had_joined_before() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let [accepted, shown, wrong] = ["accepted", "shown", "wrong"].map(|name| directory.path().join(name));
     fs::write(&accepted, "first-token\n")?;
@@ -22,12 +22,20 @@ async fn a_wrong_token_ends_an_actor_unless_it_had_joined_before() -> Result<()>
     system.access = Access { token_file: Some(shown.clone()), ..Access::default() };
     system.start_learner(LIMIT).await?;
 
-    for access in [Access { token_file: Some(wrong), ..Access::default() }, Access::default()] {
-        let mut refused = system.start_actor_with(&access, |_| {})?;
+    for access in [Access { token_file: Some(wrong.clone()), ..Access::default() }, Access::default()] {
+        let mut refused = system.start_actor_with(&access, |actor| {
+            actor.args(["--give-up-after", "1"]);
+        })?;
         let status = refused.until_it_ends(LIMIT).await?;
         ensure!(status.code() == Some(2), "{status}: {}", refused.log());
         ensure!(refused.log().contains("--token-file"), "the remedy is not named: {}", refused.log());
     }
+
+    let mut early =
+        system.start_actor_with(&Access { token_file: Some(wrong.clone()), ..Access::default() }, |_| {})?;
+    early.until_log_holds("does not accept this process", LIMIT).await?;
+    fs::write(&wrong, "first-token\n")?;
+    early.until_log_holds("joined the learner", LIMIT).await?;
 
     let mut actor = system.start_actor()?;
     actor.until_log_holds("joined the learner", LIMIT).await?;

@@ -109,6 +109,10 @@ pub struct Evaluate {
     /// Where files from the learner are kept; `comic` in the user's cache directory unless given.
     #[arg(long, value_name = "DIR", env = "COMIC_CACHE", help_heading = "Watch")]
     cache: Option<PathBuf>,
+    /// End with exit code 3 when the learner has not answered for so long. Never unless given.
+    #[arg(long, value_name = "SECONDS", env = "COMIC_GIVE_UP_AFTER", help_heading = "Watch")]
+    #[arg(value_parser = clap::value_parser!(u32).range(1..))]
+    give_up_after: Option<u32>,
     #[command(flatten)]
     access: Access,
     /// Films the first episode: .gif, .webp, .mp4 (through ffmpeg) or .png (a contact sheet).
@@ -157,6 +161,7 @@ impl Evaluate {
             learner: learner.to_owned(),
             access: self.access.clone(),
             cache: self.cache.clone(),
+            give_up_after: self.give_up_after.map(|seconds| Duration::from_secs(seconds.into())),
             interval: Duration::from_secs_f64(self.every * 60.0),
             clips: self.clips.clone(),
             seed: self.seed,

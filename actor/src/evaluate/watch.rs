@@ -38,6 +38,8 @@ pub(super) struct WatchSettings {
     pub(super) learner: String,
     pub(super) access: Access,
     pub(super) cache: Option<PathBuf>,
+    /// How long to go on while the learner does not answer; for ever when absent.
+    pub(super) give_up_after: Option<Duration>,
     /// From the begin of an evaluation to the begin of the next one, at least.
     pub(super) interval: Duration,
     /// Clips in place of the experiment's own.
@@ -51,13 +53,14 @@ pub(super) struct WatchSettings {
 ///
 /// # Errors
 /// [`Error::Stopped`] when the process was told to stop before that (SIGTERM, SIGINT, SIGHUP); a learner that does not
-/// accept this process; an experiment that cannot be used.
+/// accept this process, or does not answer for too long; an experiment that cannot be used.
 pub(super) fn run(settings: &WatchSettings) -> Result<(), Error> {
     // Without a lower priority evaluations are still correct.
     let _ = rustix::process::nice(settings.nice);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
     let runtime = runtime.map_err(Error::Thread)?;
-    let follower = Follower::new(settings.learner.clone(), settings.access.clone(), settings.cache.clone())?;
+    let WatchSettings { learner, access, cache, give_up_after, .. } = settings.clone();
+    let follower = Follower::new(learner, access, cache, give_up_after)?;
     let (sender, mut newest) = watch::channel(None);
     let following = runtime.spawn(follow(follower.clone(), sender));
     let mut evaluator = Evaluator { settings, scene: None, films: true };
@@ -75,11 +78,11 @@ pub(super) fn run(settings: &WatchSettings) -> Result<(), Error> {
                 evaluator.evaluate(&checkpoint, fetched, &newest)?;
             }
             // A newer checkpoint may have replaced it.
-            Some(Err(Failure::Lost(reason))) => {
+            Some(Err(Failure::Lost(reason) | Failure::Postponed(reason))) => {
                 tracing::info!(updates = checkpoint.updates, "not evaluated: {reason}");
                 due = begun + RETRY;
             }
-            Some(Err(Failure::Fatal(error))) => return Err(error),
+            Some(Err(Failure::Unwelcome(error) | Failure::Fatal(error))) => return Err(error),
             None => break,
         }
     }

@@ -18,15 +18,24 @@ const MESSAGE_LIMIT: usize = 16 << 20;
 /// Why there is no connection.
 #[derive(Debug)]
 pub(crate) enum Failure {
-    /// Retry.
+    /// The learner did not answer. Retry.
     Lost(String),
+    /// It answered, and may accept this process later. Retry.
+    Postponed(String),
+    /// It does not accept this process's token or certificate, or this process does not accept the learner's. Retry for some
+    /// minutes: after a renewal one side has the new secret before the other.
+    Unwelcome(Error),
     /// A retry cannot help.
     Fatal(Error),
 }
 
 impl From<Status> for Failure {
     fn from(status: Status) -> Self {
-        Self::Lost(describe(&status))
+        match status.code() {
+            // All places are taken, or too many calls are in flight.
+            Code::ResourceExhausted => Self::Postponed(describe(&status)),
+            _ => Self::Lost(describe(&status)),
+        }
     }
 }
 
@@ -35,8 +44,16 @@ impl Failure {
     /// renewed token.
     pub(super) fn transient(self) -> Self {
         match self {
-            Self::Fatal(error) => Self::Lost(chain(&error)),
-            lost => lost,
+            Self::Unwelcome(error) | Self::Fatal(error) => Self::Postponed(chain(&error)),
+            retry => retry,
+        }
+    }
+
+    /// For a call after one that the learner has answered.
+    pub(super) fn after_an_answer(self) -> Self {
+        match self {
+            Self::Lost(reason) => Self::Postponed(reason),
+            other => other,
         }
     }
 }
@@ -47,21 +64,21 @@ pub(super) fn check(address: &str, access: &Access) -> Result<(), AccessError> {
     access.bearer().map(drop)
 }
 
-/// Connects by TCP and HTTP/2. A certificate that is refused, on either side, is fatal.
+/// Connects by TCP and HTTP/2.
 pub(super) async fn connect(address: &str, access: &Access) -> Result<Client, Failure> {
     // The files matched at the start. During a renewal they may not match for a moment.
     let renewed = |error: AccessError| Failure::Lost(chain(&error));
     let endpoint = access.lasting_endpoint(address).map_err(renewed)?;
     let bearer = access.bearer().map_err(renewed)?;
     let channel = endpoint.connect().await.map_err(|error| match distrusted(&error) {
-        true => Failure::Fatal(unwelcome(address, chain(&error))),
+        true => unwelcome(address, chain(&error)),
         false => Failure::Lost(no_connection(&error)),
     })?;
     Ok(LearnerClient::with_interceptor(channel, bearer).max_decoding_message_size(MESSAGE_LIMIT))
 }
 
-pub(super) fn unwelcome(address: &str, message: String) -> Error {
-    Error::Unwelcome { url: address.to_owned(), message }
+pub(super) fn unwelcome(address: &str, message: String) -> Failure {
+    Failure::Unwelcome(Error::Unwelcome { url: address.to_owned(), message })
 }
 
 /// A status with its causes and without its metadata.
@@ -134,7 +151,7 @@ impl Connector {
         request.set_timeout(CALL);
         let reply = match client.join(request).await {
             Ok(reply) => reply.into_inner(),
-            Err(status) => return Err(self.judge(&status)),
+            Err(status) => return Err(self.judge(status)),
         };
         if self.learner_epoch.replace(reply.learner_epoch) != Some(reply.learner_epoch) {
             tracing::info!(actor = reply.actor, learner_epoch = reply.learner_epoch, "joined the learner");
@@ -163,12 +180,13 @@ impl Connector {
         if Terms::of(&link.reply) == *terms { Ok(link) } else { Err(Failure::Fatal(Error::Changed)) }
     }
 
-    fn judge(&self, status: &Status) -> Failure {
-        let message = describe(status);
+    fn judge(&self, status: Status) -> Failure {
+        let message = describe(&status);
         // An actor that has joined before has a correct configuration. It may be accepted again, for instance with a
         // renewed token.
         match (status.code(), self.actor) {
-            (Code::Unauthenticated, None) => Failure::Fatal(unwelcome(&self.address, status.message().to_string())),
+            (Code::Unauthenticated, None) => unwelcome(&self.address, status.message().to_string()),
+            (Code::Unauthenticated, Some(_)) => Failure::Postponed(message),
             (
                 Code::InvalidArgument | Code::FailedPrecondition | Code::Unimplemented | Code::PermissionDenied,
                 actor,
@@ -177,8 +195,8 @@ impl Connector {
                 None => Error::Refused { url: self.address.clone(), message },
             }),
             (Code::Aborted, _) => Failure::Fatal(Error::Superseded { message }),
-            _ if self.is_barred(status) => Failure::Fatal(unwelcome(&self.address, chain(status))),
-            _ => Failure::Lost(message),
+            _ if self.is_barred(&status) => unwelcome(&self.address, chain(&status)),
+            _ => status.into(),
         }
     }
 }

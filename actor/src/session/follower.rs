@@ -15,7 +15,7 @@ use super::backoff::Backoff;
 use super::connection::{CALL, Failure, check, connect, describe, unwelcome};
 use crate::Error;
 
-/// Between two questions. A learner whose run is over answers for 1.5 s more.
+/// Between two questions. A learner whose run is over answers for at least 1.5 s more.
 const INTERVAL: Duration = Duration::from_millis(500);
 /// Most bytes of an experiment and of a policy.
 const EXPERIMENT_LIMIT: u64 = 16 << 20;
@@ -29,6 +29,8 @@ pub struct Follower {
     access: Access,
     /// Directory of the asset cache; the user's cache directory when absent.
     cache: Option<PathBuf>,
+    /// How long to go on while the learner does not answer; for ever when absent.
+    give_up_after: Option<Duration>,
 }
 
 /// A checkpoint's content.
@@ -49,32 +51,36 @@ impl Follower {
     ///
     /// # Errors
     /// [`Error::Access`], when address, certificates or token cannot be used.
-    pub fn new(learner: String, access: Access, cache: Option<PathBuf>) -> Result<Self, Error> {
+    pub fn new(
+        learner: String,
+        access: Access,
+        cache: Option<PathBuf>,
+        give_up_after: Option<Duration>,
+    ) -> Result<Self, Error> {
         check(&learner, &access)?;
-        Ok(Self { learner, access, cache })
+        Ok(Self { learner, access, cache, give_up_after })
     }
 
     /// Shows the newest checkpoint until the run is over, and none while there is no connection. A lost connection is no
     /// error.
     ///
     /// # Errors
-    /// When the learner does not accept this process, or is of another release.
+    /// When the learner does not accept this process, is of another release, or does not answer for too long.
     pub async fn follow(&self, newest: &watch::Sender<Option<Checkpoint>>) -> Result<(), Error> {
-        let mut backoff = Backoff::default();
+        let mut backoff = Backoff::new(self.give_up_after);
         let mut accepted = false;
         loop {
             let mut answered = false;
             let ended = self.ask(newest, &mut answered).await;
             if answered {
-                (accepted, backoff) = (true, Backoff::default());
+                accepted = true;
+                backoff.answered();
+                backoff.reset();
             }
             newest.send_replace(None);
-            let reason = match ended.map_err(|failure| if accepted { failure.transient() } else { failure }) {
-                Ok(()) => return Ok(()),
-                Err(Failure::Fatal(error)) => return Err(error),
-                Err(Failure::Lost(reason)) => reason,
-            };
-            backoff.wait(&self.learner, &reason).await;
+            let Err(failure) = ended else { return Ok(()) };
+            let failure = if accepted { failure.transient() } else { failure };
+            backoff.retry(&self.learner, failure).await?;
         }
     }
 
@@ -84,7 +90,7 @@ impl Follower {
         loop {
             let mut request = Request::new(CheckpointRequest {});
             request.set_timeout(CALL);
-            let reply = client.get_checkpoint(request).await.map_err(|status| self.judge(&status))?;
+            let reply = client.get_checkpoint(request).await.map_err(|status| self.judge(status))?;
             if !std::mem::replace(answered, true) {
                 tracing::info!(learner = self.learner, "following the learner's checkpoints");
             }
@@ -123,14 +129,14 @@ impl Follower {
         Ok(Fetched { experiment, policy, low_level, assets })
     }
 
-    fn judge(&self, status: &Status) -> Failure {
+    fn judge(&self, status: Status) -> Failure {
         match status.code() {
-            Code::Unauthenticated => Failure::Fatal(unwelcome(&self.learner, status.message().to_owned())),
+            Code::Unauthenticated => unwelcome(&self.learner, status.message().to_owned()),
             Code::Unimplemented | Code::PermissionDenied => {
-                Failure::Fatal(Error::Refused { url: self.learner.clone(), message: describe(status) })
+                Failure::Fatal(Error::Refused { url: self.learner.clone(), message: describe(&status) })
             }
-            _ if distrusted(status) => Failure::Fatal(unwelcome(&self.learner, chain(status))),
-            _ => Failure::Lost(describe(status)),
+            _ if distrusted(&status) => unwelcome(&self.learner, chain(&status)),
+            _ => status.into(),
         }
     }
 }

@@ -19,6 +19,7 @@ fn options_for(learner: impl Into<String>) -> JoinSettings {
         name: None,
         threads: None,
         environments: None,
+        give_up_after: None,
     }
 }
 
@@ -93,6 +94,49 @@ async fn an_actor_sends_its_name_and_superseding_it_is_no_configuration_error() 
     let error = join(&options, stopped).await.unwrap_err();
     assert!(matches!(error, Error::Superseded { .. }) && !error.is_configuration(), "{error}");
     assert_eq!(learner.seen().joins[0].name, "pod-0");
+}
+
+/// Where nobody listens.
+const NOBODY: &str = "http://127.0.0.1:1";
+
+#[tokio::test]
+async fn an_actor_gives_up_on_a_learner_that_never_answers() {
+    let options = JoinSettings { give_up_after: Some(Duration::from_millis(300)), ..options_for(NOBODY) };
+    let (_stop, stopped) = watch::channel(false);
+    let error = join(&options, stopped).await.unwrap_err();
+    assert!(matches!(error, Error::GaveUp { .. }) && error.exit_code() == 3, "{error}");
+    assert!(error.to_string().contains("has not answered for 0.3 s"), "{error}");
+}
+
+#[tokio::test]
+async fn an_actor_gives_up_on_a_learner_that_went_away_without_a_farewell() {
+    // The learner's machine, which is lost.
+    let machine = tokio::runtime::Runtime::new().unwrap();
+    let learner = machine.spawn(FakeLearner::start(Script::default())).await.unwrap();
+    let options = JoinSettings { give_up_after: Some(Duration::from_millis(300)), ..options_for(learner.address()) };
+    let (_stop, stopped) = watch::channel(false);
+    let joined = join(&options, stopped.clone()).await.unwrap();
+    machine.shutdown_background();
+    let (_unrolls, receiver) = mpsc::channel(1);
+    let error = joined.run(LIMITS, receiver, Arc::new(Mailbox::default()), stopped).await.unwrap_err();
+    assert!(matches!(error, Error::GaveUp { .. }), "{error}");
+}
+
+#[tokio::test]
+async fn an_actor_does_not_give_up_on_a_learner_that_answers_that_it_is_full() {
+    let limit = Duration::from_millis(100);
+    let learner = FakeLearner::start(Script { full_for: 5 * limit, ..Script::default() }).await;
+    let options = JoinSettings { give_up_after: Some(limit), ..options_for(learner.address()) };
+    let (_stop, stopped) = watch::channel(false);
+    assert_eq!(join(&options, stopped).await.unwrap().actor, learner::ACTOR);
+}
+
+#[tokio::test]
+async fn an_evaluator_gives_up_on_a_learner_that_never_answers() {
+    let limit = Some(Duration::from_millis(300));
+    let follower = Follower::new(NOBODY.into(), Access::default(), None, limit).unwrap();
+    let error = follower.follow(&watch::channel(None).0).await.unwrap_err();
+    assert!(matches!(error, Error::GaveUp { .. }), "{error}");
 }
 
 #[tokio::test]
@@ -305,7 +349,7 @@ async fn followed(asset: &[u8], sent: Option<&[u8]>) -> (FakeLearner, Follower, 
     let script = Script { asset: Some(asset.to_vec()), asset_sent: sent.map(<[u8]>::to_vec), ..Script::default() };
     let learner = FakeLearner::start(script).await;
     let cache = tempfile::tempdir().unwrap().keep();
-    let follower = Follower::new(learner.address(), Access::default(), Some(cache)).unwrap();
+    let follower = Follower::new(learner.address(), Access::default(), Some(cache), None).unwrap();
     let (sender, mut newest) = watch::channel(None);
     let following = follower.clone();
     let following = tokio::spawn(async move { following.follow(&sender).await });

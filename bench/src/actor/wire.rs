@@ -124,6 +124,7 @@ async fn send(address: &str, unroll: &FinishedUnroll, unrolls: usize) -> Result<
         name: None,
         threads: None,
         environments: None,
+        give_up_after: None,
     };
     let joined = session::join(&options, stopped.clone()).await?;
     let (sender, receiver) = mpsc::channel(super::ENVIRONMENTS);

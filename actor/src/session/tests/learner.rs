@@ -4,6 +4,7 @@ use std::collections::HashSet;
 use std::pin::Pin;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
@@ -32,6 +33,8 @@ pub(super) struct Script {
     /// Answers the first unroll as one of another learner epoch.
     pub(super) rejoin: bool,
     pub(super) refuse: bool,
+    /// For so long after its start it has no place for an actor.
+    pub(super) full_for: Duration,
     /// A newer process of the same name has joined.
     pub(super) superseded: bool,
     pub(super) wrong_layout: bool,
@@ -54,6 +57,7 @@ pub(super) struct Seen {
 
 struct Inner {
     script: Script,
+    started: Instant,
     seen: watch::Sender<Seen>,
     numbers: Mutex<HashSet<u64>>,
     connections: AtomicUsize,
@@ -76,6 +80,7 @@ impl FakeLearner {
         let address = format!("http://{}", listener.local_addr().unwrap());
         let inner = Arc::new(Inner {
             script,
+            started: Instant::now(),
             seen: watch::Sender::default(),
             numbers: Mutex::default(),
             connections: AtomicUsize::new(0),
@@ -154,6 +159,9 @@ impl Learner for FakeLearner {
     async fn join(&self, request: Request<JoinRequest>) -> Reply<JoinReply> {
         if self.inner.script.refuse {
             return Err(Status::failed_precondition("another protocol"));
+        }
+        if self.inner.started.elapsed() < self.inner.script.full_for {
+            return Err(Status::resource_exhausted("all places are taken"));
         }
         self.inner.seen.send_modify(|seen| seen.joins.push(request.into_inner()));
         if self.inner.script.superseded {
