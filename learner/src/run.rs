@@ -6,7 +6,7 @@ mod prepare;
 use std::io::Write as _;
 use std::net::SocketAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use comic_experiment::Experiment;
 use comic_replay::Batcher;
@@ -30,9 +30,14 @@ use crate::train::trainer::Trainer;
 const OTHER_FILES: u64 = 256;
 /// How long the learner waits until actors have heard that the run is over.
 const END_DELAY: Duration = Duration::from_millis(1500);
+/// The same while an actor that was here lately is not connected: it waits up to five seconds before it tries again. An
+/// evaluator does not join, so nobody waits for it; it has `--give-up-after`.
+const ABSENT_END_DELAY: Duration = Duration::from_secs(7);
 /// The same if the run was over before the learner started: actors then wait up to five seconds between two attempts to
 /// connect.
 const LATE_END_DELAY: Duration = Duration::from_secs(20);
+/// How often the learner looks whether absent actors are back.
+const POLL: Duration = Duration::from_millis(100);
 
 /// Serves and trains until the budget is used up or a signal comes. Prints one JSON line to stdout when it listens.
 ///
@@ -72,7 +77,11 @@ async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<()
     let ending = wait_for_end(&mut training, &mut signals, &service, &batcher).await?;
     if let Ok(Ending::Budget) = &ending {
         let trained = batcher.accounting().trained > trained_before;
-        end_run(&publisher, if trained { END_DELAY } else { LATE_END_DELAY }).await;
+        let farewell = end_run(&publisher, &service, if trained { END_DELAY } else { LATE_END_DELAY });
+        tokio::select! {
+            () = farewell => {}
+            () = signals.first() => {}
+        }
     }
     batcher.close();
     let _ = stop_serving.send(());
@@ -86,11 +95,17 @@ async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<()
     Ok(())
 }
 
-/// Tells the actors that the run is over, and gives them this time to hear it.
-async fn end_run(publisher: &Publisher, delay: Duration) {
+/// Tells the actors that the run is over, and gives them this time to hear it, and more if one is away.
+async fn end_run(publisher: &Publisher, service: &Service, delay: Duration) {
     if publisher.newest().is_some() {
+        let (begun, mut absent) = (Instant::now(), service.absent());
         publisher.end_run();
         tokio::time::sleep(delay).await;
+        while absent.remain() && begun.elapsed() < ABSENT_END_DELAY {
+            tokio::time::sleep(POLL).await;
+        }
+        // The one that has just come hears it, too.
+        tokio::time::sleep(POLL).await;
     }
 }
 

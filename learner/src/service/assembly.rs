@@ -23,7 +23,7 @@ use super::memory::IngestLimits;
 use super::offer::{NewestCheckpoint, Offer, description};
 use super::quarantine::{Quarantine, QuarantineArguments};
 use super::room::Room;
-use super::roster::Roster;
+use super::roster::{Absent, Roster};
 use super::shutdown::Shutdown;
 use super::status::StatusBoard;
 use crate::error::{Error, Result};
@@ -177,6 +177,11 @@ impl Service {
     /// The evaluations that wait for the trainer.
     pub fn evaluations(&self) -> &Evaluations {
         &self.trainer.evaluations
+    }
+
+    /// The actors that were here lately and have no connection now.
+    pub fn absent(&self) -> Absent {
+        self.parameters.roster.absent(Instant::now())
     }
 
     /// From now on no actor can join, and the health service says that the learner does not serve.

@@ -60,6 +60,8 @@ struct Actor {
     standing_by: bool,
     /// Open streams of parameters.
     streams: u32,
+    /// When it last opened one.
+    opened: Option<Instant>,
     /// Its unrolls that wait for a place in a batch.
     waiting: u32,
     heard: Instant,
@@ -134,6 +136,7 @@ impl Roster {
             superseded: false,
             standing_by: false,
             streams: 0,
+            opened: None,
             waiting: 0,
             heard: now,
             gone: None,
@@ -185,7 +188,7 @@ impl Roster {
     pub(super) fn open_stream(self: &Arc<Self>, incarnation: u64) -> Option<Presence> {
         let mut actors = self.actors.lock();
         let actor = actors.get_mut(&incarnation).filter(|actor| !actor.standing_by)?;
-        (actor.streams, actor.gone) = (actor.streams + 1, None);
+        (actor.streams, actor.opened, actor.gone) = (actor.streams + 1, Some(Instant::now()), None);
         Some(Presence { roster: self.clone(), incarnation, kind: Kind::Stream })
     }
 
@@ -195,6 +198,15 @@ impl Roster {
             actor.waiting += 1;
         }
         Presence { roster: self.clone(), incarnation, kind: Kind::Waiting }
+    }
+
+    /// The actors that were here lately and have no stream of parameters now.
+    pub(super) fn absent(self: &Arc<Self>, now: Instant) -> Absent {
+        let lately = |actor: &Actor| now.duration_since(actor.gone.unwrap_or(actor.heard)) < GRACE;
+        let is_absent = |actor: &Actor| actor.streams == 0 && !actor.superseded && !actor.standing_by && lately(actor);
+        let actors = self.actors.lock();
+        let incarnations = actors.iter().filter(|(_, actor)| is_absent(actor)).map(|(incarnation, _)| *incarnation);
+        Absent { roster: Arc::clone(self), since: now, incarnations: incarnations.collect() }
     }
 
     /// Counts the actors by their state.
@@ -209,6 +221,24 @@ impl Roster {
             } += 1;
         }
         census
+    }
+}
+
+/// Actors that had no stream of parameters at some moment.
+#[derive(Debug)]
+pub struct Absent {
+    roster: Arc<Roster>,
+    since: Instant,
+    incarnations: Vec<u64>,
+}
+
+impl Absent {
+    /// Whether one of them has opened no stream since then.
+    pub fn remain(&mut self) -> bool {
+        let actors = self.roster.actors.lock();
+        let returned = |actor: &Actor| actor.opened.is_some_and(|opened| opened > self.since);
+        self.incarnations.retain(|incarnation| !actors.get(incarnation).is_none_or(returned));
+        !self.incarnations.is_empty()
     }
 }
 
@@ -276,6 +306,22 @@ mod tests {
         drop(watching);
         assert_eq!(census(&roster, Instant::now()), (0, 0, 1, 0));
         assert_eq!(census(&roster, Instant::now() + REMEMBERED), (0, 0, 0, 0));
+    }
+
+    #[test]
+    fn an_actor_without_a_stream_is_absent_until_it_has_opened_one() {
+        let (roster, start) = (Arc::new(Roster::new(10)), Instant::now());
+        assert!(joins(&roster, 1, start) && joins(&roster, 2, start));
+        let watching = roster.open_stream(1);
+        let mut absent = roster.absent(start);
+        assert!(absent.remain(), "the second one never opened a stream");
+        drop(watching);
+        assert!(absent.remain(), "only the first one was there");
+        drop(roster.open_stream(2));
+        roster.heard(2, Instant::now());
+        assert!(!absent.remain(), "the second one was here, and has left");
+        assert!(roster.absent(Instant::now()).remain(), "both have left");
+        assert!(!roster.absent(Instant::now() + GRACE).remain(), "they left long ago");
     }
 
     #[test]
