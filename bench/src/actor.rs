@@ -28,7 +28,8 @@ const ENVIRONMENTS: usize = 16;
 ///
 /// `ratio` is value / floor. `actor.env` and `actor.policy`: steps/s with resets, against the same controls through the
 /// physics alone. `actor.gradient`: steps/s with the simulator's derivative, against those without it; the quickstart's
-/// networks. `actor.threads`: steps/s of two threads, against one. `actor.reset`: ms. `actor.wire`: ms of one core
+/// networks. `actor.contended`: steps/s of one thread alone, against those with one busy process for each core.
+/// `actor.threads`: steps/s of two threads, against one. `actor.reset`: ms. `actor.wire`: ms of one core
 /// for sending the unrolls of one update from a worker into a batch, against one second. `actor.vision`: ms of an image.
 /// `actor.memory`: resident MiB after 10,000 resets, against those after 1,000. `actor.memory.reset`: ms of one of the
 /// last thousand resets, against one of the first.
@@ -54,6 +55,7 @@ enum Name {
     Env,
     Policy,
     Gradient,
+    Contended,
     Threads,
     Reset,
     Wire,
@@ -97,6 +99,7 @@ impl Bench {
                 Name::Env => vec![physics::environment(&subject)?],
                 Name::Policy => vec![acting::policy(&subject)?],
                 Name::Gradient => vec![acting::gradient(&subject)?],
+                Name::Contended => vec![acting::contended(&subject)?],
                 Name::Threads => vec![acting::threads(&subject)?],
                 Name::Reset => vec![physics::reset(&subject)?],
                 Name::Wire => vec![wire::wire(&subject)?],

@@ -18,6 +18,7 @@ use comic_learner::vmpo::VmpoLearner;
 use comic_networks::to_safetensors;
 use serde_json::json;
 
+use crate::busy::Busy;
 use crate::median::median;
 use floor::Floor;
 use recorded::Recorded;
@@ -26,8 +27,9 @@ use recorded::Recorded;
 ///
 /// `value` is milliseconds of the step with its batch on the device. `floor` is milliseconds of its matrix products,
 /// forward and backward, on the same threads, and of libtorch's own LSTM where the network has one. `copy` is milliseconds
-/// of bringing the batch to the device, `read_back` of bringing the parameters back. All are medians of interleaved
-/// repeats.
+/// of bringing the batch to the device, `read_back` of bringing the parameters back. `learner.update.contended` is the step with
+/// one busy process of equal priority for each core, against the same alone; fair sharing is 2. All are medians of
+/// interleaved repeats.
 #[derive(Debug, Args)]
 pub struct Update {
     /// libtorch's threads
@@ -42,6 +44,9 @@ pub struct Update {
     /// Joint training of two tasks, and beside it the first task alone
     #[arg(long, conflicts_with = "low_level")]
     joint: bool,
+    /// Measure it also beside busy processes
+    #[arg(long)]
+    contended: bool,
     /// Where the update runs: cpu, cuda, cuda:N, xla or xla:N
     #[arg(long, value_name = "DEVICE", default_value_t = DeviceName::default())]
     device: DeviceName,
@@ -66,13 +71,17 @@ impl Update {
         let mut one_task = self.joint.then(|| Networks::new(&alone, &backend)).transpose()?;
         let products = Floor::new(&networks.spec, &experiment, backend.device());
         let (mut updates, mut one_tasks, mut floors) = (Vec::new(), Vec::new(), Vec::new());
-        let (mut copies, mut reads) = (Vec::new(), Vec::new());
+        let (mut copies, mut reads, mut contended) = (Vec::new(), Vec::new(), Vec::new());
         for repeat in 0..self.repeats + WARM_UP {
             let copy = milliseconds(|| networks.refill(&backend))?;
             let update = networks.update(&backend)?;
             let read = milliseconds(|| to_safetensors(networks.learner.policy_store()))?;
             let one_task = one_task.as_mut().map(|networks| networks.update(&backend)).transpose()?;
             let floor = milliseconds(|| products.run(&backend))?;
+            if self.contended && repeat >= WARM_UP {
+                let _neighbours = Busy::on_every_core()?;
+                contended.push(networks.update(&backend)?);
+            }
             if repeat >= WARM_UP {
                 updates.push(update);
                 copies.push(copy);
@@ -93,6 +102,14 @@ impl Update {
             line["against_one_task"] = json!(value / one_task);
         }
         println!("{line}");
+        if !contended.is_empty() {
+            let (figure, alone, contended) = (format!("{figure}.contended"), value, median(contended));
+            let ratio = contended / alone;
+            println!(
+                "{}",
+                json!({ "figure": figure, "value": contended, "unit": "ms", "floor": alone, "ratio": ratio })
+            );
+        }
         Ok(())
     }
 

@@ -10,6 +10,7 @@
 //!   [`adam`] is its optimiser, and [`tensors`] reads and writes its state.
 //! - [`checkpoint`] is the run's checkpoint directory. No other module touches it.
 //! - [`observe`] is what people and Prometheus see of a run: metrics, telemetry and probes.
+//! - [`threads`] says how libtorch's threads share the machine.
 //! - [`commands`] are the commands besides serving and training. [`options`] is the whole command line, and [`document`] its
 //!   arguments for the experiment.
 //! - [`error`] is the one error type; `exit_code` decides the exit code by it. `log_limiter` keeps faulty peers from flooding the log.
@@ -33,5 +34,6 @@ pub mod security;
 pub mod service;
 pub mod svg0;
 pub mod tensors;
+pub mod threads;
 pub mod train;
 pub mod vmpo;

@@ -56,6 +56,9 @@ fn run(options: &Options) -> Result<()> {
         Some(Command::Manual(manual)) => manual
             .write(Options::command())
             .map_err(|source| Error::System { what: "cannot write the manual".into(), source }),
-        None => comic_learner::run::run(options),
+        None => {
+            comic_learner::threads::wait_passively();
+            comic_learner::run::run(options)
+        }
     }
 }

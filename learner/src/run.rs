@@ -23,6 +23,7 @@ use crate::publish::Publisher;
 use crate::security::Security;
 use crate::service::process::{allow_descriptors, runtime};
 use crate::service::{Service, serve};
+use crate::threads;
 use crate::train::setup::{Ending, Setup};
 use crate::train::trainer::Trainer;
 
@@ -49,7 +50,7 @@ pub fn run(options: &Options) -> Result<()> {
         let text = experiment.to_toml()?;
         return std::io::stdout().write_all(text.as_bytes()).map_err(Error::system("cannot write to stdout"));
     }
-    tch::set_num_threads(experiment.learner.threads as i32);
+    tch::set_num_threads(threads::of(&experiment) as i32);
     runtime()?.block_on(serve_and_train(options, experiment))
 }
 

@@ -106,7 +106,11 @@ fn learner(threads: u16, arguments: &[String]) -> Result<()> {
     let mut theirs = Vec::new();
     for _ in 0..ROUNDS {
         let mut bench = Command::new(workspace::program("comic-bench-learner")?);
-        ours.push(figures(bench.args(["update", "--threads", &threads.to_string()]).args(arguments))?);
+        bench.args(["update", "--threads", &threads.to_string()]).args(arguments);
+        if compares {
+            bench.arg("--contended");
+        }
+        ours.push(figures(&mut bench)?);
         if compares {
             theirs.push(pytorch(threads)?);
         }

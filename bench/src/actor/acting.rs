@@ -21,6 +21,7 @@ use comic_tasks::{Environment, Simulated};
 use super::figure::{Figure, interleave};
 use super::tape::Recorded;
 use super::{ENVIRONMENTS, Subject};
+use crate::busy::Busy;
 
 /// Steps/s of one thread, against the physics alone.
 pub(super) fn policy(subject: &Subject) -> Result<Figure> {
@@ -53,6 +54,19 @@ pub(super) fn gradient(subject: &Subject) -> Result<Figure> {
     let note =
         "one thread, 16 environments, the quickstart's networks, untrained; floor: the same without the derivative";
     Ok(Figure::new("actor.gradient", "steps/s", medians, note))
+}
+
+/// Steps/s of one thread alone, against the same with one busy process for each core.
+pub(super) fn contended(subject: &Subject) -> Result<Figure> {
+    let mut worker = worker(subject, environments(subject, 1)?, 1)?;
+    let medians = interleave(subject.budget, || {
+        let alone = unroll_rate(&mut worker)?;
+        let _neighbours = Busy::on_every_core()?;
+        Ok::<_, anyhow::Error>((alone, unroll_rate(&mut worker)?))
+    })?;
+    let note = "one thread, 16 environments, the paper's networks; floor: the same with one busy process of equal \
+                priority for each core";
+    Ok(Figure::new("actor.contended", "steps/s", medians, note))
 }
 
 /// Steps/s of two threads, against one.

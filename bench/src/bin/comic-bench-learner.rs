@@ -32,6 +32,8 @@ enum Measurement {
 fn main() -> anyhow::Result<()> {
     let Arguments { measurement } = Arguments::parse();
     comic_bench::start_logging();
+    // As `comic-learner` does.
+    comic_learner::threads::wait_passively();
     match measurement {
         Measurement::Update(update) => update.run(),
         Measurement::Ingest(ingest) => ingest.run(),
