@@ -23,6 +23,8 @@ const DAMAGED: &str = "damaged-";
 pub struct Store {
     directory: PathBuf,
     kept: usize,
+    /// A checkpoint that is kept in addition.
+    held: Option<Name>,
 }
 
 impl Store {
@@ -38,7 +40,7 @@ impl Store {
             return Err(Error::configuration(format!("{} is not a directory: {remedy}", file.display())));
         }
         carry_out(&making(&directory))?;
-        Ok(Self { directory, kept: kept.max(1) })
+        Ok(Self { directory, kept: kept.max(1), held: None })
     }
 
     /// Prevents every other learner from using this run for as long as the guard lives.
@@ -125,6 +127,11 @@ impl Store {
         name.within(&self.directory)
     }
 
+    /// From now on keeps this checkpoint, in place of the one that was held before.
+    pub fn hold(&mut self, checkpoint: Option<Name>) {
+        self.held = checkpoint;
+    }
+
     /// Writes a whole checkpoint, and removes the oldest beyond the number kept.
     ///
     /// # Errors
@@ -169,7 +176,7 @@ impl Store {
         Ok(steps)
     }
 
-    /// The checkpoints beyond the number kept once `written` is there, without the best one.
+    /// The checkpoints beyond the number kept once `written` is there, without the best one and the held one.
     fn oldest_beside(&self, written: Name) -> Result<Vec<PathBuf>> {
         let mut numbers: Vec<u64> = numbered(&self.directory)?.into_iter().map(|(updates, _)| updates).collect();
         if let Name::Updates(updates) = written {
@@ -178,8 +185,8 @@ impl Store {
             numbers.dedup();
         }
         numbers.truncate(numbers.len().saturating_sub(self.kept));
-        let best = Best::read(&self.directory).map(Best::name);
-        let forgotten = numbers.into_iter().map(Name::Updates).filter(|name| *name != written && Some(*name) != best);
+        let kept = [Some(written), self.held, Best::read(&self.directory).map(Best::name)];
+        let forgotten = numbers.into_iter().map(Name::Updates).filter(|name| !kept.contains(&Some(*name)));
         Ok(forgotten.map(|name| self.path(name)).collect())
     }
 

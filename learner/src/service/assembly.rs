@@ -26,6 +26,7 @@ use super::room::Room;
 use super::roster::{Absent, Roster};
 use super::shutdown::Shutdown;
 use super::status::StatusBoard;
+use crate::checkpoint::Name;
 use crate::error::{Error, Result};
 use crate::log_limiter::LogLimiter;
 use crate::observe::evaluation::Evaluation;
@@ -289,6 +290,11 @@ impl TrainerHandle {
     /// From now on evaluators get this checkpoint.
     pub fn offer(&self, checkpoint: Offer) {
         self.checkpoint.replace(checkpoint);
+    }
+
+    /// The checkpoint that an evaluator fetched lately, which must not be removed before it is judged.
+    pub fn held_checkpoint(&self) -> Option<Name> {
+        self.checkpoint.held(Instant::now())
     }
 
     /// Takes the evaluations that actors reported since the last call, oldest first.

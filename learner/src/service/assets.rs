@@ -3,6 +3,7 @@
 use std::fs::File;
 use std::os::unix::fs::FileExt as _;
 use std::sync::Arc;
+use std::time::Instant;
 
 use bytes::Bytes;
 use comic_clips::Asset;
@@ -38,7 +39,7 @@ impl Assets {
 
     fn find(&self, sha256: &[u8]) -> Option<Asset> {
         let of_experiment = self.assets.iter().find(|asset| asset.sha256 == sha256).cloned();
-        of_experiment.or_else(|| self.checkpoint.get()?.file(sha256).cloned())
+        of_experiment.or_else(|| self.checkpoint.fetch(sha256, Instant::now()))
     }
 
     /// The asset with this hash in chunks, which are read from disk as the actor takes them.

@@ -2,15 +2,19 @@
 
 use std::path::Path;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use comic_clips::Asset;
 use comic_proto::v1;
 use parking_lot::Mutex;
 use sha2::{Digest as _, Sha256};
 
-use crate::checkpoint::Snapshot;
 use crate::checkpoint::progress::Progress;
+use crate::checkpoint::{Name, Snapshot};
 use crate::error::Result;
+
+/// How long a checkpoint is held for the evaluator that fetched it.
+const HELD: Duration = Duration::from_secs(3600);
 
 /// An asset as `Join` and `GetCheckpoint` describe it.
 pub(super) fn description(asset: &Asset) -> v1::Asset {
@@ -21,6 +25,8 @@ pub(super) fn description(asset: &Asset) -> v1::Asset {
 #[derive(Clone, Debug, Default)]
 pub(super) struct NewestCheckpoint {
     offer: Arc<Mutex<Option<Arc<Offer>>>>,
+    /// The one that an evaluator fetched last, and when.
+    fetched: Arc<Mutex<Option<(Name, Instant)>>>,
 }
 
 impl NewestCheckpoint {
@@ -30,6 +36,20 @@ impl NewestCheckpoint {
 
     pub(super) fn get(&self) -> Option<Arc<Offer>> {
         self.offer.lock().clone()
+    }
+
+    /// The file with this hash, for an evaluator that will judge the checkpoint.
+    pub(super) fn fetch(&self, sha256: &[u8], now: Instant) -> Option<Asset> {
+        let offer = self.get()?;
+        let file = offer.file(sha256)?.clone();
+        *self.fetched.lock() = Some((Name::Updates(offer.progress.updates), now));
+        Some(file)
+    }
+
+    /// The checkpoint that an evaluator fetched within the last hour: its judgement may still come.
+    pub(super) fn held(&self, now: Instant) -> Option<Name> {
+        let lately = |(_, fetched): &(Name, Instant)| now.duration_since(*fetched) < HELD;
+        self.fetched.lock().filter(lately).map(|(name, _)| name)
     }
 }
 
@@ -57,7 +77,7 @@ impl Offer {
     }
 
     /// The file with this hash.
-    pub(super) fn file(&self, sha256: &[u8]) -> Option<&Asset> {
+    fn file(&self, sha256: &[u8]) -> Option<&Asset> {
         [&self.experiment, &self.policy].into_iter().find(|file| file.sha256 == sha256)
     }
 
@@ -75,5 +95,18 @@ impl Offer {
             policy: Some(description(&self.policy)),
             assets: clips.iter().map(description).collect(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fetched_checkpoint_is_held_for_an_hour() {
+        let (newest, fetched) = (NewestCheckpoint::default(), Instant::now());
+        *newest.fetched.lock() = Some((Name::Updates(3), fetched));
+        assert_eq!(newest.held(fetched + HELD / 2), Some(Name::Updates(3)));
+        assert_eq!(newest.held(fetched + HELD), None);
     }
 }

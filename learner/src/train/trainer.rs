@@ -339,6 +339,8 @@ impl Trainer {
         if !self.checkpoints.is_due() || self.checkpoints.is_busy() {
             return Ok(());
         }
+        // Before an older checkpoint is removed, it is judged by what was reported.
+        self.take_evaluations()?;
         self.write_checkpoint_if_sound(Name::Updates(self.state.progress.updates))
     }
 

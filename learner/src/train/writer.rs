@@ -39,7 +39,7 @@ impl Writer {
         let shared = Arc::clone(&pending);
         let thread = std::thread::Builder::new()
             .name("checkpoints".into())
-            .spawn(move || run_writer(&store, &received, &shared, &service))
+            .spawn(move || run_writer(store, &received, &shared, &service))
             .map_err(Error::system("cannot start the checkpoint thread"))?;
         Ok(Self { queue, pending, thread })
     }
@@ -83,7 +83,7 @@ impl Writer {
 /// Carries out requests until the queue is closed. A write that fails is logged, and training continues, because the next one
 /// may succeed. The result is that of the last write.
 fn run_writer(
-    store: &Store,
+    mut store: Store,
     queue: &Receiver<WriteRequest>,
     pending: &AtomicUsize,
     service: &TrainerHandle,
@@ -92,6 +92,7 @@ fn run_writer(
     while let Ok(request) = queue.recv() {
         match request {
             WriteRequest::Write(name, snapshot) => {
+                store.hold(service.held_checkpoint());
                 last = store.write(name, &snapshot).map(|path| {
                     tracing::info!(checkpoint = %path.display(), "written");
                     if matches!(name, Name::Updates(_)) {
@@ -104,7 +105,7 @@ fn run_writer(
                     tracing::error!(checkpoint = %name, "checkpoint not written: {error}");
                 }
             }
-            WriteRequest::Judge(evaluated) => judge(store, evaluated),
+            WriteRequest::Judge(evaluated) => judge(&store, evaluated),
         }
         pending.fetch_sub(1, Ordering::AcqRel);
     }

@@ -3,12 +3,14 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::path::Path;
+use std::sync::Arc;
 
 use crate::support::World;
 use bytes::Bytes;
 use comic_clips::Asset;
-use comic_learner::checkpoint::Snapshot;
+use comic_learner::checkpoint::{Name, Snapshot, Store};
 use comic_learner::service::offer::Offer;
+use comic_learner::train::writer::Writer;
 use comic_proto::v1::{AssetRequest, Behaviour, CheckpointReply, CheckpointRequest};
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
@@ -103,9 +105,21 @@ async fn an_evaluator_learns_of_the_newest_checkpoint_and_fetches_its_files() {
     let newer = ask().await.checkpoint.unwrap();
     assert_eq!((newer.run, newer.learner_epoch, newer.version, newer.updates), (7, 3, 9, 4));
     assert_eq!((newer.environment_steps, newer.seconds, newer.assets.len()), (70, 2.5, 1));
+    assert_eq!(world.service.trainer().held_checkpoint(), None, "nobody has fetched one");
     assert_eq!(fetch(&world, newer.policy.unwrap().sha256).await.unwrap(), b"newer");
+    assert_eq!(world.service.trainer().held_checkpoint(), Some(Name::Updates(4)));
     assert_eq!(fetch(&world, newer.experiment.unwrap().sha256).await.unwrap(), b"");
     assert_eq!(fetch(&world, older.policy.unwrap().sha256).await.unwrap_err().code(), Code::NotFound);
+    // As long as its evaluation may come, training does not remove it.
+    let run = tempfile::tempdir().unwrap();
+    let store = Store::open(run.path(), 1).unwrap();
+    let writer = Writer::start(store, world.service.trainer()).unwrap();
+    for updates in [4, 5, 6] {
+        writer.write(Name::Updates(updates), Arc::default()).unwrap();
+    }
+    writer.finish().unwrap();
+    let kept = |updates| run.path().join(format!("checkpoints/checkpoint-{updates:010}")).exists();
+    assert_eq!([4, 5, 6].map(kept), [true, false, true]);
     world.publisher.publish(1, Behaviour::Policy, &Bytes::from_static(b"parameters"));
     world.publisher.end_run();
     assert!(ask().await.run_over);

@@ -193,6 +193,22 @@ fn the_oldest_numbered_checkpoints_are_removed_and_the_named_ones_stay() {
 }
 
 #[test]
+fn a_checkpoint_that_an_evaluator_has_is_held_until_it_has_another() {
+    let run = tempfile::tempdir().unwrap();
+    let mut store = Store::open(run.path(), 1).unwrap();
+    let mut kept_after = |held, written| {
+        store.hold(held);
+        store.write(Name::Updates(written), &snapshot("later")).unwrap();
+        (1..=written).filter(|updates| store.has(Name::Updates(*updates))).collect::<Vec<_>>()
+    };
+    assert_eq!(kept_after(None, 1), [1]);
+    assert_eq!(kept_after(Some(Name::Updates(1)), 2), [1, 2]);
+    assert_eq!(kept_after(Some(Name::Updates(1)), 3), [1, 3]);
+    assert_eq!(kept_after(Some(Name::Updates(3)), 4), [3, 4]);
+    assert_eq!(kept_after(None, 5), [5]);
+}
+
+#[test]
 fn a_manifest_with_a_path_outside_the_checkpoint_is_refused() {
     let run = tempfile::tempdir().unwrap();
     let store = Store::open(run.path(), 2).unwrap();
