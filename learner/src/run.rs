@@ -75,7 +75,7 @@ async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<()
     if let Some(metrics) = listeners.metrics {
         tokio::spawn(probes::serve(metrics, service.probed()));
     }
-    let ending = wait_for_end(&mut training, &mut signals, &service, &batcher).await?;
+    let ending = wait_for_end(&mut training, &mut signals, &service, &batcher).await;
     if let Ok(Ending::Budget) = &ending {
         let trained = batcher.accounting().trained > trained_before;
         let farewell = end_run(&publisher, &service, if trained { END_DELAY } else { LATE_END_DELAY });
@@ -144,16 +144,14 @@ impl Signals {
     }
 }
 
-/// Waits until training ends. The first signal asks the trainer to stop after its update.
-///
-/// # Errors
-/// [`Error::Stopped`] on a second signal. The inner result is the trainer's.
+/// Waits until training ends, and returns the trainer's result. The first signal asks the trainer to stop after its update,
+/// and the second one ends the process.
 async fn wait_for_end(
     training: &mut Training,
     signals: &mut Signals,
     service: &Service,
     batcher: &Batcher,
-) -> Result<Result<Ending>> {
+) -> Result<Ending> {
     let ending = tokio::select! {
         ending = &mut *training => ending,
         () = signals.first() => {
@@ -162,11 +160,18 @@ async fn wait_for_end(
             batcher.close();
             tokio::select! {
                 ending = training => ending,
-                () = signals.second() => return Err(Error::Stopped),
+                () = signals.second() => end_the_process(),
             }
         }
     };
-    Ok(ending.unwrap_or(Err(Error::Panicked("the trainer"))))
+    ending.unwrap_or(Err(Error::Panicked("the trainer")))
+}
+
+/// Ends the process at once. The trainer may be inside libtorch, which must not be destroyed meanwhile, so nothing is.
+fn end_the_process() -> ! {
+    let error = Error::Stopped;
+    tracing::error!("{error}");
+    signal_hook::low_level::exit(error.exit_code().into())
 }
 
 /// The sockets that a learner listens on.

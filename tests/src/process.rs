@@ -45,12 +45,20 @@ impl Process {
         root.join(path.strip_prefix("/").unwrap_or(path))
     }
 
+    /// Asks the process to end (SIGTERM).
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn ask_to_end(&self) -> Result<()> {
+        self.signal(Signal::TERM)
+    }
+
     /// Asks the process to end (SIGTERM) and waits.
     ///
     /// # Errors
     /// When the process still runs after `limit`.
     pub async fn terminate(mut self, limit: Duration) -> Result<ExitStatus> {
-        self.signal(Signal::TERM)?;
+        self.ask_to_end()?;
         let deadline = Instant::now() + limit;
         while Instant::now() < deadline {
             if let Some(status) = self.ended()? {
