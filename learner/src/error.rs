@@ -1,5 +1,6 @@
 //! What can go wrong in the learner. `exit_code.rs` says with which exit code the program then ends.
 
+use std::io::ErrorKind;
 use std::path::PathBuf;
 
 /// The learner's errors. A variant does not repeat in its message what its source says; `comic_proto::chain` prints both.
@@ -103,6 +104,15 @@ impl Error {
         }
     }
 
+    /// Whether a disk is full.
+    pub fn is_disk_full(&self) -> bool {
+        let cause = |error: &(dyn std::error::Error + 'static)| match error.downcast_ref::<std::io::Error>() {
+            Some(error) => matches!(error.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded),
+            None => false,
+        };
+        std::iter::successors(Some(self as &(dyn std::error::Error + 'static)), |error| error.source()).any(cause)
+    }
+
     /// A wrong configuration; the message says what is wrong and names the remedy.
     pub fn configuration(message: impl Into<String>) -> Self {
         Self::Configuration(message.into())
@@ -139,6 +149,14 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_full_disk_is_recognised_inside_other_errors() {
+        let failed = |kind: ErrorKind| {
+            Error::within::<Error>("cannot resume")(Error::file("write", "epoch")(kind.into())).is_disk_full()
+        };
+        assert!(failed(ErrorKind::StorageFull) && !failed(ErrorKind::NotFound));
+    }
 
     #[test]
     fn an_error_keeps_its_exit_code_inside_another() {

@@ -35,6 +35,12 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("comic-learner: {}", comic_proto::chain(&error));
+            if error.is_disk_full() && options.command.is_none() {
+                eprintln!(
+                    "comic-learner: the checkpoints are not lost. Remove other files from the disk, for instance \
+                     films/ and tensorboard/ of the run, and start again with the same --run"
+                );
+            }
             ExitCode::from(error.exit_code())
         }
     }

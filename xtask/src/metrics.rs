@@ -44,13 +44,15 @@ impl Line {
     }
 }
 
-/// Every line of a file of metrics.
+/// Every line of a file of metrics. A last line that is cut off is left out: the learner writes it, or was killed.
 pub(crate) fn read(path: &Path) -> Result<Vec<Line>> {
     let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
     let line = |(number, line)| {
         serde_json::from_str(line).with_context(|| format!("{}:{}: not a line of metrics", path.display(), number + 1))
     };
-    text.lines().enumerate().map(line).collect()
+    let whole = text.rfind('\n').map_or(0, |end| end + 1);
+    let last = serde_json::from_str(&text[whole..]).ok();
+    text[..whole].lines().enumerate().map(line).chain(last.map(Ok)).collect()
 }
 
 /// produced = trained + dropped + in flight.
@@ -88,6 +90,16 @@ mod tests {
         std::fs::write(&path, "{}\nnonsense\n").unwrap();
         let error = read(&path).unwrap_err();
         assert!(format!("{error:#}").contains("metrics.jsonl:2"), "{error:#}");
+    }
+
+    #[test]
+    fn a_last_line_that_is_cut_off_is_left_out() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("metrics.jsonl");
+        for (last, lines) in [(r#"{"upda"#, 1), (r#"{"updates":2}"#, 2), ("", 1)] {
+            std::fs::write(&path, format!("{{}}\n{last}")).unwrap();
+            assert_eq!(read(&path).unwrap().len(), lines, "{last}");
+        }
     }
 
     #[test]

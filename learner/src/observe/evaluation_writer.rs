@@ -1,17 +1,18 @@
 //! Keeps the evaluations that actors report: lines of `RUN/evaluations.jsonl`, films in `RUN/films`, and curves and images
 //! for TensorBoard.
 
-use std::fs;
-use std::io::{self, Write as _};
+use std::fs::File;
+use std::io::{self, BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
 use crate::error::{Error, Result};
-use crate::observe::append;
 use crate::observe::evaluation::Evaluation;
+use crate::observe::films::Films;
 use crate::observe::heat_map::HeatMap;
 use crate::observe::tensorboard::{Events, SummaryValue};
+use crate::observe::whole::Whole;
 
 /// Most clips that have a curve each. With more, TensorBoard's list of curves is hard to use.
 const MOST_CLIP_CURVES: usize = 64;
@@ -21,14 +22,44 @@ const LONGEST_NAME: usize = 200;
 /// Writes evaluations, and remembers their clips' rewards for the heat map.
 #[derive(Debug)]
 pub(super) struct EvaluationWriter {
-    run: PathBuf,
+    lines: PathBuf,
+    films: Films,
+    /// Updates and normalised reward of the best evaluation.
+    best: Option<(u64, f64)>,
     heat_map: HeatMap,
 }
 
 impl EvaluationWriter {
     /// Writes into the directory `run`.
     pub(super) fn new(run: &Path) -> Self {
-        Self { run: run.to_path_buf(), heat_map: HeatMap::new() }
+        let lines = run.join("evaluations.jsonl");
+        let mut writer = Self { films: Films::new(run), best: None, heat_map: HeatMap::new(), lines };
+        writer.recall().unwrap_or_else(|error| tracing::error!("{}: {error}", writer.lines.display()));
+        writer
+    }
+
+    /// Finds the best of the evaluations that the run has.
+    fn recall(&mut self) -> io::Result<()> {
+        let file = match File::open(&self.lines) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+            file => file?,
+        };
+        let length = file.metadata()?.len();
+        for line in BufReader::new(file.take(length)).split(b'\n') {
+            let line: Value = serde_json::from_slice(&line?).unwrap_or_default();
+            self.compare(line["updates"].as_u64(), &line["evaluation"]);
+        }
+        Ok(())
+    }
+
+    /// Remembers the best evaluation.
+    fn compare(&mut self, updates: Option<u64>, report: &Value) {
+        let reward = report["overall"]["normalised_reward"].as_f64();
+        if let Some((updates, reward)) = updates.zip(reward)
+            && self.best.is_none_or(|(_, best)| reward > best)
+        {
+            self.best = Some((updates, reward));
+        }
     }
 
     /// Keeps an evaluation. What the disk refuses is logged, and the rest is kept. A report or a film that is not as expected
@@ -41,11 +72,13 @@ impl EvaluationWriter {
         if let Err(error) = self.append(evaluation, &report) {
             tracing::error!(version, "an evaluation is lost: {}", comic_proto::chain(&error));
         }
+        self.compare(Some(evaluation.updates), &report);
         let film_size = gif_size(&evaluation.film);
+        let best = self.best.map(|(updates, _)| updates);
         if film_size.is_some()
-            && let Err(error) = self.write_film(evaluation)
+            && let Err(error) = self.films.write(evaluation.updates, &evaluation.film, best)
         {
-            tracing::error!(version, "an evaluation's film is lost: {}", comic_proto::chain(&error));
+            tracing::error!(version, "an evaluation's film is lost: {error}");
         }
         if film_size.is_none() && !evaluation.film.is_empty() {
             tracing::warn!(version, "an evaluation's film is ignored, because it is no GIF");
@@ -59,7 +92,6 @@ impl EvaluationWriter {
     }
 
     fn append(&self, evaluation: &Evaluation, report: &Value) -> Result<()> {
-        let path = self.run.join("evaluations.jsonl");
         let line = json!({
             "run": evaluation.run,
             "learner_epoch": evaluation.epoch,
@@ -69,19 +101,9 @@ impl EvaluationWriter {
             "seconds": evaluation.seconds,
             "evaluation": report,
         });
-        append(&path)?.write_all(format!("{line}\n").as_bytes()).map_err(Error::file("write", &path))
-    }
-
-    /// Writes `RUN/films/UPDATES.gif`, with as many digits as the name of the checkpoint.
-    fn write_film(&self, evaluation: &Evaluation) -> Result<()> {
-        let directory = self.run.join("films");
-        let path = directory.join(format!("{:010}.gif", evaluation.updates));
-        let written = fs::create_dir_all(&directory).and_then(|()| fs::write(&path, &evaluation.film));
-        if written.is_err() {
-            // Half a film would look like a whole one.
-            drop(fs::remove_file(&path));
-        }
-        written.map_err(Error::file("write", &path))
+        let appended =
+            Whole::open_lines(&self.lines).and_then(|mut lines| lines.append(format!("{line}\n").as_bytes()));
+        appended.map_err(Error::file("write", &self.lines))
     }
 
     /// Writes curves, the film and the heat map of all evaluations for TensorBoard.
@@ -129,6 +151,8 @@ fn gif_size(film: &[u8]) -> Option<(u16, u16)> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use bytes::Bytes;
 
     use super::*;

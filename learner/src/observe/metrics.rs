@@ -1,8 +1,6 @@
 //! The metrics of a run for people: one JSON line every few seconds in `RUN/metrics.jsonl` and for TensorBoard. The newest
 //! line is also the status.
 
-use std::fs::File;
-use std::io::Write as _;
 use std::ops::AddAssign;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -13,11 +11,11 @@ use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
 use comic_replay::{AccountingByTask, Batch};
 use serde_json::{Map, Value, json};
 
-use crate::error::Result;
-use crate::observe::append;
+use crate::error::{Error, Result};
 use crate::observe::evaluation::Evaluation;
 use crate::observe::evaluation_writer::EvaluationWriter;
 use crate::observe::tensorboard::Events;
+use crate::observe::whole::Whole;
 
 /// Sums since the last line.
 #[derive(Debug, Default)]
@@ -118,7 +116,7 @@ fn per(value: f64, count: u64) -> Value {
 pub struct Metrics {
     spec: TaskSpec,
     run: PathBuf,
-    file: File,
+    file: Whole,
     /// `None` if the file could not be opened.
     events: Option<Events>,
     evaluations: EvaluationWriter,
@@ -126,8 +124,6 @@ pub struct Metrics {
     since: Instant,
     /// The accounting of the last line.
     accounting: AccountingByTask,
-    /// Whether the last line may be incomplete.
-    torn: bool,
 }
 
 /// How far the run is, for the beginning of a line.
@@ -151,16 +147,16 @@ impl Metrics {
     /// # Errors
     /// When the file cannot be opened.
     pub fn open(run: &Path, spec: &TaskSpec) -> Result<Self> {
+        let file = run.join("metrics.jsonl");
         Ok(Self {
             spec: spec.clone(),
             run: run.to_path_buf(),
-            file: append(&run.join("metrics.jsonl"))?,
+            file: Whole::open_lines(&file).map_err(Error::file("open", &file))?,
             events: None,
             evaluations: EvaluationWriter::new(run),
             window: Window::default(),
             since: Instant::now(),
             accounting: AccountingByTask::default(),
-            torn: false,
         })
     }
 
@@ -256,11 +252,7 @@ impl Metrics {
             tracing::error!("TensorBoard's file lacks a line: {error}");
         }
         let line = line.to_string();
-        // A line that a full disk cut off is not continued.
-        let start = if self.torn { "\n" } else { "" };
-        let written = self.file.write_all(format!("{start}{line}\n").as_bytes());
-        self.torn = written.is_err();
-        if let Err(error) = written {
+        if let Err(error) = self.file.append(format!("{line}\n").as_bytes()) {
             tracing::error!("metrics.jsonl lacks a line: {error}");
         }
         line

@@ -3,8 +3,7 @@
 //! A file is a sequence of records. A record is a length, its checksum, a message and the message's checksum (TensorFlow's
 //! `record_writer.cc`). The messages are those of `event.proto` and `summary.proto`, of which a few fields are used.
 
-use std::fs::{self, File, OpenOptions};
-use std::io::Write as _;
+use std::fs;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -13,6 +12,7 @@ use prost::Message as _;
 use serde_json::Value;
 
 use crate::error::{Error, Result};
+use crate::observe::whole::Whole;
 
 /// The version that a reader expects in the first record.
 const VERSION: &str = "brain.Event:2";
@@ -25,6 +25,10 @@ const POSITION: [&str; 3] = ["environment_steps", "seconds", "learner_epoch"];
 /// Most values of one record, and bytes of their tags. Reports come from the network, and nested names multiply.
 const MOST_VALUES: usize = 4096;
 const LONGEST_TAG: usize = 256;
+/// Most bytes of a run's files. A line every five seconds is 40 MB a day, and films are added to that.
+const BUDGET: u64 = 256 << 20;
+/// How often the distance between two lines, or two pictures, doubles until the budget is used up.
+const DOUBLINGS: u64 = 8;
 /// `Summary.Image.colorspace` of RGB.
 const RGB: i32 = 3;
 
@@ -107,9 +111,13 @@ impl SummaryValue {
 /// The file of one learner epoch.
 #[derive(Debug)]
 pub(crate) struct Events {
-    file: File,
-    /// Bytes of whole records.
-    length: u64,
+    file: Whole,
+    /// Bytes of all files of the run.
+    spent: u64,
+    budget: u64,
+    /// Lines and pictures that were left out since the last one.
+    skipped_lines: u64,
+    skipped_pictures: u64,
 }
 
 impl Events {
@@ -124,39 +132,61 @@ impl Events {
         let first = step(environment_steps).saturating_add(1);
         let open = || {
             fs::create_dir_all(&directory)?;
-            let file = OpenOptions::new().create(true).append(true).open(&path)?;
-            let mut events = Self { length: file.metadata()?.len(), file };
-            events.append(&opening(now(), first))?;
-            Ok::<_, std::io::Error>(events)
+            let mut file = Whole::open(&path)?;
+            let spent = bytes_below(&directory)?;
+            file.append(&opening(now(), first))?;
+            Ok::<_, std::io::Error>(Self { file, spent, budget: BUDGET, skipped_lines: 0, skipped_pictures: 0 })
         };
         open().map_err(Error::file("write", &path))
     }
 
-    /// Writes every number of a line, by its path within the line, over environment steps.
+    /// Writes every number of a line, by its path within the line, over environment steps. The larger the files are, the more
+    /// lines are left out.
     ///
     /// # Errors
     /// When the disk refuses.
     pub(crate) fn write(&mut self, line: &Value) -> std::io::Result<()> {
+        if !is_due(&mut self.skipped_lines, self.spent, self.budget) {
+            return Ok(());
+        }
         self.append(&scalars(now(), line))
     }
 
-    /// Writes points and images at this number of environment steps.
+    /// Writes points and images at this number of environment steps. The larger the files are, the more images are left out.
     ///
     /// # Errors
     /// When the disk refuses.
-    pub(super) fn write_values(&mut self, environment_steps: u64, values: Vec<SummaryValue>) -> std::io::Result<()> {
+    pub(super) fn write_values(
+        &mut self,
+        environment_steps: u64,
+        mut values: Vec<SummaryValue>,
+    ) -> std::io::Result<()> {
+        if !is_due(&mut self.skipped_pictures, self.spent, self.budget) {
+            values.retain(|value| value.image.is_none());
+        }
+        if values.is_empty() || self.spent >= self.budget {
+            return Ok(());
+        }
         self.append(&summary(now(), step(environment_steps), values))
     }
 
-    /// Appends all of these bytes or none, because a reader stops at half a record.
-    fn append(&mut self, records: &[u8]) -> std::io::Result<()> {
-        let written = self.file.write_all(records);
-        match &written {
-            Ok(()) => self.length += records.len() as u64,
-            Err(_) => drop(self.file.set_len(self.length)),
-        }
-        written
+    fn append(&mut self, record: &[u8]) -> std::io::Result<()> {
+        self.file.append(record)?;
+        self.spent += record.len() as u64;
+        Ok(())
     }
+}
+
+/// Whether the next line or picture is written, after `skipped` that were not. Beyond the budget none is.
+fn is_due(skipped: &mut u64, spent: u64, budget: u64) -> bool {
+    let due = spent < budget && *skipped + 1 >= 1 << (DOUBLINGS * spent / budget);
+    *skipped = if due { 0 } else { *skipped + 1 };
+    due
+}
+
+/// Bytes of the files in a directory.
+fn bytes_below(directory: &Path) -> std::io::Result<u64> {
+    fs::read_dir(directory)?.map(|entry| Ok(entry?.metadata()?.len())).sum()
 }
 
 /// The beginning of a file whose first step is `step`.
@@ -244,6 +274,30 @@ mod tests {
             rest = &after[4..];
         }
         events
+    }
+
+    #[test]
+    fn lines_and_pictures_become_rarer_until_the_budget_is_used_up() {
+        let run = tempfile::tempdir().unwrap();
+        let mut events = Events { budget: 8 << 10, ..Events::begin(run.path(), 1, 0).unwrap() };
+        let picture = || vec![SummaryValue::image("film", (1, 1), vec![0; 20].into())];
+        for steps in 1..10_000 {
+            events.write(&json!({"environment_steps": steps, "reward": 0.5})).unwrap();
+            events.write_values(steps, picture()).unwrap();
+        }
+        let steps: Vec<i64> = super::tests::events(run.path(), 1)
+            .into_iter()
+            .filter(|event| {
+                event.summary.as_ref().is_some_and(|summary| summary.values.iter().any(|value| value.image.is_some()))
+            })
+            .map(|event| event.step)
+            .collect();
+        assert!(steps.starts_with(&[1, 2, 3]), "{steps:?}");
+        let gaps: Vec<i64> = steps.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        assert!(gaps.is_sorted() && gaps.last() >= Some(&8), "{gaps:?}");
+        let length =
+            fs::read_dir(run.path().join("tensorboard")).unwrap().next().unwrap().unwrap().metadata().unwrap().len();
+        assert!((8 << 10..9 << 10).contains(&length), "{length}");
     }
 
     #[test]

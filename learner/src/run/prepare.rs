@@ -40,7 +40,11 @@ pub(super) fn prepare(
     let resume = resumed(newest, options, &experiment, &spec)?;
     let epoch = store.begin_epoch()?;
     let document = options.run.join("experiment.toml");
-    std::fs::write(&document, experiment.to_toml()?).map_err(Error::file("write", document))?;
+    let text = experiment.to_toml()?;
+    // On a full disk a write leaves the file empty, so a run that is continued without a change writes nothing.
+    if std::fs::read(&document).ok().as_deref() != Some(text.as_bytes()) {
+        std::fs::write(&document, text).map_err(Error::file("write", document))?;
+    }
     let ledger = match &resume {
         Some(snapshot) => accounting(snapshot).map_err(|error| incompatible(&options.run, error))?,
         None => Ledger::new(),
