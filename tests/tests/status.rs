@@ -80,3 +80,24 @@ async fn status_watch_follows_a_run_and_waits_for_an_absent_learner() -> Result<
         })
         .await
 }
+
+#[tokio::test]
+async fn the_metrics_say_that_the_trainer_moves_while_it_waits() -> Result<()> {
+    let mut system = System::new(&[&SMALL[..], &["--metrics-port", "0"]].concat())?;
+    system.start_learner(LIMIT).await?;
+    // Without movement the silence would be as long as the learner's life.
+    let silence = |system: &System| -> Option<u64> {
+        let page = system.metrics_page().ok()?;
+        page.lines().find_map(|line| line.strip_prefix("comic_trainer_silent_seconds ")?.parse().ok())
+    };
+    let what = "the trainer moved lately, although the learner started long ago";
+    let deadline = tokio::time::Instant::now() + LIMIT;
+    loop {
+        let uptime = system.status().await?.uptime_seconds;
+        if silence(&system).context("no silence")? + 3 < uptime as u64 {
+            return Ok(());
+        }
+        ensure!(tokio::time::Instant::now() < deadline, "not within {LIMIT:?}: {what}");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}

@@ -18,6 +18,9 @@ use tokio::sync::Semaphore;
 const CONNECTIONS: usize = 64;
 /// A connection is one request and its answer, and lasts no longer.
 const LIMIT: Duration = Duration::from_secs(10);
+/// A trainer that has not moved for this time is dead. The longest step is the first one on XLA, which compiles for up to eight
+/// minutes.
+const LONGEST_STEP: Duration = Duration::from_secs(900);
 /// The pause before the next attempt when the system has no file descriptor left.
 const RETRY_DELAY: Duration = Duration::from_millis(100);
 const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
@@ -28,6 +31,8 @@ pub trait Probed: Send + Sync + 'static {
     fn metrics_page(&self) -> String;
     /// Whether the learner is going down, so that no actor can join.
     fn is_draining(&self) -> bool;
+    /// The time since the trainer last moved.
+    fn silence(&self) -> Duration;
 }
 
 /// Answers until the process ends.
@@ -65,6 +70,11 @@ async fn answer(stream: TcpStream, probed: Arc<impl Probed>) -> Result<(), hyper
 fn respond(method: &Method, path: &str, probed: &impl Probed) -> Response<Full<Bytes>> {
     let (status, kind, body) = match (method, path) {
         (&Method::GET | &Method::HEAD, "/metrics") => (StatusCode::OK, OPEN_METRICS, probed.metrics_page()),
+        (&Method::GET | &Method::HEAD, "/healthz") if probed.silence() > LONGEST_STEP => {
+            let seconds = probed.silence().as_secs();
+            let body = format!("the trainer has not moved for {seconds} s\n");
+            (StatusCode::SERVICE_UNAVAILABLE, "text/plain", body)
+        }
         (&Method::GET | &Method::HEAD, "/healthz") => (StatusCode::OK, "text/plain", "ok\n".into()),
         (&Method::GET | &Method::HEAD, "/readyz") if probed.is_draining() => {
             (StatusCode::SERVICE_UNAVAILABLE, "text/plain", "going down\n".into())
@@ -78,4 +88,31 @@ fn respond(method: &Method, path: &str, probed: &impl Probed) -> Response<Full<B
     *response.status_mut() = status;
     response.headers_mut().insert(CONTENT_TYPE, http::HeaderValue::from_static(kind));
     response
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A learner whose trainer has not moved for this time.
+    struct Silent(Duration);
+
+    impl Probed for Silent {
+        fn metrics_page(&self) -> String {
+            String::new()
+        }
+        fn is_draining(&self) -> bool {
+            false
+        }
+        fn silence(&self) -> Duration {
+            self.0
+        }
+    }
+
+    #[test]
+    fn a_learner_whose_trainer_does_not_move_is_not_healthy() {
+        let status = |silence| respond(&Method::GET, "/healthz", &Silent(silence)).status();
+        assert_eq!(status(LONGEST_STEP), StatusCode::OK);
+        assert_eq!(status(LONGEST_STEP + Duration::from_secs(1)), StatusCode::SERVICE_UNAVAILABLE);
+    }
 }

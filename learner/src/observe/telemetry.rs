@@ -70,6 +70,7 @@ struct Sampled {
     actors: Labelled<Gauge>,
     version: Gauge,
     epoch: Gauge,
+    silence: Gauge,
     memory: Gauge,
     tasks: SampledTasks,
 }
@@ -108,6 +109,7 @@ impl Sampled {
             ),
             version: catalogue.gauge("comic_parameters_version", "Newest published version of the parameters"),
             epoch: catalogue.gauge("comic_learner_epoch", "How often the learner was started for this run"),
+            silence: catalogue.gauge("comic_trainer_silent_seconds", "Seconds since the trainer last moved: a gradient step, or the look for a batch. Above 900, /healthz fails"),
             memory: catalogue.gauge("process_resident_memory_bytes", "Resident memory of the learner process in bytes"),
             tasks: SampledTasks {
                 produced: catalogue.of_tasks("counter", "comic_task_unrolls_produced", "Unrolls of the task that were accepted or dropped, over the whole run"),
@@ -129,6 +131,7 @@ pub(crate) struct Sample {
     pub(crate) actors: [(&'static str, u64); 3],
     pub(crate) version: u64,
     pub(crate) epoch: u64,
+    pub(crate) silence: Duration,
 }
 
 impl Default for Telemetry {
@@ -273,6 +276,7 @@ impl Telemetry {
             (&self.sampled.ingest, sample.ingest),
             (&self.sampled.version, sample.version),
             (&self.sampled.epoch, sample.epoch),
+            (&self.sampled.silence, sample.silence.as_secs()),
             (&self.sampled.memory, resident_bytes()),
         ] {
             gauge.set(value as i64);

@@ -30,6 +30,7 @@ use crate::checkpoint::Name;
 use crate::error::{Error, Result};
 use crate::log_limiter::LogLimiter;
 use crate::observe::evaluation::Evaluation;
+use crate::observe::heartbeat::Heartbeat;
 use crate::observe::probes::Probed;
 use crate::observe::telemetry::Telemetry;
 use crate::publish::Publisher;
@@ -170,7 +171,7 @@ impl Service {
         self.trainer.clone()
     }
 
-    /// What `/metrics` and `/readyz` show.
+    /// What `/metrics`, `/healthz` and `/readyz` show.
     pub fn probed(&self) -> Arc<impl Probed + use<>> {
         self.trainer.status.clone()
     }
@@ -234,6 +235,7 @@ impl Common {
             room,
             telemetry,
             shutdown,
+            heartbeat: Heartbeat::default(),
         }
     }
 
@@ -280,6 +282,11 @@ impl TrainerHandle {
     /// The run's number, which no other run has.
     pub fn id(&self) -> u64 {
         self.run
+    }
+
+    /// Notes that the trainer moves. A learner whose trainer does not move is not healthy.
+    pub fn beat(&self) {
+        self.status.heartbeat.beat();
     }
 
     /// Replaces the metrics that `GetStatus` answers with, JSON.

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use comic_proto::v1;
 use comic_replay::Batcher;
@@ -11,6 +11,7 @@ use parking_lot::Mutex;
 use super::room::Room;
 use super::roster::{Census, Roster};
 use super::shutdown::Shutdown;
+use crate::observe::heartbeat::Heartbeat;
 use crate::observe::probes::Probed;
 use crate::observe::telemetry::{Sample, Telemetry};
 use crate::publish::Publisher;
@@ -32,6 +33,7 @@ pub(super) struct StatusBoard {
     pub(super) room: Room,
     pub(super) telemetry: Arc<Telemetry>,
     pub(super) shutdown: Shutdown,
+    pub(super) heartbeat: Heartbeat,
 }
 
 impl StatusBoard {
@@ -80,10 +82,15 @@ impl Probed for StatusBoard {
             actors: [("alive", alive), ("slow", slow), ("lost", lost)],
             version: self.publisher.newest_version(),
             epoch: self.publisher.epoch(),
+            silence: self.heartbeat.silence(),
         })
     }
 
     fn is_draining(&self) -> bool {
         self.shutdown.has_begun()
+    }
+
+    fn silence(&self) -> Duration {
+        self.heartbeat.silence()
     }
 }

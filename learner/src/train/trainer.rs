@@ -41,6 +41,7 @@ pub struct Trainer {
     versions: Versions,
     reports: Reports,
     checkpoints: Checkpoints,
+    service: TrainerHandle,
 }
 
 impl Trainer {
@@ -71,12 +72,13 @@ impl Trainer {
             batcher,
             state,
             reports,
+            service,
         };
         match resume {
             Some(snapshot) => trainer.checkpoints.set_good(snapshot),
             None => trainer.write_checkpoint_if_sound(Name::Initial)?,
         }
-        tracing::info!("buffers take {}", trainer.memory(&service));
+        tracing::info!("buffers take {}", trainer.memory());
         Ok(trainer)
     }
 
@@ -171,6 +173,7 @@ impl Trainer {
         let mut losses = Vec::new();
         let random = &mut self.state.progress.random;
         for step in 0..self.experience.take(batch, random)? {
+            self.service.beat();
             let minibatch = self.experience.minibatch(step, random)?;
             if !losses.is_empty() {
                 self.backend.end_step()?;
@@ -225,6 +228,7 @@ impl Trainer {
         while step < steps || !self.is_sound() {
             let State { algorithm, progress, .. } = &mut self.state;
             algorithm.set_learning_rate(self.experiment.warm_start.learning_rate);
+            self.service.beat();
             warm_start.regress(algorithm.as_mut(), &mut progress.random)?;
             self.backend.end_step()?;
             let reported = step.is_multiple_of(REPORTED_STEPS) || step + 1 >= steps;
@@ -251,6 +255,7 @@ impl Trainer {
     }
 
     fn next_batch(&mut self) -> Result<Next> {
+        self.service.beat();
         let next = self.batcher.next_batch_within(PATIENCE);
         self.write_metrics_when_due()?;
         if matches!(next, Next::Batch(_)) {
@@ -390,12 +395,12 @@ impl Trainer {
     }
 
     /// How much memory the learner's buffers can take, now that every size is known.
-    fn memory(&self, service: &TrainerHandle) -> Bounds {
+    fn memory(&self) -> Bounds {
         Bounds::new(&Sizes {
             ahead: self.experiment.unroll.ahead,
             batch: self.experiment.unroll.batch,
             unroll: self.batcher.layout().size(),
-            ingest: service.ingest(),
+            ingest: self.service.ingest(),
             parameters: self.state.target.len(),
             snapshot: self.checkpoints.good().parts.values().map(Vec::len).sum(),
         })
