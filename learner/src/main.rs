@@ -7,6 +7,7 @@ use clap::{CommandFactory as _, Parser as _};
 use comic_learner::commands;
 use comic_learner::error::{Error, Result};
 use comic_learner::options::{Command, LogFormat, Options};
+use comic_learner::train::setup::Ending;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
 
@@ -14,6 +15,10 @@ use tracing_subscriber::fmt::format::FmtSpan;
 /// 27 MB a minute, without end. With this allocator it stays at its size. docs/benchmarks.md has the figures.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+/// The exit code of a learner that was told to stop before the run was over, and wrote its checkpoint. A Kubernetes Job counts 0
+/// as done.
+const STOPPED: u8 = 4;
 
 fn main() -> ExitCode {
     let options = Options::parse();
@@ -32,7 +37,7 @@ fn main() -> ExitCode {
         return health.run();
     }
     match run(&options) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(code) => code,
         Err(error) => {
             eprintln!("comic-learner: {}", comic_proto::chain(&error));
             if error.is_disk_full() && options.command.is_none() {
@@ -46,25 +51,35 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(options: &Options) -> Result<()> {
+fn run(options: &Options) -> Result<ExitCode> {
     match &options.command {
-        Some(Command::Export { checkpoint, part, out }) => commands::export::run(checkpoint, *part, out),
-        Some(Command::Prior(prior)) => prior.run(),
-        Some(Command::Sizes) => {
+        Some(command) => run_command(command, options)?,
+        None if options.print => comic_learner::run::print(options)?,
+        None => {
+            comic_learner::threads::wait_passively();
+            if comic_learner::run::run(options)? == Ending::Stopped {
+                return Ok(ExitCode::from(STOPPED));
+            }
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn run_command(command: &Command, options: &Options) -> Result<()> {
+    match command {
+        Command::Export { checkpoint, part, out } => commands::export::run(checkpoint, *part, out),
+        Command::Prior(prior) => prior.run(),
+        Command::Sizes => {
             let table = commands::sizes::table(&options.document)?;
             let written = std::io::stdout().write_all(table.as_bytes());
             written.map_err(|source| Error::System { what: "cannot write to stdout".into(), source })
         }
-        Some(Command::Status(status)) => status.run(),
-        Some(Command::Health(_)) => Ok(()),
-        Some(Command::Certs(certs)) => certs.run(),
-        Some(Command::Metrics) => comic_learner::observe::telemetry::print_reference(),
-        Some(Command::Manual(manual)) => manual
+        Command::Status(status) => status.run(),
+        Command::Health(_) => Ok(()),
+        Command::Certs(certs) => certs.run(),
+        Command::Metrics => comic_learner::observe::telemetry::print_reference(),
+        Command::Manual(manual) => manual
             .write(Options::command())
             .map_err(|source| Error::System { what: "cannot write the manual".into(), source }),
-        None => {
-            comic_learner::threads::wait_passively();
-            comic_learner::run::run(options)
-        }
     }
 }

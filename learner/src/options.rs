@@ -89,10 +89,10 @@ pub enum Command {
     Manual(Manual),
 }
 
-/// The actor has the same exit codes; `docs/running.md` says more.
+/// `docs/running.md` says more, and has the actor's.
 const EXIT_CODES: &str = "\
-Exit codes: 0 when the run is over, or when the learner was told to stop and wrote its checkpoint; 2 when the configuration
-is wrong, so that starting again cannot help; 1 otherwise.
+Exit codes: 0 when the run is over; 4 when the learner was told to stop before that and wrote its checkpoint; 2 when the
+configuration is wrong, so that starting again cannot help; 1 otherwise.
 Logs go to standard error; RUST_LOG sets their level (default: info).";
 
 /// Format of the log.

@@ -40,21 +40,27 @@ const LATE_END_DELAY: Duration = Duration::from_secs(20);
 /// How often the learner looks whether absent actors are back.
 const POLL: Duration = Duration::from_millis(100);
 
-/// Serves and trains until the budget is used up or a signal comes. Prints one JSON line to stdout when it listens.
+/// Prints the resolved experiment.
+///
+/// # Errors
+/// A wrong experiment, or a standard output that is closed.
+pub fn print(options: &Options) -> Result<()> {
+    let text = options.document.resolve()?.to_toml()?;
+    std::io::stdout().write_all(text.as_bytes()).map_err(Error::system("cannot write to stdout"))
+}
+
+/// Serves and trains until the budget is used up or a signal comes, and returns which. Prints one JSON line to stdout when it
+/// listens.
 ///
 /// # Errors
 /// A wrong experiment, unusable clips, a run directory of another experiment, an address in use, a disk that fails.
-pub fn run(options: &Options) -> Result<()> {
+pub fn run(options: &Options) -> Result<Ending> {
     let experiment = options.document.resolve()?;
-    if options.print {
-        let text = experiment.to_toml()?;
-        return std::io::stdout().write_all(text.as_bytes()).map_err(Error::system("cannot write to stdout"));
-    }
     tch::set_num_threads(threads::of(&experiment) as i32);
     runtime()?.block_on(serve_and_train(options, experiment))
 }
 
-async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<()> {
+async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<Ending> {
     // First, so that no signal is missed.
     let mut signals = Signals::new()?;
     let security = Security::new(&options.security, options.address)?;
@@ -93,7 +99,7 @@ async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<()
         Ending::Budget => "the budget is used up",
         Ending::Stopped => "stopped; start again with the same --run to continue",
     });
-    Ok(())
+    Ok(ending)
 }
 
 /// Tells the actors that the run is over, and gives them this time to hear it, and more if one is away.

@@ -37,7 +37,7 @@ fn ctrl_c_leaves_a_checkpoint_that_another_device_resumes() {
         kill_process(Pid::from_child(&child), signal).unwrap();
         let output = child.wait_with_output().unwrap();
         let log = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(0), "{device}: {log}");
+        assert_eq!(output.status.code(), Some(4), "{device}: {log}");
         assert!(log.contains("stopped; start again"), "{device}: {log}");
         assert!(find(&run).is_ok(), "{device}: {log}");
     }

@@ -5,9 +5,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
-use k8s_openapi::api::apps::v1::StatefulSet;
 use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::{Container, Namespace, PodSpec, Service};
+use k8s_openapi::api::core::v1::{Container, Namespace, PersistentVolumeClaim, PodSpec, Service};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use k8s_openapi::api::policy::v1::PodDisruptionBudget;
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
@@ -124,8 +123,10 @@ pub struct Cluster {
     pub namespace: Namespace,
     /// The learner's Service.
     pub service: Service,
-    /// The learner's StatefulSet.
-    pub learner: StatefulSet,
+    /// The claim for the learner's runs.
+    pub claim: PersistentVolumeClaim,
+    /// The learner's Job.
+    pub learner: Job,
     /// The actors' Job.
     pub actors: Job,
     /// The evaluator's Job.
@@ -147,7 +148,8 @@ impl Cluster {
         let cluster = Self {
             namespace: take(&mut manifests, "Namespace", "comic")?,
             service: take(&mut manifests, "Service", "comic-learner")?,
-            learner: take(&mut manifests, "StatefulSet", "comic-learner")?,
+            claim: take(&mut manifests, "PersistentVolumeClaim", "comic-runs")?,
+            learner: take(&mut manifests, "Job", "comic-learner")?,
             actors: take(&mut manifests, "Job", "comic-actor")?,
             evaluator: take(&mut manifests, "Job", "comic-evaluator")?,
             budget: take(&mut manifests, "PodDisruptionBudget", "comic-actor")?,
@@ -170,7 +172,7 @@ impl Cluster {
     /// # Errors
     /// When there is none.
     pub fn learner_pod(&self) -> Result<&PodSpec> {
-        self.learner.spec.template.spec.as_ref().context("no pod")
+        pod(&self.learner)
     }
 
     /// The actors' pod.

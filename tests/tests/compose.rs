@@ -65,7 +65,7 @@ async fn containers_survive_kills_and_cuts_and_the_accounting_balances() -> Resu
     let learner = project.container("learner")?;
     let before = project.status()?;
     project.compose(&["stop", "learner"])?;
-    ensure!(learner.inspect(".State.ExitCode")? == "0", "SIGTERM reached the learner: {}", learner.log()?);
+    ensure!(learner.inspect(".State.ExitCode")? == "4", "SIGTERM did not reach the learner: {}", learner.log()?);
     project.compose(&["start", "learner"])?;
     let after = trains_on_with(2, &project, "the learner resumes and the actors find it").await?;
     ensure!(learner.log()?.contains("resuming"), "the learner did not resume: {}", learner.log()?);

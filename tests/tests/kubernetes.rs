@@ -61,10 +61,19 @@ fn probes_use_ports_and_commands_that_exist() -> Result<()> {
             ensure!(asked.path.as_deref() == Some(path) && asked.scheme.is_none(), "{asked:?}");
             ensure!(asked.port == IntOrString::String("metrics".into()), "{asked:?}");
         }
+        let startup = learner.startup_probe.as_ref().context("no probe of the start")?;
+        // libtpu asks for a machine's metadata for up to eight minutes before the learner serves.
+        ensure!(startup.period_seconds.unwrap_or(10) * startup.failure_threshold.unwrap_or(3) > 480, "{startup:?}");
         let actor = container(cluster.actor_pod()?)?;
         let asked = actor.readiness_probe.as_ref().and_then(|probe: &Probe| probe.exec.as_ref()?.command.as_deref());
         ensure!(asked == Some(&["comic-actor".to_owned(), "health".to_owned()]), "{asked:?}");
         ensure!(actor.liveness_probe.is_none(), "an actor that waits for its learner would be restarted");
+        let (startup, patience) = (actor.startup_probe.as_ref().context("no probe of the start")?, environment(actor));
+        let waits = startup.period_seconds.unwrap_or(10) * startup.failure_threshold.unwrap_or(3);
+        ensure!(
+            waits > patience["COMIC_GIVE_UP_AFTER"].parse::<i32>()?,
+            "an actor is killed while it waits for its learner"
+        );
         can_write_to(actor, "COMIC_LIVENESS")
     })
 }
@@ -101,15 +110,11 @@ fn names_and_ports_agree_with_each_other_and_with_the_programs() -> Result<()> {
         let expected = [("grpc", (grpc, named("grpc"))), ("metrics", (metrics, named("metrics")))];
         ensure!(ports.collect::<BTreeMap<_, _>>() == BTreeMap::from(expected), "{:?}", service.ports);
         ensure!(service.cluster_ip.as_deref() == Some("None"), "one learner needs no virtual address");
-        ensure!(
-            service.publish_not_ready_addresses == Some(true),
-            "an actor must reach a learner that is not ready, to hear that the run is over"
-        );
+        ensure!(service.publish_not_ready_addresses == Some(true), "an actor must reach a learner that drains");
         let name = cluster.service.metadata.name.as_deref().unwrap_or_default();
-        let set = &cluster.learner.spec;
-        ensure!(set.service_name.as_deref() == Some(name) && set.replicas == Some(1), "one learner behind its Service");
-        let labels = set.template.metadata.as_ref().and_then(|metadata| metadata.labels.as_ref());
-        ensure!(labels == set.selector.match_labels.as_ref() && labels == service.selector.as_ref(), "{labels:?}");
+        let job = cluster.learner.spec.as_ref().context("no spec")?;
+        let labels = job.template.metadata.as_ref().and_then(|metadata| metadata.labels.as_ref());
+        ensure!(labels == service.selector.as_ref(), "the learner is not behind its Service: {labels:?}");
 
         let url = format!("https://{name}:{grpc}");
         let variables = environment(container(cluster.actor_pod()?)?);
@@ -160,6 +165,22 @@ fn images_are_pinned_to_this_version_everywhere() -> Result<()> {
 
 fn suffixed(name: &str, device: Option<&str>) -> String {
     device.map_or_else(|| name.to_owned(), |device| format!("{name}-{device}"))
+}
+
+#[test]
+fn the_learner_is_a_job_that_starts_again_until_the_run_is_over() -> Result<()> {
+    each(|cluster| {
+        let job = cluster.learner.spec.as_ref().context("no spec")?;
+        ensure!(job.parallelism.is_none() && job.completions.is_none(), "more than one learner");
+        let after = |code| action_after(job, code);
+        ensure!([after(1)?, after(2)?, after(4)?] == [None, Some("FailJob"), Some("Ignore")]);
+        ensure!(job.pod_replacement_policy.as_deref() == Some("Failed"), "two learners may have the run at a time");
+        for job in [&cluster.learner, &cluster.actors, &cluster.evaluator] {
+            let kept = job.spec.as_ref().and_then(|spec| spec.ttl_seconds_after_finished);
+            ensure!(kept > Some(0), "a finished Job stays for ever");
+        }
+        Ok(())
+    })
 }
 
 #[test]
@@ -254,7 +275,8 @@ fn only_actors_and_the_evaluator_reach_the_learners_port() -> Result<()> {
             "the policy covers only one direction"
         );
         ensure!(everybody.ingress.is_none() && everybody.egress.is_none(), "the policy lets traffic through");
-        let learner = cluster.learner.spec.template.metadata.as_ref().and_then(|metadata| metadata.labels.as_ref());
+        let learner = cluster.learner.spec.as_ref().and_then(|spec| spec.template.metadata.as_ref());
+        let learner = learner.and_then(|metadata| metadata.labels.as_ref());
         let learner = json!({ "matchLabels": learner });
         let label = "app.kubernetes.io/name";
         let names = [&cluster.actors, &cluster.evaluator].map(|job| {

@@ -65,8 +65,8 @@ fn pods_are_restricted() -> Result<()> {
             );
             for volume in pod.volumes.iter().flatten() {
                 ensure!(
-                    volume.secret.is_some() || volume.empty_dir.is_some(),
-                    "volume {} is neither a Secret nor an empty directory",
+                    volume.secret.is_some() || volume.empty_dir.is_some() || volume.persistent_volume_claim.is_some(),
+                    "volume {} is neither a Secret nor an empty directory nor a claim",
                     volume.name
                 );
             }
@@ -96,9 +96,11 @@ fn a_run_outlives_its_pod() -> Result<()> {
         let run = PathBuf::from(option(learner, "--run")?);
         let mounts = learner.volume_mounts.iter().flatten();
         let mount = mounts.into_iter().find(|mount| run.starts_with(&mount.mount_path)).context("no volume for it")?;
-        let claims = cluster.learner.spec.volume_claim_templates.iter().flatten();
-        let claim = claims.into_iter().find(|claim| claim.metadata.name.as_ref() == Some(&mount.name));
-        let claim = claim.and_then(|claim| claim.spec.as_ref()).context("the volume is the pod's own")?;
+        let volumes = cluster.learner_pod()?.volumes.iter().flatten();
+        let volume = volumes.into_iter().find(|volume| volume.name == mount.name).context("no such volume")?;
+        let claimed = volume.persistent_volume_claim.as_ref().context("the volume is the pod's own")?;
+        ensure!(Some(&claimed.claim_name) == cluster.claim.metadata.name.as_ref(), "{claimed:?}");
+        let claim = cluster.claim.spec.as_ref().context("no spec")?;
         ensure!(claim.access_modes.as_deref() == Some(&["ReadWriteOnce".to_owned()]), "{claim:?}");
         let requests = claim.resources.as_ref().and_then(|resources| resources.requests.as_ref());
         ensure!(amount(&requests.context("the claim has no size")?["storage"])? > 0.0, "{requests:?}");

@@ -1,10 +1,12 @@
 //! The other tests render the manifests themselves. kustomize gives the same result.
 
+use std::fs;
 use std::path::Path;
 use std::process::Command;
 
 use anyhow::{Context, Result, ensure};
 use comic_tests::kubernetes::{applicable, manifests_in, render};
+use comic_tests::repository::root;
 
 #[test]
 fn kustomize_renders_the_same() -> Result<()> {
@@ -12,6 +14,32 @@ fn kustomize_renders_the_same() -> Result<()> {
         let theirs = manifests_in(&kustomize(&directory)?)?;
         let ours = render(&directory)?;
         ensure!(ours == theirs, "{}: ours is {ours:#?}, theirs {theirs:#?}", directory.display());
+    }
+    Ok(())
+}
+
+/// A user's own overlay on each of ours: images of a registry, as `kustomize edit set image` names them, and another namespace.
+#[test]
+fn kustomize_takes_other_images_and_another_namespace() -> Result<()> {
+    let target = root().join("target");
+    fs::create_dir_all(&target)?;
+    for ours in applicable()? {
+        let overlay = tempfile::tempdir_in(&target)?;
+        let base = Path::new("../..").join(ours.strip_prefix(root())?);
+        let images = ["comic-learner", "comic-learner-cuda", "comic-learner-xla", "comic-actor"];
+        let images =
+            images.map(|name| format!("- {{name: {name}, newName: registry/{name}, newTag: \"2\"}}\n")).concat();
+        let text = format!("resources: [{}]\nnamespace: second\nimages:\n{images}", base.display());
+        fs::write(overlay.path().join("kustomization.yaml"), text)?;
+        for ((kind, name), manifest) in manifests_in(&kustomize(overlay.path())?)? {
+            let place =
+                if kind == "Namespace" { &manifest["metadata"]["name"] } else { &manifest["metadata"]["namespace"] };
+            ensure!(place == "second", "{kind} {name} is in {place}");
+            if kind == "Job" {
+                let image = manifest["spec"]["template"]["spec"]["containers"][0]["image"].as_str().unwrap_or_default();
+                ensure!(image.starts_with("registry/comic-") && image.ends_with(":2"), "{}: {image}", ours.display());
+            }
+        }
     }
     Ok(())
 }

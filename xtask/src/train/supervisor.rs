@@ -11,6 +11,8 @@ use super::process::{Process, Tail};
 use super::{Job, child};
 use crate::{evaluations, workspace};
 
+/// The exit code of a learner that was told to stop, and wrote its checkpoint.
+const STOPPED: i32 = 4;
 /// The time in which the learner must begin to serve. It opens the clips and builds the networks first.
 const START_LIMIT: Duration = Duration::from_secs(120);
 /// The time in which the learner must write its last checkpoint and end.
@@ -112,6 +114,10 @@ impl<'a> Supervisor<'a> {
             if let Some(status) = self.learner.ended()? {
                 if status.success() {
                     display.event("budget used up", &[]);
+                    return Ok(());
+                }
+                if status.code() == Some(STOPPED) {
+                    display.event("stopping", &[("reason", "the learner was told to stop".into())]);
                     return Ok(());
                 }
                 bail!("comic-learner ended with {status}; {}", self.learner.last_lines());
