@@ -96,7 +96,7 @@ async fn an_actor_sends_its_name_and_superseding_it_is_no_configuration_error() 
     assert_eq!(learner.seen().joins[0].name, "pod-0");
 }
 
-/// Where nobody listens.
+/// No server listens at port 1.
 const NOBODY: &str = "http://127.0.0.1:1";
 
 #[tokio::test]
@@ -245,8 +245,7 @@ async fn an_actor_waits_for_a_learner_that_starts_later() {
 
 #[tokio::test]
 async fn the_reason_that_an_actor_logs_without_a_learner_names_the_remedy() {
-    // No server listens at port 1.
-    let mut connector = Connector::new(&options_for("http://127.0.0.1:1")).unwrap();
+    let mut connector = Connector::new(&options_for(NOBODY)).unwrap();
     let failure = connector.connect(0).await.unwrap_err();
     assert!(matches!(&failure, Failure::Lost(reason) if reason.contains("is the learner running")), "{failure:?}");
 }
@@ -266,8 +265,7 @@ async fn a_refusal_is_a_configuration_error_and_stopping_ends_the_wait() {
 
     let (stop, stopped) = watch::channel(false);
     stop.send_replace(true);
-    // No server listens at port 1.
-    let options = options_for("http://127.0.0.1:1");
+    let options = options_for(NOBODY);
     assert!(matches!(join(&options, stopped).await, Err(Error::Stopped)));
 }
 
