@@ -41,3 +41,18 @@ pub fn of(experiment: &Experiment) -> usize {
         _ => wanted,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn there_are_no_more_threads_than_cores_except_in_lockstep() {
+        let cores = std::thread::available_parallelism().unwrap().get();
+        let mut experiment = Experiment::default();
+        for (lockstep, wanted, expected) in [(false, cores + 1, cores), (true, cores + 1, cores + 1), (false, 1, 1)] {
+            (experiment.unroll.lockstep, experiment.learner.threads) = (lockstep, wanted);
+            assert_eq!(of(&experiment), expected, "lockstep {lockstep}, {wanted} wanted");
+        }
+    }
+}
