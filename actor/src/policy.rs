@@ -2,7 +2,7 @@
 
 use comic_experiment::{ACTION_SIZE, Experiment, InitialPose, TaskSpec};
 use comic_networks::export::Exported;
-use comic_networks::{FrozenLowLevel, Policy, RecurrentState, Routing};
+use comic_networks::{FrozenLowLevel, Policy, RecurrentState, Routing, new_policy};
 use comic_proto::Field;
 use tch::nn::VarStore;
 use tch::{Device, TchError, Tensor};
@@ -14,7 +14,7 @@ use crate::forward_pass::{ActingBatch, ForwardPass, LowLevelShape};
 #[derive(Debug)]
 pub struct TorchPolicy {
     store: VarStore,
-    policy: Policy,
+    policy: Box<dyn Policy>,
     /// In transfer: what turns the policy's latents into commands.
     low_level: Option<FrozenLowLevel>,
     /// Number of tasks.
@@ -51,7 +51,7 @@ impl TorchPolicy {
         // libtorch takes signed seeds; two's complement maps every seed to one.
         tch::manual_seed(seed.cast_signed());
         let store = VarStore::new(Device::Cpu);
-        let policy = Policy::of(&store.root(), spec, experiment, &pose).map_err(misfit)?;
+        let policy = new_policy(&store.root(), spec, experiment, &pose).map_err(misfit)?;
         let low_level = match low_level {
             _ if !experiment.transfer.is_on() => None,
             Some(file) => {

@@ -1,13 +1,13 @@
 //! Finds values that parse but mean nothing. Every rule refuses NaN.
 
+use crate::algorithms;
 use crate::clips::{ClipSource, SUBSETS};
 use crate::document::Experiment;
 use crate::fault::{AT_LEAST_ONE, Fault, NOT_NEGATIVE, POSITIVE, ensure, not_negative, positive};
 use crate::network::{InitialPose, Network, Prior};
-use crate::settings::{Actor, Budget, LONGEST_UNROLL, Learner, Optimiser, Unroll, Vmpo, WarmStart};
-use crate::svg0::Svg0;
-use crate::tasks::{TaskName, TerminationError, Vision};
-use crate::transfer::{Transfer, TransferAlgorithm};
+use crate::settings::{Actor, Budget, LONGEST_UNROLL, Learner, Optimiser, Unroll, WarmStart};
+use crate::tasks::{TaskName, Vision};
+use crate::transfer::Transfer;
 
 /// The squared ratio of two float32 numbers overflows with a smaller deviation. The wire refuses a smaller one, too.
 const SMALLEST_STD: f64 = 1e-6;
@@ -25,14 +25,13 @@ pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
     experiment.clips.iter().enumerate().try_for_each(|(index, source)| clips(index, source))?;
     TaskName::ALL.into_iter().try_for_each(|task| experiment.parameters(task).check(task.section()))?;
     transfer(experiment)?;
-    svg0(experiment)?;
     network(&experiment.network)?;
-    vmpo(&experiment.vmpo, &experiment.unroll)?;
     optimiser(&experiment.optimiser)?;
     unroll(&experiment.unroll)?;
     actor(&experiment.actor)?;
     warm_start(&experiment.warm_start)?;
     together(experiment)?;
+    algorithms::check(experiment)?;
     learner(&experiment.learner)?;
     budget(&experiment.budget)
 }
@@ -86,54 +85,22 @@ fn clips(index: usize, source: &ClipSource) -> Result<(), Fault> {
 
 /// Fields of a transfer, and fields that make no sense beside a frozen low level.
 fn transfer(experiment: &Experiment) -> Result<(), Fault> {
-    let Experiment { transfer, network, vmpo, joint, .. } = experiment;
-    let Transfer { low_level: _, sha256, latent_limit, mean_scale, prior: _, algorithm: _ } = transfer;
+    let Experiment { transfer, network, joint, .. } = experiment;
+    let Transfer { low_level: _, sha256, latent_limit, mean_scale, prior: _ } = transfer;
     let holds = sha256.is_empty() || (sha256.len() == 64 && sha256.bytes().all(|byte| byte.is_ascii_hexdigit()));
     ensure("transfer.sha256", sha256, holds, "must be empty, or 64 hexadecimal digits")?;
     let in_range = |number: &f64| positive(*number) && *number <= LARGEST_LATENT;
     ensure("transfer.latent_limit", latent_limit, in_range(latent_limit), "must be positive, at most 1000")?;
     ensure("transfer.mean_scale", mean_scale, in_range(mean_scale), "must be positive, at most 1000")?;
-    if experiment.learns_low_level() {
+    if !transfer.is_on() {
         return Ok(());
     }
-    ensure("joint", joint.len(), joint.is_empty(), "must be empty with transfer.low_level or SVG(0)")?;
+    ensure("joint", joint.len(), joint.is_empty(), "must be empty with transfer.low_level")?;
     let pose = network.initial_pose;
-    let remedy = "must be \"mid-range\" with transfer.low_level or SVG(0)";
-    ensure("network.initial_pose", pose, pose == InitialPose::MidRange, remedy)?;
-    let remedy = "must be 0 with transfer.low_level or SVG(0)";
-    ensure("vmpo.action_gradient", vmpo.action_gradient, vmpo.action_gradient == 0.0, remedy)?;
+    let holds = pose == InitialPose::MidRange;
+    ensure("network.initial_pose", pose, holds, "must be \"mid-range\" with transfer.low_level")?;
     let steps = experiment.warm_start.steps;
-    ensure("warm_start.steps", steps, steps == 0, remedy)
-}
-
-fn svg0(experiment: &Experiment) -> Result<(), Fault> {
-    let Svg0 { discount, learning_rate, target_period, lambda, action_samples, entropy, kl, .. } = &experiment.svg0;
-    ensure("svg0.discount", discount, (0.0..1.0).contains(discount), "must be in [0, 1)")?;
-    ensure("svg0.learning_rate", learning_rate, positive(*learning_rate), POSITIVE)?;
-    ensure("svg0.target_period", target_period, *target_period > 0, AT_LEAST_ONE)?;
-    ensure("svg0.lambda", lambda, (0.0..=1.0).contains(lambda), "must be in [0, 1]")?;
-    ensure("svg0.action_samples", action_samples, (1..=1024).contains(action_samples), "must be 1 to 1024")?;
-    ensure("svg0.entropy", entropy, not_negative(*entropy), NOT_NEGATIVE)?;
-    ensure("svg0.kl", kl, not_negative(*kl), NOT_NEGATIVE)?;
-    let Svg0 { minibatch_sequences, burn_in, encoder, core, policy, action_value, .. } = &experiment.svg0;
-    let sequences = *minibatch_sequences;
-    ensure("svg0.minibatch_sequences", sequences, (1..=65536).contains(&sequences), "must be 1 to 65536")?;
-    let length = experiment.unroll.length;
-    let uses = experiment.transfer.algorithm == TransferAlgorithm::Svg0;
-    ensure("svg0.burn_in", burn_in, !uses || *burn_in < length, "must be less than unroll.length")?;
-    let std = experiment.network.final_std;
-    ensure("network.final_std", std, !uses || std == 0.0, "must be 0 with transfer.algorithm = \"svg0\"")?;
-    for (field, sizes) in [("svg0.encoder", encoder), ("svg0.action_value", action_value)] {
-        let holds = !sizes.is_empty() && sizes.iter().all(|size| (1..=16384).contains(size)) && sizes.len() <= 64;
-        ensure(field, sizes, holds, "must be one or more layers of 1 to 16384 units")?;
-    }
-    for (field, units) in [("svg0.core", core), ("svg0.policy", policy)] {
-        ensure(field, units, (1..=16384).contains(units), "must be 1 to 16384 units")?;
-    }
-    let Svg0 { replay_steps, samples_per_insert, .. } = &experiment.svg0;
-    ensure("svg0.replay_steps", replay_steps, *replay_steps <= 1 << 32, "must be at most 4294967296")?;
-    let samples = *samples_per_insert;
-    ensure("svg0.samples_per_insert", samples, samples > 0.0 && samples <= 1e4, "must be positive, at most 10000")
+    ensure("warm_start.steps", steps, steps == 0, "must be 0 with transfer.low_level")
 }
 
 fn network(network: &Network) -> Result<(), Fault> {
@@ -181,38 +148,6 @@ fn network(network: &Network) -> Result<(), Fault> {
     }
 }
 
-fn vmpo(vmpo: &Vmpo, unroll: &Unroll) -> Result<(), Fault> {
-    ensure("vmpo.discount", vmpo.discount, (0.0..1.0).contains(&vmpo.discount), "must be in [0, 1)")?;
-    for (field, number) in [
-        ("vmpo.epsilon_eta", vmpo.epsilon_eta),
-        ("vmpo.epsilon_mean", vmpo.epsilon_mean),
-        ("vmpo.epsilon_std", vmpo.epsilon_std),
-        ("vmpo.epsilon_discrete", vmpo.epsilon_discrete),
-        ("vmpo.initial_temperature", vmpo.initial_temperature),
-        ("vmpo.initial_alpha_mean", vmpo.initial_alpha_mean),
-        ("vmpo.initial_alpha_std", vmpo.initial_alpha_std),
-        ("vmpo.initial_alpha_discrete", vmpo.initial_alpha_discrete),
-    ] {
-        ensure(field, number, positive(number), POSITIVE)?;
-    }
-    let holds = vmpo.top_fraction > 0.0 && vmpo.top_fraction <= 1.0;
-    ensure("vmpo.top_fraction", vmpo.top_fraction, holds, "must be in (0, 1]")?;
-    ensure("vmpo.target_period", vmpo.target_period, vmpo.target_period > 0, AT_LEAST_ONE)?;
-    ensure("vmpo.gradient_steps", vmpo.gradient_steps, vmpo.gradient_steps > 0, AT_LEAST_ONE)?;
-    let batch = unroll.batch;
-    let holds = vmpo.minibatch_unrolls > 0 && batch.is_multiple_of(vmpo.minibatch_unrolls);
-    ensure("vmpo.minibatch_unrolls", vmpo.minibatch_unrolls, holds, format!("must divide unroll.batch, {batch}"))?;
-    ensure("vmpo.lambda", vmpo.lambda, (0.0..=1.0).contains(&vmpo.lambda), "must be in [0, 1]")?;
-    ensure("vmpo.entropy", vmpo.entropy, not_negative(vmpo.entropy), NOT_NEGATIVE)?;
-    let weight = vmpo.action_gradient;
-    ensure("vmpo.action_gradient", weight, not_negative(weight), NOT_NEGATIVE)?;
-    let weight = vmpo.control_variate;
-    ensure("vmpo.control_variate", weight, not_negative(weight), NOT_NEGATIVE)?;
-    ensure("vmpo.value_weight", vmpo.value_weight, not_negative(vmpo.value_weight), NOT_NEGATIVE)?;
-    let burn_in = vmpo.value_burn_in;
-    ensure("vmpo.value_burn_in", burn_in, burn_in == 0 || burn_in < unroll.length, "must be less than unroll.length")
-}
-
 fn optimiser(optimiser: &Optimiser) -> Result<(), Fault> {
     for (field, number) in [
         ("optimiser.learning_rate", optimiser.learning_rate),
@@ -255,25 +190,13 @@ fn warm_start(warm_start: &WarmStart) -> Result<(), Fault> {
 
 /// Fields that make no sense beside one another.
 fn together(experiment: &Experiment) -> Result<(), Fault> {
-    let Experiment { network, vmpo, warm_start, unroll, budget, .. } = experiment;
-    let holds = vmpo.value_burn_in == 0 || !network.value_lstm.is_empty();
-    let remedy = "must be 0 without a recurrent value function; set network.value_lstm, or leave this 0";
-    ensure("vmpo.value_burn_in", vmpo.value_burn_in, holds, remedy)?;
+    let Experiment { network, warm_start, unroll, budget, .. } = experiment;
     let demonstrates = experiment.tasks().iter().any(|(task, _)| experiment.parameters(*task).follows_clips());
     let holds = warm_start.steps == 0 || demonstrates;
     ensure("warm_start.steps", warm_start.steps, holds, "must be 0 unless a task has a reference, as tracking has")?;
     let holds = warm_start.steps == 0 || network.low_level.imitates();
     let remedy = format!("must be 0 with network.low_level = \"{}\"", network.low_level);
     ensure("warm_start.steps", warm_start.steps, holds, &remedy)?;
-    let has = |wanted| experiment.tasks().iter().any(|(task, _)| *task == wanted);
-    let linear = experiment.tracking.termination_error == TerminationError::DmControl;
-    let differentiable = if has(TaskName::Tracking) { linear } else { has(TaskName::GetUp) };
-    let holds = vmpo.action_gradient == 0.0 || differentiable;
-    let remedy = "must be 0 without tracking and get-up, and with another tracking.termination_error than dm-control";
-    ensure("vmpo.action_gradient", vmpo.action_gradient, holds, remedy)?;
-    let holds = vmpo.control_variate == 0.0 || experiment.components() == 1;
-    let remedy = "must be 0 with network.low_level = \"mixture\", whose KL has no closed form";
-    ensure("vmpo.control_variate", vmpo.control_variate, holds, remedy)?;
     let holds = !unroll.lockstep || unroll.ahead == 0;
     ensure("unroll.ahead", unroll.ahead, holds, "must be 0 with unroll.lockstep")?;
     let holds = !unroll.lockstep || budget.minutes == 0.0;

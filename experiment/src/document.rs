@@ -2,14 +2,15 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::algorithms::{AlgorithmName, Svg0, Vmpo};
 use crate::body::ACTION_SIZE;
 use crate::clips::ClipSource;
 use crate::for_each_task;
 use crate::network::Network;
-use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll, Vmpo, WarmStart};
-use crate::svg0::Svg0;
+use crate::replay::Replay;
+use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll, WarmStart};
 use crate::tasks::{self, TaskName, TaskParameters};
-use crate::transfer::{Transfer, TransferAlgorithm};
+use crate::transfer::Transfer;
 
 macro_rules! document {
     ($($(#[$description:meta])* $task:ident, $section:ident, $name:literal;)*) => {
@@ -21,6 +22,8 @@ macro_rules! document {
             pub name: String,
             /// Seed of all random numbers: networks, actors, minibatches.
             pub seed: u64,
+            /// The learning algorithm. The section of the same name holds its parameters.
+            pub algorithm: AlgorithmName,
             /// The task. The section of the same name holds its parameters.
             pub task: TaskName,
             /// Tasks of joint training: each episode draws its task, and all tasks share the low level (S: get-up 0.1 or
@@ -37,6 +40,8 @@ macro_rules! document {
             pub vmpo: Vmpo,
             /// Parameters of SVG(0).
             pub svg0: Svg0,
+            /// The replay of an off-policy algorithm.
+            pub replay: Replay,
             /// Adam.
             pub optimiser: Optimiser,
             /// Unrolls and batches.
@@ -56,6 +61,7 @@ macro_rules! document {
                 Self {
                     name: "tracking-mlp".into(),
                     seed: 1,
+                    algorithm: AlgorithmName::default(),
                     task: TaskName::Tracking,
                     joint: Vec::new(),
                     clips: vec![ClipSource::whole("builtin:CMU_007_01")],
@@ -64,6 +70,7 @@ macro_rules! document {
                     network: Network::default(),
                     vmpo: Vmpo::default(),
                     svg0: Svg0::default(),
+                    replay: Replay::default(),
                     optimiser: Optimiser::default(),
                     unroll: Unroll::default(),
                     actor: Actor::default(),
@@ -110,11 +117,6 @@ impl Experiment {
         if self.transfer.is_on() { self.network.latent.size } else { ACTION_SIZE }
     }
 
-    /// Whether the policy has an encoder and a low level of its own, which it learns.
-    pub fn learns_low_level(&self) -> bool {
-        !self.transfer.is_on() && self.transfer.algorithm == TransferAlgorithm::Vmpo
-    }
-
     /// Length of the latent that the policy samples itself.
     pub fn latent_size(&self) -> usize {
         if self.learns_low_level() { self.network.latent.size } else { 0 }
@@ -123,15 +125,6 @@ impl Experiment {
     /// Gaussians in the distribution of the policy's action.
     pub fn components(&self) -> usize {
         if self.learns_low_level() { self.network.components() } else { 1 }
-    }
-
-    /// Size of the policy's recurrent state. A frozen low level's state is not part of it.
-    pub fn state_size(&self) -> usize {
-        match self.transfer.algorithm {
-            TransferAlgorithm::Svg0 => 2 * (self.svg0.core + self.svg0.policy),
-            TransferAlgorithm::Vmpo if self.transfer.is_on() => 0,
-            TransferAlgorithm::Vmpo => self.network.state_size(),
-        }
     }
 
     /// Size of the recurrent state of a frozen low level; 0 without one.

@@ -7,12 +7,13 @@
 //! - [`resolve()`] turns a preset or a file plus `--set key=value` overrides into an [`Experiment`]. It refuses unknown
 //!   fields and names the nearest known one.
 //! - [`find_field`] finds a field by the end of its name. [`Experiment::differences`] compares two experiments.
-//! - [`for_each_task`] lists all tasks. [`TaskSpec`] is what networks, wire and learner know of a task: sizes and names.
+//! - [`for_each_algorithm`] lists the learning algorithms, and [`for_each_task`] the tasks. [`TaskSpec`] is what networks, wire and learner know of a task: sizes and names.
 //! - [`seed`] derives independent seeds; [`statistics`] has the median. Every crate uses the same ones.
 //!
 //! Every default is the paper's: (S) the CoMic supplement, (V) V-MPO. (D) is a decision of this project where both are
 //! silent. A preset with other values gives the reason in its file.
 
+mod algorithms;
 mod body;
 mod check;
 mod clips;
@@ -25,16 +26,17 @@ mod lines;
 mod nearest;
 mod network;
 pub mod presets;
+mod replay;
 mod resolve;
 pub mod seed;
 mod settings;
 mod spec;
 pub mod statistics;
-mod svg0;
 mod tasks;
 mod transfer;
 mod vocabulary;
 
+pub use algorithms::{AlgorithmName, Svg0, Vmpo};
 pub use body::{ACTION_SIZE, IMAGE_SIZE, PROPRIOCEPTION, PROPRIOCEPTION_SIZE};
 pub use clips::{ClipSource, SUBSETS};
 pub use device::{DeviceName, MatmulPrecision};
@@ -43,11 +45,9 @@ pub use error::Error;
 pub use fields::{Difference, find_field};
 pub use nearest::nearest;
 pub use network::{InitialPose, Latent, LowLevelName, Lstm, Mlp, Network, Primitives, Prior};
+pub use replay::Replay;
 pub use resolve::resolve;
-pub use settings::{
-    Actor, Budget, LARGEST_ACTION_GRADIENT, LONGEST_UNROLL, Learner, Optimiser, Unroll, Vmpo, WarmStart,
-};
+pub use settings::{Actor, Budget, LARGEST_ACTION_GRADIENT, LONGEST_UNROLL, Learner, Optimiser, Unroll, WarmStart};
 pub use spec::{TaskPart, TaskSpec};
-pub use svg0::Svg0;
 pub use tasks::*;
-pub use transfer::{Transfer, TransferAlgorithm, TransferPrior};
+pub use transfer::{Transfer, TransferPrior};

@@ -13,7 +13,8 @@ use crate::presets;
 use crate::vocabulary::{Unknown, refuse_unknown};
 
 /// Resolves `document`, which is a preset's name or the path of a TOML file. Then applies `overrides` of the form
-/// `field.path=value` in order. A number names an element of an array: `clips.0.weight=2`.
+/// `field.path=value` in order. A number names an element of an array: `clips.0.weight=2`. An override of `algorithm` comes
+/// before all others, and gives what the new algorithm does not read its default.
 ///
 /// # Errors
 /// [`Error`], naming file, line and field.
@@ -28,8 +29,11 @@ fn overridden(
     overrides: &[String],
     origin: impl Fn(&str) -> String,
 ) -> Result<Experiment, Error> {
-    let apply = |experiment: Experiment, argument: &String| apply_override(&experiment, argument);
-    let experiment = overrides.iter().try_fold(experiment, apply)?;
+    let (choices, others): (Vec<_>, Vec<_>) = overrides.iter().partition(|argument| path_of(argument) == "algorithm");
+    let choose = |experiment, argument: &String| with_unread_at_defaults(&apply_override(&experiment, argument)?);
+    let experiment = choices.into_iter().try_fold(experiment, choose)?;
+    let experiment =
+        others.into_iter().try_fold(experiment, |experiment, argument| apply_override(&experiment, argument))?;
     check(&experiment).map_err(|fault| {
         let argument = overrides.iter().rev().find(|argument| names(argument, &fault.field));
         let origin = argument.map_or_else(|| origin(&fault.field), |argument| format!("--set {argument}"));
@@ -118,11 +122,29 @@ fn at(origin: &str, text: &str, field: &str) -> String {
 
 /// Whether `argument` sets `field`, a part of it, or a section that contains it.
 fn names(argument: &str, field: &str) -> bool {
-    let path = argument.split_once('=').map_or(argument, |(path, _)| path).trim();
+    let path = path_of(argument);
     let within = |outer: &str, inner: &str| {
         inner.strip_prefix(outer).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
     };
     within(path, field) || within(field, path)
+}
+
+/// The field that `argument` sets.
+fn path_of(argument: &str) -> &str {
+    argument.split_once('=').map_or(argument, |(path, _)| path).trim()
+}
+
+/// The experiment with the default of every field that its algorithm does not read.
+fn with_unread_at_defaults(experiment: &Experiment) -> Result<Experiment, Error> {
+    let mut document = Value::Table(experiment.to_table()?);
+    let defaults = Value::Table(Experiment::default().to_table()?);
+    for name in experiment.unread() {
+        let default = name.split('.').try_fold(&defaults, |place, part| place.get(part));
+        if let (Some(place), Some(default)) = (place(&mut document, name), default) {
+            *place = default.clone();
+        }
+    }
+    document.try_into().map_err(|error| malformed("experiment", &on_one_line(&error)))
 }
 
 /// Applies one `--set`. Its name and type are checked here, so that an error can name the argument.

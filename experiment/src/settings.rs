@@ -1,59 +1,8 @@
-//! The sections of learning, experience, actors, the learner and the budget.
+//! The sections of the optimiser, experience, actors, the learner and the budget.
 
 use serde::{Deserialize, Serialize};
 
 use crate::device::{DeviceName, MatmulPrecision};
-
-/// V-MPO.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Vmpo {
-    /// γ (S).
-    pub discount: f64,
-    /// ε_η: limit of the E-step (S).
-    pub epsilon_eta: f64,
-    /// ε_μ: limit on the mean (S).
-    pub epsilon_mean: f64,
-    /// ε_Σ: limit on the covariance (S: MLP and LSTM; 1e-3 for mixture and product).
-    pub epsilon_std: f64,
-    /// ε_discrete: limit on a mixture's weights (S).
-    pub epsilon_discrete: f64,
-    /// η at the start (S).
-    pub initial_temperature: f64,
-    /// α_μ at the start (S).
-    pub initial_alpha_mean: f64,
-    /// α_Σ at the start (S).
-    pub initial_alpha_std: f64,
-    /// α_discrete at the start (S).
-    pub initial_alpha_discrete: f64,
-    /// Share of the valid steps that the E-step imitates: those with the best advantages (S: the top half).
-    pub top_fraction: f64,
-    /// In joint training each task has its own temperature and its own best steps, because advantages of different tasks
-    /// have different scales (D). Without this, one E-step ranks the steps of all tasks.
-    pub temperature_per_task: bool,
-    /// Gradient steps between two updates of the target network. Actors act with the target network (V).
-    pub target_period: u64,
-    /// Gradient steps on each batch (V: 1).
-    pub gradient_steps: usize,
-    /// Unrolls in a gradient step. The number must divide the batch (V: the whole batch).
-    pub minibatch_unrolls: usize,
-    /// λ of the return: 1 is the paper's n-step return; less is GAE's mixture of returns (D).
-    pub lambda: f64,
-    /// Entropy bonus (V: none).
-    pub entropy: f64,
-    /// κ: weight of a term of the policy loss whose expected gradient is 0 in the first gradient step on a batch (D). It
-    /// cancels the part of the gradient that only imitates exploration noise, so an estimate from the same steps has less
-    /// variance. 0 is off (V). A mixture has none.
-    pub control_variate: f64,
-    /// Weight w of the simulator's derivative of the reward with respect to the actions (D): the policy loss has the term
-    /// −w/η · mean over valid steps of derivative · mean action. The actors compute the derivative, as `tracking.gradient`
-    /// and `get_up.gradient` say; other tasks have none. 0 is off.
-    pub action_gradient: f64,
-    /// Weight of the value loss (D).
-    pub value_weight: f64,
-    /// Rows at the start of an unroll that only build up the recurrent state of the value function. No loss uses them (D).
-    pub value_burn_in: usize,
-}
 
 /// The longest unroll.
 pub const LONGEST_UNROLL: usize = 4096;
@@ -62,38 +11,11 @@ pub const LONGEST_UNROLL: usize = 4096;
 /// larger one comes from a simulation that is about to diverge, and would outweigh its whole minibatch.
 pub const LARGEST_ACTION_GRADIENT: f32 = 1e3;
 
-impl Default for Vmpo {
-    fn default() -> Self {
-        Self {
-            discount: 0.95,
-            epsilon_eta: 0.1,
-            epsilon_mean: 0.1,
-            epsilon_std: 1e-5,
-            epsilon_discrete: 1e-3,
-            initial_temperature: 1.0,
-            initial_alpha_mean: 1.0,
-            initial_alpha_std: 1.0,
-            initial_alpha_discrete: 1.0,
-            top_fraction: 0.5,
-            temperature_per_task: true,
-            target_period: 100,
-            gradient_steps: 1,
-            minibatch_unrolls: 128,
-            lambda: 1.0,
-            entropy: 0.0,
-            control_variate: 0.0,
-            action_gradient: 0.0,
-            value_weight: 1.0,
-            value_burn_in: 0,
-        }
-    }
-}
-
 /// Adam.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Optimiser {
-    /// Learning rate of every network (S).
+    /// Learning rate of every network, whichever algorithm trains it (S; A for SVG(0): the same).
     pub learning_rate: f64,
     /// Learning rate of the multipliers (S: the same).
     pub multiplier_learning_rate: f64,

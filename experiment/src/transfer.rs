@@ -22,18 +22,6 @@ pub struct Transfer {
     pub mean_scale: f64,
     /// What an action of the policy means.
     pub prior: TransferPrior,
-    /// What the policy learns with (S: SVG(0)).
-    pub algorithm: TransferAlgorithm,
-}
-
-/// What a transfer's policy learns with. Also an experiment without a low level may use SVG(0), for comparison.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum TransferAlgorithm {
-    /// V-MPO, on-policy.
-    Vmpo,
-    /// SVG(0) with Retrace, off-policy.
-    Svg0,
 }
 
 /// What an action u of a transfer's policy means.
@@ -55,7 +43,6 @@ impl Default for Transfer {
             latent_limit: 3.0,
             mean_scale: 3.0,
             prior: TransferPrior::Standard,
-            algorithm: TransferAlgorithm::Vmpo,
         }
     }
 }

@@ -10,12 +10,17 @@
 //! - [`mod@masked_mean`]: the mean over rows with a transition. `stores` names the parameters of networks.
 //! - [`error`]: what an algorithm refuses.
 //!
-//! # A second algorithm
-//! It is a module beside `vmpo` with a learner that implements [`Algorithm`]. The loop does not change. The
-//! one place that chooses is `State::new` in `train/state.rs`, which makes the `Box<dyn Algorithm>`. Losses are reported by
-//! name, so they reach the metrics without another list.
+//! - [`experience`]: where the unrolls of gradient steps come from: the newest batch, or a replay.
+//! - `descent`: gradients, their norms, and a step of Adam that is taken as a whole or not at all.
+//!
+//! # A third algorithm
+//! It is an entry of the list `for_each_algorithm!` and a file in each of three crates: its parameters in
+//! `experiment/src/algorithms/`, its policy in `networks/src/`, and its learner in a folder of this crate, whose `Builder`
+//! makes it. Losses are reported by name, so they reach the metrics without another list.
 
+pub(crate) mod descent;
 pub mod error;
+pub mod experience;
 pub mod loss_report;
 pub mod masked_mean;
 pub mod minibatch;
@@ -23,11 +28,15 @@ pub mod shape;
 pub(crate) mod stores;
 
 use std::fmt::Debug;
+use std::sync::Arc;
 
+use comic_experiment::{Experiment, TaskSpec};
 use comic_networks::NormaliserStatistics;
-use tch::Tensor;
+use comic_proto::UnrollLayout;
+use tch::{Device, Tensor};
 
 use crate::algorithm::error::Error;
+use crate::algorithm::experience::Experience;
 use crate::algorithm::loss_report::Losses;
 use crate::algorithm::minibatch::MinibatchTensors;
 
@@ -48,8 +57,8 @@ pub trait Algorithm: Debug {
     /// As of [`step`](Self::step).
     fn regress(&mut self, minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error>;
 
-    /// Batches from one published version of the parameters to the next.
-    fn publish_period(&self) -> u64;
+    /// Whether a new version of the parameters is due after update number `updates`, which took `steps` gradient steps.
+    fn publishes_after(&self, updates: u64, steps: u64) -> bool;
 
     /// Sets the statistics by which observations are normalised.
     ///
@@ -76,6 +85,12 @@ pub trait Algorithm: Debug {
     /// [`Error::Networks`] when they cannot be read from the device.
     fn policy_parameters(&self) -> Result<Vec<u8>, Error>;
 
+    /// Every trained parameter's name and number of elements.
+    fn parameter_counts(&self) -> Vec<(String, usize)>;
+
+    /// What usually helps when losses and gradients are not finite again and again.
+    fn remedies(&self) -> &'static str;
+
     /// Everything that changes future steps, by name. The tensors are copies on the CPU, so another thread can write them
     /// while the next step runs.
     fn state(&self) -> Vec<(String, Tensor)>;
@@ -85,4 +100,47 @@ pub trait Algorithm: Debug {
     /// # Errors
     /// [`Error::State`] when names, shapes or element types differ; nothing changes then.
     fn load_state(&mut self, state: &[(String, Tensor)]) -> Result<(), Error>;
+}
+
+/// What a learner is made from.
+#[derive(Clone, Copy, Debug)]
+pub struct Parts<'a> {
+    /// The resolved experiment.
+    pub experiment: &'a Experiment,
+    /// The task's sizes and names.
+    pub spec: &'a TaskSpec,
+    /// The action at which the policy's mean starts, `[A]`.
+    pub pose: &'a [f32],
+    /// Where it computes.
+    pub device: Device,
+}
+
+/// What an algorithm brings: its networks with their optimiser, and where its experience comes from.
+pub(crate) trait Builder {
+    /// New networks and their optimiser.
+    ///
+    /// # Errors
+    /// [`Error::Networks`] when the networks cannot be made.
+    fn learner(&self, parts: Parts<'_>) -> Result<Box<dyn Algorithm>, Error>;
+
+    /// What its gradient steps learn from. Unrolls have this layout.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::Configuration`] when memory cannot hold it.
+    fn experience(&self, parts: Parts<'_>, layout: &Arc<UnrollLayout>) -> crate::error::Result<Box<dyn Experience>>;
+}
+
+/// The learner that `make` makes, on `device`. First values come from libtorch's generator on the CPU, so after
+/// `tch::manual_seed` they are the same on every device.
+///
+/// # Errors
+/// Those of `make`.
+pub(crate) fn made_on<L: Algorithm>(device: Device, make: impl Fn(Device) -> Result<L, Error>) -> Result<L, Error> {
+    let host = make(Device::Cpu)?;
+    if device == Device::Cpu {
+        return Ok(host);
+    }
+    let mut learner = make(device)?;
+    learner.load_state(&host.state())?;
+    Ok(learner)
 }

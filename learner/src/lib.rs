@@ -5,12 +5,11 @@
 //! - [`service`] is gRPC on tokio. [`publish`] encodes parameters for the actors. [`security`] is who may use the service.
 //! - [`train`] is the OS thread that owns the device: batches in, gradient steps, parameters out. [`device`] is where it
 //!   computes: CPU, CUDA or XLA.
-//! - [`algorithm`] is what the trainer needs of a learning algorithm. [`vmpo`] is V-MPO, and [`svg0`] SVG(0): losses and gradient
-//!   step.
-//!   [`adam`] is its optimiser, and [`tensors`] reads and writes its state.
+//! - [`algorithm`] is what the trainer needs of a learning algorithm. [`vmpo`] is V-MPO, and [`svg0`] SVG(0): experience, losses
+//!   and gradient step. [`algorithms`] makes the one that the experiment names. [`adam`] is their optimiser, and [`tensors`] reads and writes its state.
 //! - [`checkpoint`] is the run's checkpoint directory. No other module touches it.
 //! - [`observe`] is what people and Prometheus see of a run: metrics, telemetry and probes.
-//! - [`threads`] says how libtorch's threads share the machine.
+//! - `memory_limit` is how much memory the process may use. [`threads`] says how libtorch's threads share the machine.
 //! - [`commands`] are the commands besides serving and training. [`options`] is the whole command line, and [`document`] its
 //!   arguments for the experiment.
 //! - [`error`] is the one error type; `exit_code` decides the exit code by it. `log_limiter` keeps faulty peers from flooding the log.
@@ -19,6 +18,7 @@
 
 pub mod adam;
 pub mod algorithm;
+pub mod algorithms;
 pub mod checkpoint;
 pub mod commands;
 pub mod device;
@@ -26,6 +26,7 @@ pub mod document;
 pub mod error;
 mod exit_code;
 mod log_limiter;
+mod memory_limit;
 pub mod observe;
 pub mod options;
 pub mod publish;

@@ -3,12 +3,37 @@
 //!
 //! # Layout
 //! - [`mod@retrace`]: the targets of the action value.
+//! - `experience`: the replay.
 //! - [`Svg0Learner`]: online and target networks and Adam; one gradient step at a time.
 //!
 //! Everything is float32 and of static shape: masks instead of selections.
 
+mod experience;
 mod learner;
 mod retrace;
 
+use std::sync::Arc;
+
+use comic_proto::UnrollLayout;
+
+use crate::algorithm::error::Error;
+use crate::algorithm::experience::Experience;
+use crate::algorithm::{self, Algorithm, Parts};
+use crate::svg0::experience::Replay;
+
 pub use learner::Svg0Learner;
 pub use retrace::{Trace, retrace};
+
+/// Makes what SVG(0) needs.
+#[derive(Debug)]
+pub(crate) struct Builder;
+
+impl algorithm::Builder for Builder {
+    fn learner(&self, parts: Parts<'_>) -> Result<Box<dyn Algorithm>, Error> {
+        Ok(Box::new(Svg0Learner::new(parts.spec, parts.experiment, parts.device)?))
+    }
+
+    fn experience(&self, parts: Parts<'_>, layout: &Arc<UnrollLayout>) -> crate::error::Result<Box<dyn Experience>> {
+        Ok(Box::new(Replay::new(parts.experiment, layout, parts.spec.tasks.len(), parts.device)?))
+    }
+}

@@ -4,8 +4,6 @@
 //! - [`trainer`] is the loop; the other modules own its parts and know nothing of it.
 //! - [`setup`] is what it begins with, and how it ends.
 //! - `state` is what changes and is saved: the algorithm, [`statistics`] of the observations, and the progress.
-//! - `experience` decides what gradient steps learn from: the newest batch, or a replay. `minibatches` puts a batch on the device
-//!   and draws the unrolls of each gradient step.
 //! - `warm_start` gathers demonstrations and regresses on them.
 //! - `versions` publishes parameters; `reports` counts and writes metrics; `budget` is the clock.
 //! - `skipped_steps` counts gradient steps that were skipped, and decides how to recover.
@@ -13,8 +11,6 @@
 
 mod budget;
 mod checkpoints;
-mod experience;
-mod minibatches;
 mod reports;
 pub mod setup;
 mod skipped_steps;

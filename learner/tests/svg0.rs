@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use comic_experiment::{Experiment, TaskPart, TaskSpec, TransferAlgorithm};
+use comic_experiment::{AlgorithmName, Experiment, TaskPart, TaskSpec};
 use comic_learner::algorithm::Algorithm as _;
 use comic_learner::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
 use comic_learner::algorithm::shape::MinibatchShape;
@@ -35,14 +35,13 @@ fn spec() -> TaskSpec {
 
 fn experiment() -> Experiment {
     let mut experiment = Experiment::default();
-    experiment.transfer.algorithm = TransferAlgorithm::Svg0;
+    experiment.algorithm = AlgorithmName::Svg0;
     experiment.unroll.length = LENGTH;
     let svg0 = &mut experiment.svg0;
     (svg0.encoder, svg0.action_value) = (vec![8], vec![16]);
     (svg0.core, svg0.policy, svg0.burn_in, svg0.action_samples) = (6, 5, 2, 4);
     // Nearly the gradient times a number, so that equal parameters after a step mean equal gradients.
-    experiment.optimiser.epsilon = 10.0;
-    svg0.learning_rate = 1.0;
+    (experiment.optimiser.epsilon, experiment.optimiser.learning_rate) = (10.0, 1.0);
     experiment
 }
 
@@ -217,11 +216,11 @@ fn the_action_value_of_a_chain_with_two_states_is_learned() {
     let _guard = GENERATOR.lock().unwrap();
     let mut experiment = experiment();
     experiment.unroll.length = 8;
-    experiment.optimiser.epsilon = 1e-8;
+    (experiment.optimiser.epsilon, experiment.optimiser.learning_rate) = (1e-8, 3e-3);
     experiment.network.min_std = 0.3;
     experiment.network.initial_std = 0.7;
     let svg0 = &mut experiment.svg0;
-    (svg0.learning_rate, svg0.target_period, svg0.discount) = (3e-3, 25, 0.8);
+    (svg0.target_period, svg0.discount) = (25, 0.8);
     (svg0.entropy, svg0.kl, svg0.burn_in) = (0.0, 0.0, 0);
     // Wide enough for the step between staying and going: an error there is bootstrapped, which multiplies it by 1 / (1 − γ).
     svg0.action_value = vec![64, 64];

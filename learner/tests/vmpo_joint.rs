@@ -8,7 +8,7 @@ use comic_experiment::Experiment;
 use comic_learner::algorithm::Algorithm as _;
 use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::vmpo::VmpoLearner;
-use comic_networks::{NormaliserStatistics, RecurrentState, Routing};
+use comic_networks::{NormaliserStatistics, Policy as _, RecurrentState, Routing};
 use tch::{Device, Tensor};
 use vmpo_support::{LENGTH, Numbers, Unrolls, difference, every_low_level, joint_spec, learner_of, state};
 

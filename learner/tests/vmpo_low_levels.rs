@@ -9,7 +9,7 @@ use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives};
 use comic_learner::algorithm::Algorithm as _;
 use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::vmpo::VmpoLearner;
-use comic_networks::{RecurrentState, Routing};
+use comic_networks::{Policy as _, RecurrentState, Routing};
 use tch::{Device, Kind, Tensor};
 use vmpo_support::{LENGTH, Numbers, Unrolls, assert_close, difference, experiment, learner};
 

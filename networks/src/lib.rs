@@ -1,8 +1,8 @@
 //! The networks. Acting and learning use the same functions: acting inside `tch::no_grad`, learning with gradient.
 //!
 //! # Layout
-//! - [`Policy`] is everything that acting needs: normaliser, image encoder, reference encoder, low level. The learner
-//!   publishes its parameters.
+//! - [`Policy`] is what acting needs of every policy; the learner publishes its parameters. [`new_policy`] makes that of an
+//!   experiment's algorithm. [`VmpoPolicy`] has a reference encoder and a low level; [`Svg0Policy`] is recurrent.
 //! - In joint training each task has its own encoder and value function ([`Routing`]), and all tasks share the low
 //!   level.
 //! - `low_level` has one file per low level: MLP, LSTM, mixture and product of primitives.
@@ -25,6 +25,7 @@
 //! numbers are libtorch's: call `tch::manual_seed` first to make them reproducible.
 
 mod action;
+mod algorithms;
 mod encoder;
 mod error;
 pub mod export;
@@ -42,8 +43,11 @@ mod prior;
 mod routing;
 mod svg0;
 mod value;
+mod vmpo;
+mod weights;
 
 pub use action::ActionDistribution;
+pub use algorithms::new_policy;
 pub use error::Error;
 pub use frozen::FrozenLowLevel;
 pub use gaussian::DiagonalGaussian;
@@ -54,5 +58,6 @@ pub use parameters::{from_safetensors, to_safetensors};
 pub use policy::{Acting, Policy};
 pub use prior::StatePrior;
 pub use routing::Routing;
-pub use svg0::{ActionValue, Core, LatentPolicy};
+pub use svg0::{ActionValue, Core, LatentPolicy, Svg0Policy};
 pub use value::Value;
+pub use vmpo::VmpoPolicy;

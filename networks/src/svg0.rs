@@ -1,13 +1,124 @@
 //! The networks of SVG(0) (CoMic supplement 2.5): a recurrent core that action value and policy share, an action value, and a
 //! recurrent policy. Sizes and what no paper says are fields of [`Svg0`].
 
-use comic_experiment::{Network, Svg0, TaskSpec, Transfer};
+use comic_experiment::{Experiment, Network, Svg0, TaskSpec, Transfer};
 use tch::{Tensor, nn};
 
+use crate::action::ActionDistribution;
+use crate::error::Error;
 use crate::gaussian::DiagonalGaussian;
+use crate::image_encoder::ImageEncoder;
 use crate::layers::{GaussianHead, GaussianHeadConfig, Torso, linear, rows};
 use crate::lstm::{LstmStack, RecurrentState};
-use crate::normaliser::NormalisedObservation;
+use crate::normaliser::{NormalisedObservation, Normaliser, NormaliserStatistics};
+use crate::policy::{self, Acting, Policy, Weights};
+use crate::routing::Routing;
+use crate::weights::{hidden, image_features};
+
+/// What acts: the core, which the critic trains, and the policy on its features. The action is not bounded by a low level of its
+/// own: it is the latent of a frozen one, or the command.
+#[derive(Debug)]
+pub struct Svg0Policy {
+    normaliser: Normaliser,
+    image_encoder: Option<ImageEncoder>,
+    core: Core,
+    policy: LatentPolicy,
+}
+
+impl Svg0Policy {
+    /// Creates its parameters in `store`.
+    pub fn new(store: &nn::Path, spec: &TaskSpec, experiment: &Experiment) -> Self {
+        let Experiment { network, svg0, transfer, .. } = experiment;
+        let features = network.image_features as i64;
+        let image_encoder = (spec.image > 0).then(|| ImageEncoder::new(&(store / "image_encoder"), features));
+        Self {
+            normaliser: Normaliser::new(&(store / "normaliser"), spec, network.normaliser_steps > 0),
+            core: Core::new(&(store / "core"), spec, image_encoder.as_ref().map_or(0, ImageEncoder::output), svg0),
+            image_encoder,
+            policy: LatentPolicy::new(&(store / "latent_policy"), spec, network, svg0, transfer),
+        }
+    }
+
+    /// The core, whose features action value and policy read.
+    pub fn core(&self) -> &Core {
+        &self.core
+    }
+
+    /// The policy on the core's features.
+    pub fn latent_policy(&self) -> &LatentPolicy {
+        &self.policy
+    }
+}
+
+impl Policy for Svg0Policy {
+    fn normalise(
+        &self,
+        proprioception: &Tensor,
+        task: &Tensor,
+        image: Option<&Tensor>,
+        routing: &Routing,
+    ) -> NormalisedObservation {
+        let mut observation = self.normaliser.forward(proprioception, task, routing);
+        if let (Some(encoder), Some(image)) = (&self.image_encoder, image) {
+            observation.task = Tensor::cat(&[&observation.task, &encoder.forward(image)], -1);
+        }
+        observation
+    }
+
+    /// The state is the core's, followed by the policy's.
+    fn act(
+        &self,
+        observation: &NormalisedObservation,
+        _: &Tensor,
+        latent_noise: &Tensor,
+        recurrent: RecurrentState<'_>,
+    ) -> Acting {
+        let own = self.core.state_size();
+        let states = [recurrent.state.narrow(1, 0, own), recurrent.state.narrow(1, own, self.policy.state_size())];
+        let of = |state| RecurrentState { state, first: recurrent.first };
+        let (features, core_state) = self.core.forward(&observation.with_steps(), of(&states[0]));
+        let (action, policy_state) = self.policy.forward(&features, of(&states[1]));
+        Acting {
+            latent: rows(latent_noise),
+            action: ActionDistribution::Gaussian(action),
+            latent_posterior: None,
+            state: Tensor::cat(&[core_state, policy_state], 1),
+        }
+    }
+
+    fn set_normaliser(&self, statistics: &NormaliserStatistics) -> Result<(), Error> {
+        self.normaliser.set(statistics)
+    }
+}
+
+/// Makes policies of SVG(0).
+#[derive(Debug)]
+pub(crate) struct Builder;
+
+impl policy::Builder for Builder {
+    fn policy(
+        &self,
+        store: &nn::Path,
+        spec: &TaskSpec,
+        experiment: &Experiment,
+        _: &[f32],
+    ) -> Result<Box<dyn Policy>, Error> {
+        Ok(Box::new(Svg0Policy::new(store, spec, experiment)))
+    }
+
+    fn weights(&self, spec: &TaskSpec, experiment: &Experiment) -> Weights {
+        let Svg0 { encoder, core, policy, .. } = &experiment.svg0;
+        let (mut weights, mut width) = (0, image_features(spec, &experiment.network) as u64);
+        for input in [spec.proprioception, spec.task].into_iter().filter(|input| *input > 0) {
+            let (own, output) = hidden(input as u64, encoder);
+            (weights, width) = (weights + own, width + output);
+        }
+        let lstm = |input: u64, units: u64| 4 * units * (input + units);
+        let [core, policy] = [core, policy].map(|units| *units as u64);
+        let head = policy * 2 * spec.action as u64;
+        Weights { low_level: 0, rest: weights + lstm(width, core) + lstm(core, policy) + head }
+    }
+}
 
 /// The core: an encoder each for proprioception, task observation and image features, concatenated, and an LSTM.
 #[derive(Debug)]

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use comic_experiment::{Experiment, LowLevelName, TaskSpec, resolve};
 use comic_networks::export::{Exported, KEY, Part, Source};
-use comic_networks::{Error, Policy, RecurrentState, Routing, from_safetensors, to_safetensors};
+use comic_networks::{Error, Policy, RecurrentState, Routing, VmpoPolicy, from_safetensors, to_safetensors};
 use proptest::prelude::*;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
@@ -35,11 +35,11 @@ fn small(preset: &str, more: &[&str]) -> Experiment {
 }
 
 /// A policy of the experiment with random parameters, statistics included.
-fn policy(experiment: &Experiment) -> (nn::VarStore, Policy, TaskSpec) {
+fn policy(experiment: &Experiment) -> (nn::VarStore, VmpoPolicy, TaskSpec) {
     tch::manual_seed(1);
     let spec = TaskSpec::new(experiment, Vec::new()).unwrap();
     let store = nn::VarStore::new(Device::Cpu);
-    let policy = Policy::new(&store.root(), &spec, &experiment.network, &vec![0.1; spec.action]).unwrap();
+    let policy = VmpoPolicy::new(&store.root(), &spec, &experiment.network, &vec![0.1; spec.action]).unwrap();
     // Sorted by name, so the same experiment gives the same policy.
     for (name, tensor) in store.variables().into_iter().collect::<BTreeMap<_, _>>() {
         let mut noise = tensor.detach().rand_like() * 0.5 - 0.25;
@@ -121,12 +121,12 @@ fn a_policy_of_one_task_acts_like_the_joint_policy_in_that_task() {
     let (_, both, spec) = policy(&joint);
     let own = TaskSpec::new(&file.experiment, Vec::new()).unwrap();
     let mut store = nn::VarStore::new(Device::Cpu);
-    let alone = Policy::new(&store.root(), &own, &file.experiment.network, &vec![0.0; own.action]).unwrap();
+    let alone = VmpoPolicy::new(&store.root(), &own, &file.experiment.network, &vec![0.0; own.action]).unwrap();
     from_safetensors(&mut store, &file.bytes).unwrap();
 
     let (proprioception, latent, state) = (random(spec.proprioception), random(4), random(0));
     let task = random(spec.task);
-    let act = |policy: &Policy, task: &Tensor, routing: Routing| {
+    let act = |policy: &VmpoPolicy, task: &Tensor, routing: Routing| {
         let observation = policy.normalise(&proprioception, task, None, &routing);
         let recurrent = RecurrentState { state: &state, first: None };
         policy.act(&observation, &latent, &latent.zeros_like(), recurrent).action.mode()

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "helpers of tests may panic")]
 
 use comic_experiment::{LowLevelName, Lstm, Network, Primitives, TaskPart, TaskSpec, resolve};
-use comic_networks::{ActionDistribution, DiagonalGaussian, Policy, RecurrentState, Routing};
+use comic_networks::{ActionDistribution, DiagonalGaussian, Policy, RecurrentState, Routing, VmpoPolicy};
 use tch::{Device, Kind, Tensor, nn};
 
 /// libtorch has one generator per process, so tests that seed it must not run at the same time.
@@ -18,9 +18,9 @@ fn spec() -> TaskSpec {
     TaskSpec { proprioception: 7, task: 11, action: 3, tasks: vec![task], ..TaskSpec::default() }
 }
 
-fn policy(network: &Network) -> (nn::VarStore, Policy) {
+fn policy(network: &Network) -> (nn::VarStore, VmpoPolicy) {
     let store = nn::VarStore::new(Device::Cpu);
-    let policy = Policy::new(&store.root(), &spec(), network, &[0.1, -0.2, 0.3]).unwrap();
+    let policy = VmpoPolicy::new(&store.root(), &spec(), network, &[0.1, -0.2, 0.3]).unwrap();
     (store, policy)
 }
 
@@ -176,7 +176,7 @@ fn the_papers_low_levels_have_similar_sizes() {
     let size = |preset: &str| {
         let network = resolve(preset, &[]).unwrap().network;
         let store = nn::VarStore::new(Device::Cpu);
-        Policy::new(&store.root(), &spec, &network, &[0.0; 56]).unwrap();
+        VmpoPolicy::new(&store.root(), &spec, &network, &[0.0; 56]).unwrap();
         let parameters = store.variables().into_iter().filter(|(name, _)| name.starts_with("low_level."));
         parameters.map(|(_, parameter)| parameter.numel()).sum::<usize>()
     };

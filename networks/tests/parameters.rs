@@ -5,7 +5,7 @@
 use std::collections::HashMap;
 
 use comic_experiment::{Mlp, Network, TaskPart, TaskSpec};
-use comic_networks::{Error, Policy, from_safetensors, to_safetensors};
+use comic_networks::{Error, VmpoPolicy, from_safetensors, to_safetensors};
 use proptest::prelude::*;
 use safetensors::tensor::{Dtype, TensorView};
 use tch::{Device, nn};
@@ -30,7 +30,7 @@ fn store() -> nn::VarStore {
         Network { encoder: vec![8], mlp: Mlp { hidden: vec![8] }, normaliser_steps: 1, ..Network::default() };
     network.latent.size = 2;
     let store = nn::VarStore::new(Device::Cpu);
-    Policy::new(&store.root(), &spec, &network, &[0.0; 2]).unwrap();
+    VmpoPolicy::new(&store.root(), &spec, &network, &[0.0; 2]).unwrap();
     store
 }
 

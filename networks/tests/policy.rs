@@ -5,7 +5,7 @@
 use comic_experiment::{Mlp, Network, TaskPart, TaskSpec};
 use comic_networks::{
     DiagonalGaussian, Error, NORMALISED_LIMIT, NormalisedObservation, NormaliserStatistics, Policy, RecurrentState,
-    Routing, Value,
+    Routing, Value, VmpoPolicy,
 };
 use tch::{Device, Kind, Tensor, nn};
 
@@ -36,11 +36,11 @@ fn network() -> Network {
     network
 }
 
-fn policy(network: &Network, seed: i64, pose: &[f32]) -> (nn::VarStore, Policy) {
+fn policy(network: &Network, seed: i64, pose: &[f32]) -> (nn::VarStore, VmpoPolicy) {
     let store = nn::VarStore::new(Device::Cpu);
     let _guard = GENERATOR.lock().unwrap();
     tch::manual_seed(seed);
-    let policy = Policy::new(&store.root(), &spec(), network, pose).unwrap();
+    let policy = VmpoPolicy::new(&store.root(), &spec(), network, pose).unwrap();
     (store, policy)
 }
 
@@ -55,7 +55,7 @@ fn inputs() -> [Tensor; 4] {
 }
 
 /// Acts without a recurrent state, on `[B, ·]` or `[B, T, ·]`.
-fn pass(policy: &Policy, observation: &NormalisedObservation, previous: &Tensor, noise: &Tensor) -> Pass {
+fn pass(policy: &VmpoPolicy, observation: &NormalisedObservation, previous: &Tensor, noise: &Tensor) -> Pass {
     let state = Tensor::zeros([previous.size()[0], 0], (Kind::Float, Device::Cpu));
     let acting = policy.act(observation, previous, noise, RecurrentState { state: &state, first: None });
     let (mean, std, log_weights) = acting.action.to_rows();
@@ -70,7 +70,7 @@ struct Pass {
     action: DiagonalGaussian,
 }
 
-fn act(policy: &Policy) -> Pass {
+fn act(policy: &VmpoPolicy) -> Pass {
     let [proprioception, task, previous, noise] = inputs();
     pass(policy, &policy.normalise(&proprioception, &task, None, &Routing::single()), &previous, &noise)
 }
@@ -163,7 +163,7 @@ fn the_seed_determines_every_initial_parameter() {
 #[test]
 fn a_pose_with_the_wrong_length_is_refused() {
     let store = nn::VarStore::new(Device::Cpu);
-    let error = Policy::new(&store.root(), &spec(), &network(), &[0.0; 4]).unwrap_err();
+    let error = VmpoPolicy::new(&store.root(), &spec(), &network(), &[0.0; 4]).unwrap_err();
     assert!(matches!(error, Error::Length { expected: 3, found: 4, .. }));
 }
 
@@ -242,7 +242,7 @@ fn the_image_changes_the_latent_and_its_encoder_gets_gradients() {
     let policy = {
         let _guard = GENERATOR.lock().unwrap();
         tch::manual_seed(3);
-        Policy::new(&store.root(), &spec, &network, &[0.0; 3]).unwrap()
+        VmpoPolicy::new(&store.root(), &spec, &network, &[0.0; 3]).unwrap()
     };
     let rows = 2;
     let zeros = |width: i64| Tensor::zeros([rows, width], (Kind::Float, Device::Cpu));
@@ -271,7 +271,7 @@ fn an_image_gives_the_same_numbers_in_unrolls_and_in_rows() {
     let policy = {
         let _guard = GENERATOR.lock().unwrap();
         tch::manual_seed(4);
-        Policy::new(&store.root(), &spec, &network(), &[0.0; 3]).unwrap()
+        VmpoPolicy::new(&store.root(), &spec, &network(), &[0.0; 3]).unwrap()
     };
     let image = Tensor::arange(64 * 64 * 3, (Kind::Int64, Device::Cpu)).remainder(251).to_kind(Kind::Uint8);
     let acted = |leading: &[i64]| {

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, HashMap};
 
 use comic_experiment::{Experiment, LowLevelName, TaskSpec, resolve};
 use comic_networks::export::{Exported, KEY, Source};
-use comic_networks::{Error, Policy, RecurrentState, Routing, to_safetensors};
+use comic_networks::{Error, Policy, RecurrentState, Routing, new_policy, to_safetensors};
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest as _, Sha256};
@@ -35,11 +35,11 @@ fn small(preset: &str, more: &[&str]) -> Experiment {
 }
 
 /// A policy of the experiment with random parameters, statistics included.
-fn policy(experiment: &Experiment) -> (nn::VarStore, Policy, TaskSpec) {
+fn policy(experiment: &Experiment) -> (nn::VarStore, Box<dyn Policy>, TaskSpec) {
     tch::manual_seed(1);
     let spec = TaskSpec::new(experiment, Vec::new()).unwrap();
     let store = nn::VarStore::new(Device::Cpu);
-    let policy = Policy::of(&store.root(), &spec, experiment, &vec![0.0; spec.action]).unwrap();
+    let policy = new_policy(&store.root(), &spec, experiment, &vec![0.0; spec.action]).unwrap();
     for (name, tensor) in store.variables().into_iter().collect::<BTreeMap<_, _>>() {
         let mut noise = tensor.detach().rand_like() * 0.5 - 0.25;
         if name.ends_with("_std") {

@@ -44,7 +44,7 @@ impl UnrollShape {
             image: spec.image.next_multiple_of(ELEMENT),
             components: experiment.components(),
             state: experiment.state_size(),
-            action_gradient: if experiment.vmpo.action_gradient > 0.0 { spec.action } else { 0 },
+            action_gradient: if experiment.reads_action_gradient() { spec.action } else { 0 },
         }
     }
 }

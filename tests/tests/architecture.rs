@@ -125,12 +125,36 @@ fn neither_actor_nor_learner_names_a_low_level() -> Result<()> {
     Ok(())
 }
 
-/// The loop works with every algorithm. One file makes the one that the experiment names.
+/// An algorithm is an entry of a list, and its own files.
 #[test]
-fn one_file_of_the_training_loop_names_the_algorithm() -> Result<()> {
-    let found = places(&within(&["learner/src/train/"])?, |line| line.contains("crate::vmpo"));
-    let files: BTreeSet<_> = found.iter().filter_map(|place| place.split(':').next()).collect();
-    ensure!(files.len() <= 1, "{files:?}");
+fn one_file_of_each_crate_names_the_algorithms() -> Result<()> {
+    for name in ["experiment", "networks", "learner", "actor", "proto", "replay", "tasks"] {
+        let sources = within(&[&format!("{name}/src/")])?;
+        let found = places(&sources, |line| line.contains("AlgorithmName::"));
+        let files: BTreeSet<_> = found.iter().filter_map(|place| place.split(':').next()).collect();
+        ensure!(files.len() <= 1, "{files:?}");
+    }
+    Ok(())
+}
+
+/// Everything else works with every algorithm.
+#[test]
+fn only_its_own_files_read_the_parameters_of_an_algorithm() -> Result<()> {
+    let mut sources = sources()?;
+    sources.retain(|source| source.path.contains("/src/") && source.path != "experiment/src/document.rs");
+    for algorithm in ["vmpo", "svg0"] {
+        let words = |line: &str| line.split(|c: char| !c.is_alphanumeric() && c != '_').any(|word| word == algorithm);
+        let reads = |line: &str| {
+            let destructures = line.contains("Experiment {") && words(line);
+            destructures
+                || line.contains(&format!("experiment.{algorithm}"))
+                || line.contains(&format!("self.{algorithm}."))
+        };
+        let found = places(&sources, |line| reads(line));
+        ensure!(!found.is_empty(), "no file reads the parameters of {algorithm}");
+        let others: Vec<_> = found.iter().filter(|place| !place.contains(&format!("/{algorithm}"))).collect();
+        ensure!(others.is_empty(), "{others:?}");
+    }
     Ok(())
 }
 

@@ -207,19 +207,46 @@ async fn a_prior_is_fitted_to_latents_and_a_policy_deviates_from_it() -> Result<
     Ok(())
 }
 
-/// Fields of SVG(0) with small networks, which learns from the second batch on.
-const SVG0: [&str; 10] = [
-    "transfer.algorithm=svg0",
-    "network.final_std=0",
+/// Go-to-target with SVG(0) and small networks, which learns from the second batch on; in lockstep.
+const SVG0: [&str; 33] = [
+    "--lockstep",
+    "--preset",
+    "go-to-target",
+    "--clips",
+    "builtin:CMU_007_01",
+    "--set",
+    "algorithm=svg0",
+    "--set",
     "svg0.encoder=[16]",
+    "--set",
     "svg0.core=12",
+    "--set",
     "svg0.policy=10",
+    "--set",
     "svg0.action_value=[16]",
+    "--set",
     "svg0.burn_in=2",
+    "--set",
     "svg0.minibatch_sequences=8",
-    "svg0.begin_at=128",
-    "svg0.samples_per_insert=4",
+    "--set",
+    "replay.min_size=128",
+    "--set",
+    "replay.samples_per_insert=4",
+    "--set",
+    "network.normaliser_steps=256",
+    "--set",
+    "unroll.length=8",
+    "--set",
+    "unroll.batch=8",
+    "--set",
+    "actor.environments=2",
+    "--set",
+    "budget.minutes=0",
 ];
+
+fn svg0(fields: &[&str]) -> Result<System> {
+    System::new(&SVG0.into_iter().chain(fields.iter().flat_map(|field| ["--set", *field])).collect::<Vec<_>>())
+}
 
 /// The learner's part of the newest checkpoint.
 fn learned(system: &System, updates: u64) -> Result<Vec<u8>> {
@@ -233,10 +260,11 @@ async fn svg0_learns_from_its_replay_and_in_lockstep_the_seed_decides_every_para
     let file =
         low_level(directory.path(), "low_level.safetensors", &["network.low_level=lstm", "network.lstm.units=[12, 8]"])
             .await?;
-    let fields = [&SVG0[..], &["budget.updates=4"]].concat();
-    let mut one = transfer(&file, &fields)?;
+    let low_level = format!("transfer.low_level={}", file.display());
+    let fields = ["budget.updates=4", low_level.as_str()];
+    let mut one = svg0(&fields)?;
     train(&mut one).await?;
-    let mut other = transfer(&file, &fields)?;
+    let mut other = svg0(&fields)?;
     train(&mut other).await?;
     ensure!(learned(&one, 4)? == learned(&other, 4)?, "the same seed gave other parameters");
     let metrics = fs::read_to_string(one.run().join("metrics.jsonl"))?;
@@ -251,8 +279,7 @@ async fn svg0_learns_from_its_replay_and_in_lockstep_the_seed_decides_every_para
 
 #[tokio::test]
 async fn svg0_also_learns_without_a_low_level() -> Result<()> {
-    let plain = ["task=go-to-target", "vmpo.action_gradient=0", "network.initial_pose=mid-range", "warm_start.steps=0"];
-    let mut scratch = short(&[&plain[..], &SVG0, &["transfer.mean_scale=1", "budget.updates=3"]].concat())?;
+    let mut scratch = svg0(&["transfer.mean_scale=1", "budget.updates=3"])?;
     train(&mut scratch).await?;
     normalised_reward(&scratch.run()).map(drop)
 }

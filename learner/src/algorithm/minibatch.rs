@@ -2,8 +2,10 @@
 
 use std::ops::Index;
 
+use comic_experiment::{Experiment, TaskSpec};
 use comic_networks::Routing;
-use comic_proto::{Field, PerField};
+use comic_proto::{Field, PerField, UnrollShape};
+use comic_replay::Batch;
 use tch::{Device, Tensor};
 
 use crate::algorithm::error::Error;
@@ -95,6 +97,19 @@ impl MinibatchTensors {
         self.shape
     }
 
+    /// # Errors
+    /// [`Error::Shape`] when the minibatch belongs to another experiment or task.
+    pub(crate) fn check(&self, spec: &TaskSpec, experiment: &Experiment) -> Result<(), Error> {
+        let found = self.shape;
+        let unroll = UnrollShape { length: found.unroll.length, ..UnrollShape::new(spec, experiment) };
+        let expected = MinibatchShape { unrolls: found.unrolls, tasks: spec.tasks.len(), unroll };
+        let (clips, known) = (self.clips, spec.clips.len());
+        if found == expected && clips <= known {
+            return Ok(());
+        }
+        Err(Error::Shape { expected: Box::new(expected), found: Box::new(found), clips, known })
+    }
+
     /// The task of each unroll, `[B]`.
     pub fn tasks(&self) -> &[usize] {
         &self.tasks
@@ -155,6 +170,30 @@ impl MinibatchTensors {
             let _ = self.fields[Field::PreviousLatent].index_copy_(0, indices, &refreshed);
         });
     }
+}
+
+/// A batch of unrolls of any of `tasks` tasks on the device.
+///
+/// # Errors
+/// When the device refuses.
+pub(crate) fn to_device(batch: &Batch, tasks: usize, device: Device) -> Result<MinibatchTensors, Error> {
+    masked_to_device(batch, batch.f32(Field::Valid), tasks, device)
+}
+
+/// As [`to_device`], with `valid`, `[B, T]`, in place of the batch's own: a row counts only where it is 1.
+///
+/// # Errors
+/// When the device refuses.
+pub(crate) fn masked_to_device(
+    batch: &Batch,
+    valid: &[f32],
+    tasks: usize,
+    device: Device,
+) -> Result<MinibatchTensors, Error> {
+    let shape = MinibatchShape { unrolls: batch.unrolls, tasks, unroll: *batch.layout.shape() };
+    let floats = PerField::from_fn(|field| if field == Field::Valid { valid } else { batch.f32(field) });
+    let source = MinibatchSource { floats, clip: batch.clip(), image: batch.image(), tasks: &batch.tasks() };
+    MinibatchTensors::new(&source, &shape, device)
 }
 
 /// The tensor of a field.

@@ -147,7 +147,7 @@ fn fit(file: &Exported, latents: &Latents, hidden: Vec<usize>, steps: u32) -> Re
 mod tests {
     use comic_experiment::resolve;
     use comic_networks::export::{Part, Source};
-    use comic_networks::{Policy, to_safetensors};
+    use comic_networks::{VmpoPolicy, to_safetensors};
 
     use super::*;
 
@@ -157,7 +157,7 @@ mod tests {
         let experiment = resolve("tracking-mlp", &fields.map(String::from)).unwrap();
         let spec = comic_experiment::TaskSpec::new(&experiment, Vec::new()).unwrap();
         let store = nn::VarStore::new(Device::Cpu);
-        Policy::new(&store.root(), &spec, &experiment.network, &vec![0.0; spec.action]).unwrap();
+        VmpoPolicy::new(&store.root(), &spec, &experiment.network, &vec![0.0; spec.action]).unwrap();
         let parameters = to_safetensors(&store).unwrap();
         Exported::new(Part::LowLevel, &experiment, Source::default(), &parameters, None).unwrap()
     }

@@ -5,9 +5,10 @@ use std::collections::BTreeMap;
 use comic_experiment::{Experiment, TaskSpec};
 use tch::Device;
 
+use crate::algorithm::Parts;
+use crate::algorithms;
 use crate::document::DocumentArguments;
 use crate::error::{Error, Result};
-use crate::vmpo::VmpoLearner;
 
 /// The paper's presets.
 const PRESETS: [&str; 6] =
@@ -20,7 +21,8 @@ const PRESETS: [&str; 6] =
 pub fn count(experiment: &Experiment) -> Result<BTreeMap<&'static str, usize>> {
     let spec = TaskSpec::new(experiment, vec!["clip".into()])
         .map_err(|name| Error::Defect(format!("no observation `{name}`")))?;
-    let learner = VmpoLearner::new(&spec, experiment, &vec![0.0; spec.action], Device::Cpu)?;
+    let pose = vec![0.0; spec.action];
+    let learner = algorithms::learner(Parts { experiment, spec: &spec, pose: &pose, device: Device::Cpu })?;
     let mut counts = BTreeMap::new();
     for (name, count) in learner.parameter_counts() {
         let part = match name.split('.').collect::<Vec<_>>()[..] {

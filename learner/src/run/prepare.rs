@@ -155,13 +155,13 @@ mod tests {
     #[test]
     fn a_changed_experiment_is_refused_with_every_changed_field() {
         let change = |experiment: &mut Experiment| {
-            experiment.vmpo.lambda = 0.5;
+            experiment.optimiser.beta1 = 0.5;
             experiment.network.latent.beta = 0.25;
         };
         let refused = resume(change, false).unwrap_err();
         assert_eq!(refused.exit_code(), 2);
         let message = refused.to_string();
-        for part in ["vmpo.lambda was", "is 0.5", "network.latent.beta was", "is 0.25", "--allow-changed"] {
+        for part in ["optimiser.beta1 was", "is 0.5", "network.latent.beta was", "is 0.25", "--allow-changed"] {
             assert!(message.contains(part), "no `{part}` in {message}");
         }
         assert!(resume(change, true).is_ok());

@@ -2,20 +2,20 @@
 
 use comic_experiment::{Experiment, Svg0, TaskSpec};
 use comic_networks::{
-    ActionValue, Core, DiagonalGaussian, LatentPolicy, NormalisedObservation, NormaliserStatistics, Policy,
-    RecurrentState, to_safetensors,
+    ActionValue, DiagonalGaussian, NormalisedObservation, NormaliserStatistics, Policy as _, RecurrentState,
+    Svg0Policy, to_safetensors,
 };
-use comic_proto::{Field, UnrollShape};
+use comic_proto::Field;
 use tch::{Device, Kind, Tensor, nn};
 
 use crate::adam::{self, Adam};
-use crate::algorithm::Algorithm;
+use crate::algorithm::descent::{Gradients, descend};
 use crate::algorithm::error::Error;
 use crate::algorithm::loss_report::Losses;
 use crate::algorithm::masked_mean::masked_mean;
 use crate::algorithm::minibatch::MinibatchTensors;
-use crate::algorithm::shape::MinibatchShape;
 use crate::algorithm::stores::{named, trainable};
+use crate::algorithm::{Algorithm, made_on};
 use crate::svg0::retrace::{Trace, retrace};
 
 /// Online and target networks, and Adam.
@@ -39,7 +39,7 @@ pub struct Svg0Learner {
 struct Networks {
     policy_store: nn::VarStore,
     value_store: nn::VarStore,
-    policy: Policy,
+    policy: Svg0Policy,
     action_value: ActionValue,
 }
 
@@ -53,11 +53,11 @@ struct Pass {
 }
 
 impl Networks {
-    fn new(device: Device, spec: &TaskSpec, experiment: &Experiment) -> Result<Self, Error> {
+    fn new(device: Device, spec: &TaskSpec, experiment: &Experiment) -> Self {
         let (policy_store, value_store) = (nn::VarStore::new(device), nn::VarStore::new(device));
-        let policy = Policy::of(&policy_store.root(), spec, experiment, &vec![0.0; spec.action])?;
+        let policy = Svg0Policy::new(&policy_store.root(), spec, experiment);
         let action_value = ActionValue::new(&value_store.root(), spec, &experiment.svg0);
-        Ok(Self { policy_store, value_store, policy, action_value })
+        Self { policy_store, value_store, policy, action_value }
     }
 
     /// Every parameter, by name.
@@ -76,13 +76,9 @@ impl Networks {
         });
     }
 
-    fn parts(&self) -> Result<(&Core, &LatentPolicy), Error> {
-        self.policy.recurrent().ok_or(Error::Unsupported("SVG(0) needs a recurrent policy"))
-    }
-
     /// The networks from row `burn_in` on. The rows before it only build up the recurrent states, without gradient.
-    fn pass(&self, minibatch: &MinibatchTensors, burn_in: i64) -> Result<Pass, Error> {
-        let (core, policy) = self.parts()?;
+    fn pass(&self, minibatch: &MinibatchTensors, burn_in: i64) -> Pass {
+        let (core, policy) = (self.policy.core(), self.policy.latent_policy());
         let (proprioception, task) = (&minibatch[Field::Proprioception], &minibatch[Field::Task]);
         let observation = self.policy.normalise(proprioception, task, minibatch.image(), minibatch.routing());
         let (first, state) = (&minibatch[Field::First], &minibatch[Field::State]);
@@ -105,7 +101,7 @@ impl Networks {
         // The critic alone trains the core.
         let recurrent = RecurrentState { state: &states[1], first: Some(&first) };
         let (policy, _) = policy.forward(&features.detach(), recurrent);
-        Ok(Pass { features, policy })
+        Pass { features, policy }
     }
 
     /// The mean over J samples of Q, `[N]`, for features `[N, H]` and actions μ + σ ε^j with noise `[J, N, Z]`.
@@ -125,37 +121,20 @@ impl Svg0Learner {
     /// # Errors
     /// [`Error::Networks`] when the networks cannot be made.
     pub fn new(spec: &TaskSpec, experiment: &Experiment, device: Device) -> Result<Self, Error> {
-        let host = Self::made_on(Device::Cpu, spec, experiment)?;
-        if device == Device::Cpu {
-            return Ok(host);
-        }
-        let mut learner = Self::made_on(device, spec, experiment)?;
-        learner.load_state(&host.state())?;
-        Ok(learner)
+        made_on(device, |device| Ok(Self::make(device, spec, experiment)))
     }
 
-    fn made_on(device: Device, spec: &TaskSpec, experiment: &Experiment) -> Result<Self, Error> {
-        let online = Networks::new(device, spec, experiment)?;
-        let mut target = Networks::new(device, spec, experiment)?;
+    fn make(device: Device, spec: &TaskSpec, experiment: &Experiment) -> Self {
+        let online = Networks::new(device, spec, experiment);
+        let mut target = Networks::new(device, spec, experiment);
         target.copy_from(&online);
         target.policy_store.freeze();
         target.value_store.freeze();
         let mut adam = Adam::new(&experiment.optimiser);
         let mut parameters = trainable("policy", &online.policy_store);
         parameters.extend(trainable("value", &online.value_store));
-        let group = adam.add_group("networks", parameters, experiment.svg0.learning_rate);
-        Ok(Self { spec: spec.clone(), experiment: experiment.clone(), online, target, adam, group, steps: 0 })
-    }
-
-    fn check(&self, minibatch: &MinibatchTensors) -> Result<(), Error> {
-        let found = minibatch.shape();
-        let unroll = UnrollShape { length: found.unroll.length, ..UnrollShape::new(&self.spec, &self.experiment) };
-        let expected = MinibatchShape { unrolls: found.unrolls, tasks: self.spec.tasks.len(), unroll };
-        if found == expected {
-            return Ok(());
-        }
-        let (clips, known) = (minibatch.clips(), self.spec.clips.len());
-        Err(Error::Shape { expected: Box::new(expected), found: Box::new(found), clips, known })
+        let group = adam.add_group("networks", parameters, experiment.optimiser.learning_rate);
+        Self { spec: spec.clone(), experiment: experiment.clone(), online, target, adam, group, steps: 0 }
     }
 
     /// Standard-normal noise of this gradient step, `[2, J, N, Z]`: for the target's values and for the policy's gradient.
@@ -181,7 +160,7 @@ impl Algorithm for Svg0Learner {
     /// L = L_Q + L_π, where L_Q = ½ mean (Q(h_t, z_t) − Q^ret_t)² and
     /// L_π = −mean [mean_j Q′(h′_t, z^j) + c_H H(π)] + c_KL mean KL(π ‖ N(0, I)).
     fn step(&mut self, minibatch: &MinibatchTensors) -> Result<Losses, Error> {
-        self.check(minibatch)?;
+        minibatch.check(&self.spec, &self.experiment)?;
         let Svg0 { discount, lambda, entropy, kl, burn_in, .. } = self.experiment.svg0;
         let burn_in = burn_in as i64;
         let [unrolls, length] = [minibatch.shape().unrolls, minibatch.shape().unroll.length].map(|size| size as i64);
@@ -195,10 +174,10 @@ impl Algorithm for Svg0Learner {
         let without_last = |tensor: &Tensor| tensor.unflatten(0, [unrolls, rows]).narrow(1, 0, steps).flatten(0, 1);
         let noise = self.noise(unrolls * rows);
 
-        let online = self.online.pass(minibatch, burn_in)?;
+        let online = self.online.pass(minibatch, burn_in);
         let divergence = online.policy.kl_to_standard_normal();
         let (targets, trace, target_features) = tch::no_grad(|| {
-            let target = self.target.pass(minibatch, burn_in)?;
+            let target = self.target.pass(minibatch, burn_in);
             let features = target.features.flatten(0, 1);
             let value = self.target.expected_action_value(&features, &target.policy, &noise.select(0, 0));
             let value = (value - divergence.detach() * kl).reshape([unrolls, rows]);
@@ -215,8 +194,8 @@ impl Algorithm for Svg0Learner {
                 coefficient: &coefficient,
                 valid: &valid,
             });
-            Ok::<_, Error>((targets.flatten(0, 1), coefficient.flatten(0, 1), features))
-        })?;
+            (targets.flatten(0, 1), coefficient.flatten(0, 1), features)
+        });
 
         let mask = valid.flatten(0, 1);
         let action_value = self.online.action_value.forward(&without_last(&online.features.flatten(0, 1)), &action);
@@ -233,20 +212,11 @@ impl Algorithm for Svg0Learner {
         let policy_loss = &divergence * kl - &gain - &spread * entropy;
         let total = &value_loss + &policy_loss;
 
-        let mut gradients = Tensor::f_run_backward(&[&total], self.adam.parameters(self.group), false, false)?;
-        for (gradient, parameter) in gradients.iter_mut().zip(self.adam.parameters(self.group)) {
-            // A parameter that the loss does not depend on has no gradient tensor.
-            if !gradient.defined() {
-                *gradient = parameter.detach().zeros_like();
-            }
-        }
-        let norm = adam::global_norm(&gradients);
-        let finite = (total.detach() + norm.square()).isfinite().all();
-        let limit = self.experiment.optimiser.max_gradient_norm;
-        if limit > 0.0 {
-            adam::clip_by_global_norm(&mut gradients, &norm, limit);
-        }
-        self.adam.step(self.group, &gradients, &finite);
+        let gradients = Tensor::f_run_backward(&[&total], self.adam.parameters(self.group), false, false)?;
+        let gradients = Gradients::new(&self.adam, self.group, gradients);
+        let norm = gradients.norm();
+        let gradients = gradients.clipped(self.experiment.optimiser.max_gradient_norm);
+        let finite = descend(&mut self.adam, &total, &[gradients]);
         self.steps += 1;
         if self.steps.is_multiple_of(self.experiment.svg0.target_period) {
             self.target.copy_from(&self.online);
@@ -277,13 +247,15 @@ impl Algorithm for Svg0Learner {
         Ok(self.target.policy.set_normaliser(statistics)?)
     }
 
-    fn publish_period(&self) -> u64 {
-        1
+    /// Where a multiple of the period lies within the update's gradient steps.
+    fn publishes_after(&self, _: u64, steps: u64) -> bool {
+        let period = self.experiment.svg0.publish_period;
+        self.steps / period > self.steps.saturating_sub(steps) / period
     }
 
     fn set_progress(&mut self, used: f64) {
         let share = self.experiment.optimiser.final_learning_rate_share;
-        self.set_learning_rate(self.experiment.svg0.learning_rate * (1.0 - (1.0 - share) * used.clamp(0.0, 1.0)));
+        self.set_learning_rate(self.experiment.optimiser.learning_rate * (1.0 - (1.0 - share) * used.clamp(0.0, 1.0)));
     }
 
     fn set_learning_rate(&mut self, rate: f64) {
@@ -297,6 +269,16 @@ impl Algorithm for Svg0Learner {
     fn is_finite(&self) -> bool {
         let parameters: Vec<Tensor> = self.adam.parameters(self.group).iter().map(Tensor::detach).collect();
         adam::global_norm(&parameters).double_value(&[]).is_finite()
+    }
+
+    fn parameter_counts(&self) -> Vec<(String, usize)> {
+        let mut parameters = trainable("policy", &self.online.policy_store);
+        parameters.extend(trainable("value", &self.online.value_store));
+        parameters.into_iter().map(|(name, tensor)| (name, tensor.numel())).collect()
+    }
+
+    fn remedies(&self) -> &'static str {
+        "a lower optimiser.learning_rate, a larger svg0.target_period, and an optimiser.max_gradient_norm"
     }
 
     fn policy_parameters(&self) -> Result<Vec<u8>, Error> {

@@ -3,10 +3,13 @@
 use crate::algorithm::loss_report::LossValues;
 use crate::log_limiter::LogLimiter;
 
-/// The remedies that an operator is told when training gives up.
-pub(super) const REMEDIES: &str = "losses and gradients are not finite, and were not after a return to the last good state \
-    either; the checkpoints are from before. The usual remedies are a lower optimiser.learning_rate or vmpo.epsilon_mean, \
-    and an optimiser.max_gradient_norm; else look at what the actors send";
+/// What an operator is told when training gives up. `usual` are the algorithm's usual remedies.
+pub(super) fn remedies(usual: &str) -> String {
+    format!(
+        "losses and gradients are not finite, and were not after a return to the last good state either; the checkpoints are \
+        from before. The usual remedies are {usual}; else look at what the actors send"
+    )
+}
 
 /// Counts skipped steps. Too many in a row restore the last good state. As many again, before as many steps were taken,
 /// end training: the same failure would come back.

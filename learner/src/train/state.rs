@@ -1,19 +1,17 @@
 //! What changes in training and decides its future: what a checkpoint holds and restores.
 
 use bytes::Bytes;
-use comic_experiment::{Experiment, TaskSpec, TransferAlgorithm};
+use comic_experiment::{Experiment, TaskSpec};
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
-use tch::Device;
 
-use crate::algorithm::Algorithm;
+use crate::algorithm::{Algorithm, Parts};
+use crate::algorithms;
 use crate::checkpoint::progress::{PROGRESS, Progress};
 use crate::checkpoint::snapshot::{self, Snapshot};
 use crate::error::{Error, Result};
-use crate::svg0::Svg0Learner;
 use crate::tensors;
 use crate::train::statistics::ObservationStatistics;
-use crate::vmpo::VmpoLearner;
 
 /// The algorithm and what is saved with it.
 #[derive(Debug)]
@@ -29,25 +27,14 @@ pub(super) struct State {
 }
 
 impl State {
-    /// The state at the beginning of run number `run`. `pose` is the action at which the policy's mean starts, `[A]`;
-    /// `low_level` the file of a transfer's frozen low level.
+    /// The state at the beginning of run number `run`. `low_level` is the file of a transfer's frozen low level.
     ///
     /// # Errors
     /// When the networks cannot be made.
-    pub(super) fn new(
-        experiment: &Experiment,
-        spec: &TaskSpec,
-        pose: &[f32],
-        low_level: Option<Bytes>,
-        device: Device,
-        run: u64,
-        epoch: u64,
-    ) -> Result<Self> {
+    pub(super) fn new(parts: Parts<'_>, low_level: Option<Bytes>, run: u64, epoch: u64) -> Result<Self> {
+        let Parts { experiment, spec, .. } = parts;
         tch::manual_seed(experiment.seed as i64);
-        let algorithm: Box<dyn Algorithm> = match experiment.transfer.algorithm {
-            TransferAlgorithm::Vmpo => Box::new(VmpoLearner::new(spec, experiment, pose, device)?),
-            TransferAlgorithm::Svg0 => Box::new(Svg0Learner::new(spec, experiment, device)?),
-        };
+        let algorithm = algorithms::learner(parts)?;
         let progress = Progress {
             run: Some(run),
             epoch,

@@ -6,7 +6,10 @@ use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::v1::Behaviour;
 use comic_replay::{Batch, Batcher, Next, Reason};
 
+use crate::algorithm::Parts;
+use crate::algorithm::experience::Experience;
 use crate::algorithm::loss_report::{LossValues, Losses};
+use crate::algorithms;
 use crate::checkpoint::{Name, Snapshot, incompatible};
 use crate::device::Backend;
 use crate::error::{Error, Result};
@@ -14,10 +17,9 @@ use crate::service::TrainerHandle;
 use crate::service::memory::{Bounds, Sizes};
 use crate::train::budget::BudgetClock;
 use crate::train::checkpoints::Checkpoints;
-use crate::train::experience::{Experience, experience};
 use crate::train::reports::Reports;
 use crate::train::setup::{Ending, Setup};
-use crate::train::skipped_steps::{REMEDIES, Recovery, SkippedSteps};
+use crate::train::skipped_steps::{Recovery, SkippedSteps, remedies};
 use crate::train::state::State;
 use crate::train::versions::Versions;
 use crate::train::warm_start::WarmStart;
@@ -53,13 +55,14 @@ impl Trainer {
         let Setup { experiment, spec, pose, low_level, backend, run, epoch, resume, batcher, publisher, service } =
             setup;
         backend.train_here()?;
-        let mut state = State::new(&experiment, &spec, &pose, low_level, backend.device(), service.id(), epoch)?;
+        let parts = Parts { experiment: &experiment, spec: &spec, pose: &pose, device: backend.device() };
+        let mut state = State::new(parts, low_level, service.id(), epoch)?;
         if let Some(snapshot) = &resume {
             state.restore(snapshot, service.id(), epoch).map_err(|error| incompatible(&run, error))?;
         }
         let mut reports = Reports::open(&run, &spec, &experiment.learner, service.clone())?;
         reports.begin(&state.progress, batcher.accounting_by_task());
-        let experience = experience(&experiment, batcher.layout(), spec.tasks.len(), backend.device())?;
+        let experience = algorithms::experience(parts, batcher.layout())?;
         let mut trainer = Self {
             experience,
             skipped_steps: SkippedSteps::new(experiment.learner.restore_after),
@@ -128,8 +131,8 @@ impl Trainer {
         if self.normalise_by(&batch)? {
             return self.skip_batch(batch);
         }
-        let losses = self.take_gradient_steps(&batch)?;
-        let publishes = (self.state.progress.updates + 1).is_multiple_of(self.state.algorithm.publish_period());
+        let (steps, losses) = self.take_gradient_steps(&batch)?;
+        let publishes = self.state.algorithm.publishes_after(self.state.progress.updates + 1, steps);
         let restored = self.report_when_ready(losses, publishes || self.checkpoints.is_due())?;
         let version = self.state.progress.version;
         self.state.progress.updates += 1;
@@ -167,8 +170,8 @@ impl Trainer {
         self.after_update()
     }
 
-    /// The gradient steps on a batch, and the mean of their losses.
-    fn take_gradient_steps(&mut self, batch: &Batch) -> Result<Option<Losses>> {
+    /// The gradient steps on a batch: how many, and the mean of their losses.
+    fn take_gradient_steps(&mut self, batch: &Batch) -> Result<(u64, Option<Losses>)> {
         self.state.algorithm.set_progress(self.budget.used(&self.state.progress));
         let mut losses = Vec::new();
         let random = &mut self.state.progress.random;
@@ -181,10 +184,10 @@ impl Trainer {
             let step = tracing::debug_span!("gradient_step").in_scope(|| self.state.algorithm.step(&minibatch));
             losses.push(step?);
         }
-        let losses = Losses::mean(&losses);
+        let (steps, losses) = (losses.len() as u64, Losses::mean(&losses));
         self.experience.release();
         self.backend.end_step()?;
-        Ok(losses)
+        Ok((steps, losses))
     }
 
     /// Gathers demonstrations, regresses on them, and writes the checkpoint `warm-started`. Returns false if the learner was
@@ -321,7 +324,9 @@ impl Trainer {
         match recovery {
             Recovery::Continue => {}
             Recovery::Restore => self.restore_last_good()?,
-            Recovery::GiveUp => return Err(Error::Diverged(format!("update {update}: {REMEDIES}"))),
+            Recovery::GiveUp => {
+                return Err(Error::Diverged(format!("update {update}: {}", remedies(self.state.algorithm.remedies()))));
+            }
         }
         self.reports.keep_losses(losses);
         Ok(recovery == Recovery::Restore)

@@ -10,8 +10,8 @@ use tch::Device;
 use crate::algorithm::Algorithm;
 use crate::algorithm::loss_report::Losses;
 use crate::algorithm::minibatch::MinibatchTensors;
+use crate::algorithm::minibatch::masked_to_device;
 use crate::error::Result;
-use crate::train::minibatches::masked_to_device;
 
 /// Which unrolls of a batch are demonstrations; the others are masked.
 #[derive(Debug)]

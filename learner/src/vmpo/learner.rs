@@ -1,18 +1,20 @@
 //! Networks, multipliers and optimiser, stepped together.
 
 use comic_experiment::{Experiment, Prior, TaskSpec};
-use comic_networks::{ActionDistribution, NormaliserStatistics, Policy, RecurrentState, Value, to_safetensors};
-use comic_proto::{Field, UnrollShape};
+use comic_networks::{
+    ActionDistribution, NormaliserStatistics, Policy as _, RecurrentState, Value, VmpoPolicy, to_safetensors,
+};
+use comic_proto::Field;
 use tch::{Device, Kind, Tensor, nn};
 
 use crate::adam::{self, Adam};
-use crate::algorithm::Algorithm;
+use crate::algorithm::descent::{Gradients, descend};
 use crate::algorithm::error::Error;
 use crate::algorithm::loss_report::Losses;
 use crate::algorithm::masked_mean::masked_mean;
 use crate::algorithm::minibatch::MinibatchTensors;
-use crate::algorithm::shape::MinibatchShape;
 use crate::algorithm::stores::{named, trainable};
+use crate::algorithm::{Algorithm, made_on};
 use crate::vmpo::improvement::{Evidence, KlLimits, policy_improvement};
 use crate::vmpo::multipliers::Multipliers;
 use crate::vmpo::report::{Descent, Pass, Terms, report};
@@ -28,7 +30,7 @@ pub struct VmpoLearner {
     experiment: Experiment,
     policy_store: nn::VarStore,
     value_store: nn::VarStore,
-    policy: Policy,
+    policy: VmpoPolicy,
     value: Value,
     multipliers: Multipliers,
     adam: Adam,
@@ -43,20 +45,14 @@ impl VmpoLearner {
     /// # Errors
     /// [`Error::Networks`] when `pose` is no action of this task.
     pub fn new(spec: &TaskSpec, experiment: &Experiment, pose: &[f32], device: Device) -> Result<Self, Error> {
-        let host = Self::made_on(Device::Cpu, spec, experiment, pose)?;
-        if device == Device::Cpu {
-            return Ok(host);
-        }
-        let mut learner = Self::made_on(device, spec, experiment, pose)?;
-        learner.load_state(&host.state())?;
-        Ok(learner)
+        made_on(device, |device| Self::make(device, spec, experiment, pose))
     }
 
-    fn made_on(device: Device, spec: &TaskSpec, experiment: &Experiment, pose: &[f32]) -> Result<Self, Error> {
+    fn make(device: Device, spec: &TaskSpec, experiment: &Experiment, pose: &[f32]) -> Result<Self, Error> {
         let Experiment { network, vmpo, optimiser, .. } = experiment;
         let policy_store = nn::VarStore::new(device);
         let value_store = nn::VarStore::new(device);
-        let policy = Policy::of(&policy_store.root(), spec, experiment, pose)?;
+        let policy = VmpoPolicy::of(&policy_store.root(), spec, experiment, pose)?;
         let value = Value::new(&value_store.root(), spec, network);
         let temperatures = if vmpo.temperature_per_task { spec.tasks.len() } else { 1 };
         let multipliers = Multipliers::initial(vmpo, temperatures, experiment.components(), device);
@@ -88,7 +84,7 @@ impl VmpoLearner {
     }
 
     /// The online policy.
-    pub fn policy(&self) -> &Policy {
+    pub fn policy(&self) -> &VmpoPolicy {
         &self.policy
     }
 
@@ -108,30 +104,12 @@ impl VmpoLearner {
         self.adam.set_learning_rate(self.multipliers_group, multipliers);
     }
 
-    /// Every trained parameter's name and number of elements.
-    pub fn parameter_counts(&self) -> Vec<(String, usize)> {
-        let mut parameters = trainable("policy", &self.policy_store);
-        parameters.extend(trainable("value", &self.value_store));
-        parameters.into_iter().map(|(name, tensor)| (name, tensor.numel())).collect()
-    }
-
     fn entries(&self) -> Vec<(String, Tensor)> {
         let mut entries = named("policy", &self.policy_store);
         entries.extend(named("value", &self.value_store));
         entries.push(("multipliers".to_string(), self.multipliers.parameter().shallow_clone()));
         entries.extend(self.adam.entries());
         entries
-    }
-
-    fn check(&self, minibatch: &MinibatchTensors) -> Result<(), Error> {
-        let found = minibatch.shape();
-        let unroll = UnrollShape { length: found.unroll.length, ..UnrollShape::new(&self.spec, &self.experiment) };
-        let expected = MinibatchShape { unrolls: found.unrolls, tasks: self.spec.tasks.len(), unroll };
-        let known = self.spec.clips.len();
-        if found == expected && minibatch.clips() <= known {
-            return Ok(());
-        }
-        Err(Error::Shape { expected: Box::new(expected), found: Box::new(found), clips: minibatch.clips(), known })
     }
 
     fn forward(&self, minibatch: &MinibatchTensors) -> Pass {
@@ -206,30 +184,16 @@ impl VmpoLearner {
         valid
     }
 
-    /// Clips the gradients if the experiment says so, and steps networks and multipliers if every number is finite.
-    fn descend(&mut self, total: &Tensor, mut gradients: Vec<Tensor>, multipliers: Option<&[Tensor]>) -> Descent {
-        // A parameter that the loss does not depend on has no gradient tensor.
-        for (gradient, parameter) in gradients.iter_mut().zip(self.adam.parameters(self.networks_group)) {
-            if !gradient.defined() {
-                *gradient = parameter.detach().zeros_like();
-            }
-        }
-        let norm = adam::global_norm(&gradients);
-        // Of the squares, because Adam keeps squares: if their sum is finite, each of them is.
-        let mut sum = total.detach() + norm.square();
+    /// Clips the networks' gradients if the experiment says so, and steps networks and multipliers if every number is finite.
+    fn descend(&mut self, total: &Tensor, networks: Vec<Tensor>, multipliers: Option<Vec<Tensor>>) -> Descent {
+        let networks = Gradients::new(&self.adam, self.networks_group, networks);
+        let norm = networks.norm();
+        let mut groups = vec![networks.clipped(self.experiment.optimiser.max_gradient_norm)];
         if let Some(multipliers) = multipliers {
-            sum = &sum + adam::global_norm(multipliers).square();
+            groups.push(Gradients::new(&self.adam, self.multipliers_group, multipliers));
         }
-        let finite = sum.isfinite().all();
-        let limit = self.experiment.optimiser.max_gradient_norm;
-        if limit > 0.0 {
-            adam::clip_by_global_norm(&mut gradients, &norm, limit);
-        }
-        self.adam.step(self.networks_group, &gradients, &finite);
-        if let Some(multipliers) = multipliers {
-            self.adam.step(self.multipliers_group, multipliers, &finite);
-            self.multipliers.project();
-        }
+        let finite = descend(&mut self.adam, total, &groups);
+        self.multipliers.project();
         Descent { norm, finite }
     }
 }
@@ -238,7 +202,7 @@ impl Algorithm for VmpoLearner {
     /// L = L_π + L_η + L_α + w · value loss + β · the latent's KL − the simulator's derivative times the mean action − the
     /// entropy bonus.
     fn step(&mut self, minibatch: &MinibatchTensors) -> Result<Losses, Error> {
-        self.check(minibatch)?;
+        minibatch.check(&self.spec, &self.experiment)?;
         let pass = self.forward(minibatch);
         let advantage = (&pass.targets - pass.values.detach()).sum_dim_intlist(-1i64, false, Kind::Float);
         let policy = &pass.acting.action;
@@ -274,7 +238,7 @@ impl Algorithm for VmpoLearner {
         let inputs: Vec<&Tensor> = networks.iter().chain([self.multipliers.parameter()]).collect();
         let mut gradients = Tensor::f_run_backward(&[&total], &inputs, false, false)?;
         let multipliers = gradients.split_off(networks.len());
-        let descent = self.descend(&total, gradients, Some(&multipliers));
+        let descent = self.descend(&total, gradients, Some(multipliers));
         Ok(report(
             &pass,
             &descent,
@@ -286,7 +250,7 @@ impl Algorithm for VmpoLearner {
     /// Mean over valid steps of Σ ½ ((μ_θ − μ_stored) / initial_std)², with β times the latent's KL; the value function as
     /// in [`step`](Algorithm::step). The policy's standard deviation gets no gradient.
     fn regress(&mut self, minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error> {
-        self.check(minibatch)?;
+        minibatch.check(&self.spec, &self.experiment)?;
         let pass = self.forward(minibatch);
         let Experiment { network, vmpo, .. } = &self.experiment;
         let errors = pass.acting.action.mean_error(&pass.behaviour.mean(), network.initial_std);
@@ -307,8 +271,8 @@ impl Algorithm for VmpoLearner {
         Ok((losses, latents))
     }
 
-    fn publish_period(&self) -> u64 {
-        self.experiment.vmpo.target_period
+    fn publishes_after(&self, updates: u64, _: u64) -> bool {
+        updates.is_multiple_of(self.experiment.vmpo.target_period)
     }
 
     fn set_normaliser(&mut self, statistics: &NormaliserStatistics) -> Result<(), Error> {
@@ -337,6 +301,16 @@ impl Algorithm for VmpoLearner {
         let networks = self.adam.parameters(self.networks_group).iter().map(Tensor::detach);
         let parameters: Vec<Tensor> = networks.chain([self.multipliers.parameter().detach()]).collect();
         adam::global_norm(&parameters).double_value(&[]).is_finite()
+    }
+
+    fn parameter_counts(&self) -> Vec<(String, usize)> {
+        let mut parameters = trainable("policy", &self.policy_store);
+        parameters.extend(trainable("value", &self.value_store));
+        parameters.into_iter().map(|(name, tensor)| (name, tensor.numel())).collect()
+    }
+
+    fn remedies(&self) -> &'static str {
+        "a lower optimiser.learning_rate or vmpo.epsilon_mean, and an optimiser.max_gradient_norm"
     }
 
     fn policy_parameters(&self) -> Result<Vec<u8>, Error> {

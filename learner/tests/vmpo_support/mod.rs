@@ -6,7 +6,7 @@ use comic_learner::algorithm::Algorithm as _;
 use comic_learner::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
 use comic_learner::algorithm::shape::MinibatchShape;
 use comic_learner::vmpo::VmpoLearner;
-use comic_networks::{Acting, RecurrentState, Routing};
+use comic_networks::{Acting, Policy as _, RecurrentState, Routing};
 use comic_proto::{Field, PerField, UnrollShape};
 use tch::{Device, Kind, Tensor};
 

@@ -14,6 +14,7 @@ use tch::{Device, nn};
 use super::part::Part;
 use super::spec::{FORMAT, FittedPrior, Source, Spec, task_spec};
 use super::weights;
+use crate::algorithms::new_policy;
 use crate::error::Error;
 use crate::frozen::FrozenLowLevel;
 use crate::parameters;
@@ -266,9 +267,9 @@ impl Exported {
     }
 
     /// New networks of the experiment, and of the prior if the file has one.
-    pub(super) fn policy(&self, sizes: &TaskSpec) -> Result<(nn::VarStore, Policy), Error> {
+    pub(super) fn policy(&self, sizes: &TaskSpec) -> Result<(nn::VarStore, Box<dyn Policy>), Error> {
         let store = nn::VarStore::new(Device::Cpu);
-        let policy = Policy::of(&store.root(), sizes, &self.experiment, &vec![0.0; sizes.action])?;
+        let policy = new_policy(&store.root(), sizes, &self.experiment, &vec![0.0; sizes.action])?;
         if let Some(prior) = &self.spec.prior {
             StatePrior::new(&(store.root() / "prior"), &self.experiment.network, &prior.hidden);
         }

@@ -44,7 +44,7 @@ impl Exported {
         if sizes.image > 0 {
             inputs.push(row(sizes.image as i64, Kind::Uint8));
         }
-        let mut forward = |inputs: &[Tensor]| vec![step(&policy, frozen.as_ref(), inputs, memory)];
+        let mut forward = |inputs: &[Tensor]| vec![step(policy.as_ref(), frozen.as_ref(), inputs, memory)];
         let module = tch::no_grad(|| CModule::create_by_tracing("Policy", "forward", &inputs, &mut forward))?;
         module.save(path)?;
         self.enclose(path).map_err(Error::File)
@@ -66,7 +66,7 @@ impl Exported {
 
 /// One step without noise: the action within its bounds, the latent, and the states. `memory` has the sizes of the latent, of
 /// the policy's state and of a frozen low level's.
-fn step(policy: &Policy, frozen: Option<&FrozenLowLevel>, inputs: &[Tensor], memory: [i64; 3]) -> Tensor {
+fn step(policy: &dyn Policy, frozen: Option<&FrozenLowLevel>, inputs: &[Tensor], memory: [i64; 3]) -> Tensor {
     let observation = policy.normalise(&inputs[0], &inputs[1], inputs.get(3), &Routing::single());
     let [latent, state, low_level] = memory;
     let previous = inputs[2].narrow(1, 0, latent);

@@ -7,7 +7,7 @@ use std::cell::RefCell;
 use bytes::Bytes;
 use comic_actor::session::{Assembled, Assembler};
 use comic_fuzz::{experiment, seed, spec};
-use comic_networks::{Policy, from_safetensors, to_safetensors};
+use comic_networks::{VmpoPolicy, from_safetensors, to_safetensors};
 use comic_proto::v1::{Behaviour, ParametersChunk};
 use libfuzzer_sys::fuzz_target;
 use prost::Message;
@@ -23,7 +23,7 @@ fn store() -> nn::VarStore {
     let experiment = experiment();
     let spec = spec(&experiment);
     let store = nn::VarStore::new(Device::Cpu);
-    Policy::new(&store.root(), &spec, &experiment.network, &vec![0.0; spec.action]).expect("valid networks");
+    VmpoPolicy::new(&store.root(), &spec, &experiment.network, &vec![0.0; spec.action]).expect("valid networks");
     let whole = Bytes::from(to_safetensors(&store).expect("parameters can be written"));
     let half = whole.len() / 2;
     let piece = |offset: usize, data: Bytes| ParametersChunk {

@@ -1,0 +1,52 @@
+//! A step down the gradients of one loss.
+
+use tch::Tensor;
+
+use crate::adam::{self, Adam};
+
+/// The gradients of one group of Adam's parameters.
+pub(crate) struct Gradients {
+    group: usize,
+    gradients: Vec<Tensor>,
+    /// Their global norm, before any clipping.
+    norm: Tensor,
+}
+
+impl Gradients {
+    /// As libtorch gave them, in the order of the group's parameters. A parameter that the loss does not depend on has no
+    /// gradient tensor; here its gradient is 0.
+    pub(crate) fn new(adam: &Adam, group: usize, mut gradients: Vec<Tensor>) -> Self {
+        for (gradient, parameter) in gradients.iter_mut().zip(adam.parameters(group)) {
+            if !gradient.defined() {
+                *gradient = parameter.detach().zeros_like();
+            }
+        }
+        let norm = adam::global_norm(&gradients);
+        Self { group, gradients, norm }
+    }
+
+    /// Their global norm, before any clipping.
+    pub(crate) fn norm(&self) -> Tensor {
+        self.norm.shallow_clone()
+    }
+
+    /// Scaled down to the global norm `limit` if theirs is larger; 0 is no limit.
+    pub(crate) fn clipped(mut self, limit: f64) -> Self {
+        if limit > 0.0 {
+            adam::clip_by_global_norm(&mut self.gradients, &self.norm, limit);
+        }
+        self
+    }
+}
+
+/// Steps every group, or none of them if `total` or a gradient is not finite. Returns whether the step was taken, a boolean
+/// scalar on the device.
+pub(crate) fn descend(adam: &mut Adam, total: &Tensor, groups: &[Gradients]) -> Tensor {
+    // Of the squares, because Adam keeps squares: if their sum is finite, each of them is.
+    let sum = groups.iter().fold(total.detach(), |sum, gradients| sum + gradients.norm.square());
+    let finite = sum.isfinite().all();
+    for Gradients { group, gradients, .. } in groups {
+        adam.step(*group, gradients, &finite);
+    }
+    finite
+}
