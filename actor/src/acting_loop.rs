@@ -16,11 +16,8 @@ use crate::forward_pass::{ActingBatch, ActingRow, ForwardPass, LowLevelShape, cl
 pub enum Controller<'a, F> {
     /// A policy.
     Policy(&'a mut F),
-    /// The servo action, the pose of the next reference frame, with Gaussian noise.
-    Servo {
-        /// Standard deviation of the noise.
-        std: f32,
-    },
+    /// The servo action: the pose of the next reference frame.
+    Servo,
     /// The zero action: every servo aims at the middle of its joint's range.
     Zero,
 }
@@ -28,17 +25,14 @@ pub enum Controller<'a, F> {
 impl<F: ForwardPass> Controller<'_, F> {
     /// Writes the action distribution of every row.
     fn decide<E: Environment>(&mut self, rollouts: &[Rollout<E>], batch: &mut ActingBatch) -> Result<(), Error> {
-        let std = match self {
+        let write_action: fn(&Rollout<E>, &mut [f32]) = match self {
             Self::Policy(forward) => return forward.forward(batch),
-            Self::Servo { std } => Some(*std),
-            Self::Zero => None,
+            Self::Servo => Rollout::servo_action,
+            Self::Zero => |_, action| action.fill(0.0),
         };
         for (index, rollout) in rollouts.iter().enumerate() {
             let mut row = batch.row(index);
-            match std {
-                Some(std) => row.set_gaussian(|mean| rollout.servo_action(mean), std),
-                None => row.set_gaussian(|mean| mean.fill(0.0), 0.0),
-            }
+            row.set_action(|mean| write_action(rollout, mean));
             // No policy acts, so there is no latent and no recurrent state.
             row.latent.fill(0.0);
             row.reset_recurrent_state();
@@ -50,7 +44,7 @@ impl<F: ForwardPass> Controller<'_, F> {
     fn actuate(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
         match self {
             Self::Policy(forward) => forward.actuate(batch),
-            Self::Servo { .. } | Self::Zero => {
+            Self::Servo | Self::Zero => {
                 batch.command.copy_from_slice(&batch.action);
                 Ok(())
             }
@@ -61,7 +55,7 @@ impl<F: ForwardPass> Controller<'_, F> {
     pub(crate) fn low_level(&self) -> Option<LowLevelShape> {
         match self {
             Self::Policy(forward) => forward.low_level(),
-            Self::Servo { .. } | Self::Zero => None,
+            Self::Servo | Self::Zero => None,
         }
     }
 }

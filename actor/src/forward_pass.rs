@@ -221,15 +221,15 @@ impl ActingRow<'_> {
         }
     }
 
-    /// Makes the action distribution N(mean, std²): every component has these values, and all weights are equal. `mean`
-    /// fills `[A]`.
-    pub fn set_gaussian(&mut self, mean: impl Fn(&mut [f32]), std: f32) {
+    /// Makes the action distribution one action without noise: every component has this mean and no deviation, and all
+    /// weights are equal. `mean` fills `[A]`.
+    pub fn set_action(&mut self, mean: impl Fn(&mut [f32])) {
         let components = self[Field::LogWeights].len().max(1);
         let means = &mut self[Field::Mean];
         for component in means.chunks_exact_mut((means.len() / components).max(1)) {
             mean(component);
         }
-        self[Field::Std].fill(std);
+        self[Field::Std].fill(0.0);
         self[Field::LogWeights].fill(-(components as f32).ln());
     }
 }
@@ -387,14 +387,14 @@ mod tests {
     }
 
     #[test]
-    fn a_gaussian_fills_every_component_and_a_reset_empties_the_recurrent_state() {
+    fn an_action_fills_every_component_and_a_reset_empties_the_recurrent_state() {
         let mut batch = mixture([0.2, 0.3, 0.5]);
         batch[Field::State].fill(1.0);
         let mut row = batch.row(0);
-        row.set_gaussian(|mean| mean.copy_from_slice(&[0.1, 0.2]), 0.3);
+        row.set_action(|mean| mean.copy_from_slice(&[0.1, 0.2]));
         row.reset_recurrent_state();
         assert_eq!(batch[Field::Mean], [0.1, 0.2, 0.1, 0.2, 0.1, 0.2]);
-        assert_eq!((&batch[Field::Std], &batch[Field::State]), (&[0.3; 6][..], &[0.0; 4][..]));
+        assert_eq!((&batch[Field::Std], &batch[Field::State]), (&[0.0; 6][..], &[0.0; 4][..]));
         assert!(batch[Field::LogWeights].iter().all(|weight| (weight.exp() - 1.0 / 3.0).abs() < 1e-6));
     }
 }

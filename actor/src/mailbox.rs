@@ -4,7 +4,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytes::Bytes;
-use comic_proto::v1::Behaviour;
 use parking_lot::{Condvar, Mutex, MutexGuard};
 
 /// How to act, in one version. Versions of different learner epochs cannot be compared.
@@ -14,9 +13,7 @@ pub struct Directive {
     pub learner_epoch: u64,
     /// Its version within that epoch.
     pub version: u64,
-    /// What chooses the actions.
-    pub behaviour: Behaviour,
-    /// The parameters of the policy (safetensors); may be empty for a demonstration.
+    /// The parameters of the policy (safetensors).
     pub parameters: Bytes,
 }
 
@@ -98,7 +95,7 @@ mod tests {
     use super::*;
 
     fn directive(version: u64) -> Directive {
-        Directive { learner_epoch: 1, version, behaviour: Behaviour::Policy, parameters: Bytes::new() }
+        Directive { learner_epoch: 1, version, parameters: Bytes::new() }
     }
 
     #[test]

@@ -180,8 +180,7 @@ fn build(
             Pace::Free => Box::new(policy),
             Pace::Lockstep => Box::new(OneByOne::new(policy, joined.layout.shape())),
         };
-        let noise = experiment.warm_start.noise as f32;
-        workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), noise, first, joined.seed)?);
+        workers.push(Worker::new(environments, policy, Arc::clone(&joined.layout), first, joined.seed)?);
     }
     Ok((workers, parameters))
 }

@@ -20,7 +20,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
 use comic_proto::UnrollLayout;
-use comic_proto::v1::{Behaviour, EpisodeStatistics};
+use comic_proto::v1::EpisodeStatistics;
 use comic_tasks::Environment;
 use tokio::sync::mpsc;
 
@@ -40,8 +40,6 @@ pub struct FinishedUnroll {
     pub learner_epoch: u64,
     /// Version of the parameters that acted, from the first row to the last.
     pub version: u64,
-    /// What acted, from the first row to the last.
-    pub behaviour: Behaviour,
     /// Episodes that ended in this unroll.
     pub episodes: Vec<EpisodeStatistics>,
     /// The environment's number.
@@ -80,7 +78,6 @@ pub struct Worker<E, F> {
     length: usize,
     /// The number of the first environment.
     first: u32,
-    demonstration_noise: f32,
     /// What the current unroll is made with; none before the first directive.
     directive: Option<Arc<Directive>>,
 }
@@ -88,8 +85,8 @@ pub struct Worker<E, F> {
 impl<E: Environment, F: ForwardPass> Worker<E, F> {
     /// Resets every environment.
     ///
-    /// `demonstration_noise` is the standard deviation around the servo action in demonstrations. The environments are
-    /// numbered from `first` on. `seed` and its number decide the noise of an environment's latents and actions.
+    /// The environments are numbered from `first` on. `seed` and its number decide the noise of an environment's latents
+    /// and actions.
     ///
     /// # Errors
     /// The unrolls have a place for derivatives, and an environment's body has none.
@@ -97,7 +94,6 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         environments: Vec<E>,
         forward: F,
         layout: Arc<UnrollLayout>,
-        demonstration_noise: f32,
         first: u32,
         seed: u64,
     ) -> Result<Self, Error> {
@@ -111,7 +107,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
             rollout.environment.reset();
             rollout.begin_episode(&mut acting.batch.row(index));
         }
-        Ok(Self { acting, recorder, forward, length, first, demonstration_noise, directive: None })
+        Ok(Self { acting, recorder, forward, length, first, directive: None })
     }
 
     /// Acts by the newest directive and sends every full unroll to `unrolls`, until the mailbox or the channel is closed.
@@ -156,20 +152,12 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     /// Uses a directive from the next unroll on.
     ///
     /// # Errors
-    /// Parameters that do not fit, or a demonstration where a frozen low level acts.
+    /// Parameters that do not fit.
     pub fn adopt(&mut self, directive: &Arc<Directive>) -> Result<(), Error> {
         if self.directive.as_ref().is_some_and(|current| Arc::ptr_eq(current, directive)) {
             return Ok(());
         }
-        match directive.behaviour {
-            Behaviour::Policy => self.forward.load(&directive.parameters)?,
-            // Its action is a command, and the policy's is a latent.
-            Behaviour::Demonstration if self.forward.low_level().is_some() => {
-                let reason = "the learner wants a demonstration, although a frozen low level acts".to_owned();
-                return Err(Error::Misfit { reason });
-            }
-            Behaviour::Demonstration | Behaviour::Unspecified => {}
-        }
+        self.forward.load(&directive.parameters)?;
         self.directive = Some(Arc::clone(directive));
         Ok(())
     }
@@ -183,12 +171,8 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         stopped: &dyn Fn() -> bool,
         progress: &Progress,
     ) -> Result<Option<Vec<FinishedUnroll>>, Error> {
-        let Self { acting, recorder, forward, length, demonstration_noise, directive, .. } = self;
-        let demonstrates = directive.as_ref().is_some_and(|directive| directive.behaviour == Behaviour::Demonstration);
-        let mut controller = match demonstrates {
-            true => Controller::Servo { std: *demonstration_noise },
-            false => Controller::Policy(forward),
-        };
+        let Self { acting, recorder, forward, length, .. } = self;
+        let mut controller = Controller::Policy(forward);
         for t in 0..*length {
             if stopped() {
                 return Ok(None);
@@ -205,10 +189,8 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     }
 
     fn finish(&mut self) -> Result<Vec<FinishedUnroll>, Error> {
-        let (learner_epoch, version, behaviour) = self
-            .directive
-            .as_ref()
-            .map_or((0, 0, Behaviour::Policy), |newest| (newest.learner_epoch, newest.version, newest.behaviour));
+        let (learner_epoch, version) =
+            self.directive.as_ref().map_or((0, 0), |newest| (newest.learner_epoch, newest.version));
         let ActingLoop { rollouts, batch } = &mut self.acting;
         let mut unrolls = Vec::with_capacity(rollouts.len());
         for ((index, rollout), environment) in rollouts.iter_mut().enumerate().zip(self.first..) {
@@ -219,16 +201,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
                 rollout.begin_episode(&mut batch.row(index));
             }
             let ticket = None;
-            unrolls.push(FinishedUnroll {
-                payload,
-                learner_epoch,
-                version,
-                behaviour,
-                episodes,
-                environment,
-                task,
-                ticket,
-            });
+            unrolls.push(FinishedUnroll { payload, learner_epoch, version, episodes, environment, task, ticket });
         }
         Ok(unrolls)
     }

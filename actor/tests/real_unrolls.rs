@@ -34,41 +34,38 @@ fn setup() -> Setup {
 }
 
 /// Two rounds of unrolls, `[round][environment]`.
-fn record(setup: &Setup, behaviour: Behaviour) -> Vec<Vec<FinishedUnroll>> {
+fn record(setup: &Setup) -> Vec<Vec<FinishedUnroll>> {
     let environments =
         (0..ENVIRONMENTS as u64).map(|seed| Arc::clone(&setup.task).environment(seed).unwrap()).collect();
     let policy = TorchPolicy::untrained(setup.task.spec(), &setup.experiment, None, 6, || Ok([0.0; 56])).unwrap();
-    let mut worker = Worker::new(environments, policy, Arc::clone(&setup.layout), 0.1, 0, 9).unwrap();
+    let mut worker = Worker::new(environments, policy, Arc::clone(&setup.layout), 0, 9).unwrap();
     let parameters = Bytes::from(setup.policy.to_parameters().unwrap());
-    worker.adopt(&Arc::new(Directive { learner_epoch: 2, version: 4, behaviour, parameters })).unwrap();
+    worker.adopt(&Arc::new(Directive { learner_epoch: 2, version: 4, parameters })).unwrap();
     (0..2).map(|_| worker.unroll(&|| false, &Progress::default()).unwrap().unwrap()).collect()
 }
 
 #[test]
 fn unrolls_pass_the_learners_validation() {
     let setup = setup();
-    for behaviour in [Behaviour::Policy, Behaviour::Demonstration] {
-        for unroll in record(&setup, behaviour).into_iter().flatten() {
-            let header = UnrollHeader {
-                learner_epoch: unroll.learner_epoch,
-                version: unroll.version,
-                layout_hash: setup.layout.hash().to_vec(),
-                behaviour: unroll.behaviour.into(),
-                episodes: unroll.episodes,
-                task: unroll.task,
-                ..UnrollHeader::default()
-            };
-            let expected = Expected { clips: &[setup.task.spec().clips.len()], epoch: 2, newest_version: 4 };
-            validate(&setup.layout, &header, &unroll.payload.clone().into(), &expected).unwrap();
-            assert_eq!(unroll.behaviour, behaviour);
-        }
+    for unroll in record(&setup).into_iter().flatten() {
+        let header = UnrollHeader {
+            learner_epoch: unroll.learner_epoch,
+            version: unroll.version,
+            layout_hash: setup.layout.hash().to_vec(),
+            behaviour: Behaviour::Policy.into(),
+            episodes: unroll.episodes,
+            task: unroll.task,
+            ..UnrollHeader::default()
+        };
+        let expected = Expected { clips: &[setup.task.spec().clips.len()], epoch: 2, newest_version: 4 };
+        validate(&setup.layout, &header, &unroll.payload.clone().into(), &expected).unwrap();
     }
 }
 
 #[test]
 fn the_behaviour_policy_follows_from_the_recorded_fields() {
     let mut setup = setup();
-    for round in record(&setup, Behaviour::Policy) {
+    for round in record(&setup) {
         let mut unrolls: Vec<_> =
             round.iter().map(|unroll| UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap()).collect();
         let mut batch = ActingBatch::new(ENVIRONMENTS, setup.layout.shape(), None);
@@ -94,7 +91,7 @@ fn the_behaviour_policy_follows_from_the_recorded_fields() {
 fn rewards_are_the_tracking_tasks() {
     let setup = setup();
     let mut best = 0.0_f32;
-    for unroll in record(&setup, Behaviour::Demonstration).into_iter().flatten() {
+    for unroll in record(&setup).into_iter().flatten() {
         let buffer = UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap();
         for t in 0..setup.layout.shape().length {
             let reward: f32 = buffer.row(Field::Reward, t).iter().sum();
@@ -103,14 +100,14 @@ fn rewards_are_the_tracking_tasks() {
             best = best.max(reward);
         }
     }
-    assert!(best > 0.3, "the servo action tracks a little, at least at an episode's start: {best}");
+    assert!(best > 0.3, "an episode begins at its reference: {best}");
 }
 
 #[test]
 fn every_transition_has_the_derivative_of_its_action() {
     let setup = setup();
     let mut transitions = 0;
-    for unroll in record(&setup, Behaviour::Policy).into_iter().flatten() {
+    for unroll in record(&setup).into_iter().flatten() {
         let buffer = UnrollBuffer::from_payload(&setup.layout, &unroll.payload).unwrap();
         for t in 0..setup.layout.shape().length {
             let is_transition = buffer.row(Field::Valid, t) == [1.0];

@@ -5,7 +5,7 @@ use crate::clips::{ClipSource, SUBSETS};
 use crate::document::Experiment;
 use crate::fault::{AT_LEAST_ONE, Fault, NOT_NEGATIVE, POSITIVE, ensure, not_negative, positive};
 use crate::network::{InitialPose, Network, Prior};
-use crate::settings::{Actor, Budget, LONGEST_UNROLL, Learner, Optimiser, Unroll, WarmStart};
+use crate::settings::{Actor, Budget, LONGEST_UNROLL, Learner, Optimiser, Unroll};
 use crate::tasks::{TaskName, Vision};
 use crate::transfer::Transfer;
 
@@ -29,7 +29,6 @@ pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
     optimiser(&experiment.optimiser)?;
     unroll(&experiment.unroll)?;
     actor(&experiment.actor)?;
-    warm_start(&experiment.warm_start)?;
     together(experiment)?;
     algorithms::check(experiment)?;
     learner(&experiment.learner)?;
@@ -98,9 +97,7 @@ fn transfer(experiment: &Experiment) -> Result<(), Fault> {
     ensure("joint", joint.len(), joint.is_empty(), "must be empty with transfer.low_level")?;
     let pose = network.initial_pose;
     let holds = pose == InitialPose::MidRange;
-    ensure("network.initial_pose", pose, holds, "must be \"mid-range\" with transfer.low_level")?;
-    let steps = experiment.warm_start.steps;
-    ensure("warm_start.steps", steps, steps == 0, "must be 0 with transfer.low_level")
+    ensure("network.initial_pose", pose, holds, "must be \"mid-range\" with transfer.low_level")
 }
 
 fn network(network: &Network) -> Result<(), Fault> {
@@ -178,25 +175,9 @@ fn actor(actor: &Actor) -> Result<(), Fault> {
     ensure("actor.environments", actor.environments, (1..=4096).contains(&actor.environments), "must be 1 to 4096")
 }
 
-fn warm_start(warm_start: &WarmStart) -> Result<(), Fault> {
-    let WarmStart { steps, demonstration_steps, noise, minibatch_unrolls, learning_rate, .. } = warm_start;
-    let holds = *steps == 0 || *demonstration_steps > 0;
-    ensure("warm_start.demonstration_steps", demonstration_steps, holds, AT_LEAST_ONE)?;
-    ensure("warm_start.noise", noise, positive(*noise) && *noise >= SMALLEST_STD, AT_LEAST_STD)?;
-    ensure("warm_start.noise", noise, *noise <= LARGEST_STD, AT_MOST_STD)?;
-    ensure("warm_start.minibatch_unrolls", minibatch_unrolls, *minibatch_unrolls > 0, AT_LEAST_ONE)?;
-    ensure("warm_start.learning_rate", learning_rate, positive(*learning_rate), POSITIVE)
-}
-
 /// Fields that make no sense beside one another.
 fn together(experiment: &Experiment) -> Result<(), Fault> {
-    let Experiment { network, warm_start, unroll, budget, .. } = experiment;
-    let demonstrates = experiment.tasks().iter().any(|(task, _)| experiment.parameters(*task).follows_clips());
-    let holds = warm_start.steps == 0 || demonstrates;
-    ensure("warm_start.steps", warm_start.steps, holds, "must be 0 unless a task has a reference, as tracking has")?;
-    let holds = warm_start.steps == 0 || network.low_level.imitates();
-    let remedy = format!("must be 0 with network.low_level = \"{}\"", network.low_level);
-    ensure("warm_start.steps", warm_start.steps, holds, &remedy)?;
+    let Experiment { unroll, budget, .. } = experiment;
     let holds = !unroll.lockstep || unroll.ahead == 0;
     ensure("unroll.ahead", unroll.ahead, holds, "must be 0 with unroll.lockstep")?;
     let holds = !unroll.lockstep || budget.minutes == 0.0;

@@ -8,7 +8,7 @@ use crate::clips::ClipSource;
 use crate::for_each_task;
 use crate::network::Network;
 use crate::replay::Replay;
-use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll, WarmStart};
+use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll};
 use crate::tasks::{self, TaskName, TaskParameters};
 use crate::transfer::Transfer;
 
@@ -48,8 +48,6 @@ macro_rules! document {
             pub unroll: Unroll,
             /// One actor process.
             pub actor: Actor,
-            /// Regression towards the servo action before V-MPO starts.
-            pub warm_start: WarmStart,
             /// The learner as a service.
             pub learner: Learner,
             /// When the run ends.
@@ -74,7 +72,6 @@ macro_rules! document {
                     optimiser: Optimiser::default(),
                     unroll: Unroll::default(),
                     actor: Actor::default(),
-                    warm_start: WarmStart::default(),
                     learner: Learner::default(),
                     budget: Budget::default(),
                 }

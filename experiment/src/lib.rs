@@ -47,7 +47,7 @@ pub use nearest::nearest;
 pub use network::{InitialPose, Latent, LowLevelName, Lstm, Mlp, Network, Primitives, Prior};
 pub use replay::Replay;
 pub use resolve::resolve;
-pub use settings::{Actor, Budget, LARGEST_ACTION_GRADIENT, LONGEST_UNROLL, Learner, Optimiser, Unroll, WarmStart};
+pub use settings::{Actor, Budget, LARGEST_ACTION_GRADIENT, LONGEST_UNROLL, Learner, Optimiser, Unroll};
 pub use spec::{TaskPart, TaskSpec};
 pub use tasks::*;
 pub use transfer::{Transfer, TransferPrior};

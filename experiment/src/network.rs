@@ -103,12 +103,6 @@ impl LowLevelName {
     pub(crate) fn acts_without_bottleneck(self) -> bool {
         matches!(self, Self::Mixture | Self::Product)
     }
-
-    /// Whether it learns from demonstrations. The mean of a product depends on the deviations of its primitives. Regression
-    /// of the mean alone would spoil these deviations.
-    pub(crate) fn imitates(self) -> bool {
-        self != Self::Product
-    }
 }
 
 impl std::fmt::Display for LowLevelName {

@@ -85,30 +85,6 @@ impl Default for Actor {
     }
 }
 
-/// Regression of the policy towards the servo action of frame t + 1, on rollouts of that action with noise (D; not in the
-/// paper).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct WarmStart {
-    /// Gradient steps. 0 is no warm start.
-    pub steps: u64,
-    /// Environment steps that are collected with the servo action before the first gradient step. In joint training this
-    /// includes the steps of tasks without a reference.
-    pub demonstration_steps: u64,
-    /// Standard deviation of the noise added to the servo action.
-    pub noise: f64,
-    /// Unrolls in a regression step.
-    pub minibatch_unrolls: usize,
-    /// Adam's learning rate while regressing.
-    pub learning_rate: f64,
-}
-
-impl Default for WarmStart {
-    fn default() -> Self {
-        Self { steps: 0, demonstration_steps: 32_768, noise: 0.1, minibatch_unrolls: 32, learning_rate: 1e-3 }
-    }
-}
-
 /// The learner as a service.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]

@@ -43,8 +43,6 @@ pub struct TaskPart {
     pub clips: usize,
     /// The largest reward of one step. Normalised rewards are divided by it.
     pub max_reward: f64,
-    /// Whether it has a reference. The reference's servo action is a demonstration.
-    pub demonstrated: bool,
 }
 
 impl Experiment {
@@ -95,13 +93,7 @@ impl TaskSpec {
         let observation = parameters.observations()?.iter().map(|(_, size)| size).sum();
         let draws = parameters.vision().is_some_and(|(_, vision)| vision != Vision::Off);
         let clips = if parameters.follows_clips() { clips } else { vec![name.clone()] };
-        let part = TaskPart {
-            name,
-            observation,
-            clips: clips.len(),
-            max_reward: parameters.max_reward(),
-            demonstrated: parameters.follows_clips(),
-        };
+        let part = TaskPart { name, observation, clips: clips.len(), max_reward: parameters.max_reward() };
         Ok(Self {
             proprioception: PROPRIOCEPTION_SIZE,
             task: observation,

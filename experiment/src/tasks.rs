@@ -123,7 +123,7 @@ pub(crate) trait TaskParameters {
         None
     }
 
-    /// Whether the task has a reference. It comes from the experiment's clips, and its servo action is a demonstration.
+    /// Whether the task has a reference, which comes from the experiment's clips.
     fn follows_clips(&self) -> bool {
         false
     }

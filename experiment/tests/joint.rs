@@ -13,7 +13,7 @@ fn the_joint_presets_have_the_papers_probabilities() {
 #[test]
 fn meaningless_joint_tasks_are_refused() {
     let refused = |joint: &str, other: &str| {
-        let overrides = [format!("joint=[{joint}]"), other.to_string(), "warm_start.steps=1".into()];
+        let overrides = [format!("joint=[{joint}]"), other.to_string()];
         resolve("quickstart", &overrides).unwrap_err().to_string()
     };
     let get_up = r#"{task="get-up", probability=0.1}"#;
@@ -26,7 +26,6 @@ fn meaningless_joint_tasks_are_refused() {
         (r#"{task="get-up", probability=0.5}, {task="ball-catch", probability=0.5}"#, "seed=1", "joint"),
         (r#"{task="gaps", probability=0.5}"#, "seed=1", "gaps.corridor.vision"),
         (get_up, "network.value_lstm=[8]", "network.value_lstm"),
-        (r#"{task="get-up", probability=0.1}"#, "task=go-to-target", "warm_start.steps"),
     ] {
         let error = refused(joint, other);
         assert!(error.contains(field), "{joint}, {other}: {error}");

@@ -55,8 +55,8 @@ fn defaults_are_the_papers() {
     assert_eq!((vmpo.gradient_steps, vmpo.minibatch_unrolls, vmpo.target_period), (1, 128, 100));
     assert_eq!((vmpo.entropy, optimiser.max_gradient_norm, vmpo.lambda), (0.0, 0.0, 1.0));
     // Additions to the paper are off.
-    let Experiment { warm_start, network, tracking, optimiser, .. } = Experiment::default();
-    assert_eq!((warm_start.steps, network.normaliser_steps, tracking.preset_actuators), (0, 0, false));
+    let Experiment { network, tracking, optimiser, .. } = Experiment::default();
+    assert_eq!((network.normaliser_steps, tracking.preset_actuators), (0, false));
     assert_eq!((network.initial_pose, network.latent.prior), (InitialPose::MidRange, Prior::Standard));
     assert_eq!((tracking.termination_error, optimiser.final_learning_rate_share), (TerminationError::DmControl, 1.0));
 }
@@ -85,8 +85,6 @@ fn contradictory_fields_are_refused() {
         let overrides: Vec<String> = overrides.iter().map(ToString::to_string).collect();
         resolve("quickstart", &overrides).unwrap_err().to_string()
     };
-    let error = refused(&["network.low_level=product", "warm_start.steps=1"]);
-    assert!(error.contains("warm_start.steps") && error.contains("product"), "{error}");
     let error = refused(&["vmpo.value_burn_in=2"]);
     assert!(error.contains("network.value_lstm"), "{error}");
     let error = refused(&["network.latent.size=0"]);
@@ -367,8 +365,6 @@ fn meaningless_values_are_refused_with_field_and_remedy() {
         ("unroll.ahead=2", "must be 0 or 1"),
         ("actor.threads=0", "must be 1 to 1024"),
         ("actor.environments=5000", "must be 1 to 4096"),
-        ("warm_start.noise=0.0", "must be at least 1e-6"),
-        ("warm_start.minibatch_unrolls=0", "must be at least 1"),
         ("learner.threads=0", "must be 1 to 1024"),
         ("learner.checkpoint_seconds=0.0", "must be positive"),
         ("learner.checkpoints_kept=0", "must be at least 1"),

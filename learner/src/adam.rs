@@ -108,16 +108,6 @@ impl Adam {
         }
     }
 
-    /// Sets moments and step counts to zero, and keeps the learning rates.
-    pub fn reset(&mut self) {
-        for group in &mut self.groups {
-            for moment in group.first.iter_mut().chain(&mut group.second) {
-                let _ = moment.zero_();
-            }
-            let _ = group.steps.zero_();
-        }
-    }
-
     /// One step of a group: θ ← θ − lr · m̂ / (√v̂ + ε), with gradients in the order of [`Adam::parameters`]. Where
     /// `counts`, a boolean scalar, is false, nothing changes, whatever the gradients are.
     pub fn step(&mut self, group: usize, gradients: &[Tensor], counts: &Tensor) {

@@ -49,14 +49,6 @@ pub trait Algorithm: Debug {
     /// [`Error::Shape`] when the minibatch belongs to another task or network; nothing changes then.
     fn step(&mut self, minibatch: &MinibatchTensors) -> Result<Losses, Error>;
 
-    /// One gradient step of the warm start: regression of the policy's mean towards the stored mean. Returns the report and
-    /// the latents z_t, `[B, T, Z]`, for [`MinibatchTensors::refresh_previous_latent`]. It is skipped where
-    /// [`step`](Self::step) would be.
-    ///
-    /// # Errors
-    /// As of [`step`](Self::step).
-    fn regress(&mut self, minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error>;
-
     /// Whether a new version of the parameters is due after update number `updates`, which took `steps` gradient steps.
     fn publishes_after(&self, updates: u64, steps: u64) -> bool;
 
@@ -69,12 +61,6 @@ pub trait Algorithm: Debug {
     /// Sets everything that follows a schedule, when the share `used` of the budget is used, 0 to 1. The learning rate of
     /// the networks is part of it.
     fn set_progress(&mut self, used: f64);
-
-    /// Sets the learning rate of the networks, until it is set again. Rates of other parameters are the algorithm's own.
-    fn set_learning_rate(&mut self, rate: f64);
-
-    /// Sets the optimiser's moments to zero, as between a warm start and training.
-    fn reset_optimiser(&mut self);
 
     /// Whether every parameter is a finite number; waits for the device.
     fn is_finite(&self) -> bool;

@@ -2,8 +2,8 @@
 //!
 //! A checkpoint is a directory `checkpoint-NNNNNNNNNN` (the number of updates) with one file per part and a
 //! `MANIFEST.json` that holds each part's SHA-256. It is written beside its final name, synced, renamed, and the parent
-//! synced, so a crash leaves either the whole checkpoint or none. Two more, `initial` and `warm-started`, are kept
-//! for comparison. `best.json` names the checkpoint with the best evaluation, which is also kept; the link `best` points
+//! synced, so a crash leaves either the whole checkpoint or none. One more, `initial`, is kept for
+//! comparison. `best.json` names the checkpoint with the best evaluation, which is also kept; the link `best` points
 //! to it.
 //!
 //! # Layout

@@ -4,7 +4,6 @@
 //! - [`trainer`] is the loop; the other modules own its parts and know nothing of it.
 //! - [`setup`] is what it begins with, and how it ends.
 //! - `state` is what changes and is saved: the algorithm, [`statistics`] of the observations, and the progress.
-//! - `warm_start` gathers demonstrations and regresses on them.
 //! - `versions` publishes parameters; `reports` counts and writes metrics; `budget` is the clock.
 //! - `skipped_steps` counts gradient steps that were skipped, and decides how to recover.
 //! - `checkpoints` decides when one is written, [`writer`] is the thread that writes.
@@ -18,5 +17,4 @@ mod state;
 pub mod statistics;
 pub mod trainer;
 mod versions;
-mod warm_start;
 pub mod writer;

@@ -13,8 +13,6 @@ use comic_learner::algorithm::loss_report::{LossValues, Losses};
 use comic_learner::device::Backend;
 use comic_learner::vmpo::VmpoLearner;
 use tch::Device;
-#[cfg(feature = "xla")]
-use vmpo_support::LENGTH;
 use vmpo_support::{Unrolls, every_low_level, joint_spec, learner_on, spec, state};
 
 const COUNT: usize = 12;
@@ -166,31 +164,5 @@ fn no_other_thread_runs_backward_passes() {
             let waits: u64 = field("voluntary_ctxt_switches:").parse().unwrap();
             assert!(waits < 5, "{} was woken {waits} times", field("Name:"));
         }
-    }
-}
-
-#[cfg(feature = "xla")]
-#[test]
-fn a_warm_start_compiles_nothing_twice_whatever_is_demonstrated() {
-    let of_two_tasks = |(_, _, spec): &(String, Experiment, TaskSpec)| spec.tasks.len() > 1;
-    for (name, experiment, spec) in experiments().into_iter().filter(of_two_tasks) {
-        let mut learner = learner_on(backend().device(), &spec, &experiment, 8);
-        let mut after_warm_up = 0;
-        for seed in 0..20 {
-            if seed == 3 {
-                after_warm_up = backend().compilations().unwrap();
-            }
-            let mut unrolls = Unrolls::recorded(&experiment, &spec, 2000 + seed, COUNT);
-            for (valid, _) in unrolls.valid.chunks_mut(LENGTH).zip(&unrolls.tasks).filter(|(_, task)| **task == 1) {
-                valid.fill(0.0);
-            }
-            let mut demonstrations = unrolls.minibatch_on(learner.device());
-            let order: Vec<usize> = (0..COUNT).rev().skip(4).collect();
-            let (losses, latents) = learner.regress(&demonstrations.select(&order)).unwrap();
-            demonstrations.refresh_previous_latent(&order, &latents);
-            backend().end_step().unwrap();
-            assert!(Losses::mean(&[losses]).unwrap().to_values().is_finite(), "{name}");
-        }
-        assert_eq!(backend().compilations().unwrap(), after_warm_up, "{name}: compiled after the warm-up");
     }
 }

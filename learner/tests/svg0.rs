@@ -21,7 +21,7 @@ const ACTION: usize = 2;
 static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
 fn spec() -> TaskSpec {
-    let task = TaskPart { name: "go-to-target".into(), observation: 2, clips: 1, max_reward: 1.0, demonstrated: false };
+    let task = TaskPart { name: "go-to-target".into(), observation: 2, clips: 1, max_reward: 1.0 };
     TaskSpec {
         proprioception: 3,
         task: 2,
@@ -217,6 +217,7 @@ fn the_action_value_of_a_chain_with_two_states_is_learned() {
     let mut experiment = experiment();
     experiment.unroll.length = 8;
     (experiment.optimiser.epsilon, experiment.optimiser.learning_rate) = (1e-8, 3e-3);
+    experiment.optimiser.final_learning_rate_share = 1.0 / 15.0;
     experiment.network.min_std = 0.3;
     experiment.network.initial_std = 0.7;
     let svg0 = &mut experiment.svg0;
@@ -231,7 +232,7 @@ fn the_action_value_of_a_chain_with_two_states_is_learned() {
     for step in 0..3000 {
         if step == 1500 {
             // Smaller steps, so that the estimate settles.
-            learner.set_learning_rate(2e-4);
+            learner.set_progress(1.0);
         }
         let mut sequences = Sequences::new(&experiment, 32, random.random());
         for sequence in 0..32 {

@@ -77,7 +77,7 @@ fn each_group_has_its_own_learning_rate() {
 }
 
 #[test]
-fn a_restored_adam_continues_bit_for_bit_and_a_reset_one_starts_again() {
+fn a_restored_adam_continues_bit_for_bit() {
     let make = |start: &Tensor| {
         let mut adam = Adam::new(&Optimiser::default());
         let learnt = start.detach().copy().set_requires_grad(true);
@@ -95,11 +95,6 @@ fn a_restored_adam_continues_bit_for_bit_and_a_reset_one_starts_again() {
         restored.step(0, &[gradient(step)], &counts(true));
     });
     assert_eq!(values(&learnt), values(&restored_parameter));
-    let (mut fresh, fresh_parameter) = make(&learnt);
-    adam.reset();
-    adam.step(0, &[gradient(9)], &counts(true));
-    fresh.step(0, &[gradient(9)], &counts(true));
-    assert_eq!(values(&learnt), values(&fresh_parameter));
 }
 
 /// The same update with its corrections computed on the host, in double precision.

@@ -1,4 +1,4 @@
-//! The learner over several steps: its state, the warm start, and that it learns.
+//! The learner over several steps: its state, and that it learns.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
@@ -10,7 +10,6 @@ use comic_learner::algorithm::error::Error;
 use comic_learner::algorithm::loss_report::Losses;
 use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::vmpo::VmpoLearner;
-use comic_proto::Field;
 use tch::{Kind, Tensor};
 use vmpo_support::{LENGTH, Numbers, UNROLLS, Unrolls, experiment, learner, state, values};
 
@@ -128,9 +127,6 @@ fn a_step_that_is_not_finite_changes_not_one_bit_and_is_reported() {
         let before = bits(&learner);
         let report = learner.step(&poisoned(9).minibatch()).unwrap().to_values();
         assert_eq!((report.steps, report.skipped, report.skipped_last), (1, 1, 1), "{report:?}");
-        let (report, latents) = learner.regress(&poisoned(9).minibatch()).unwrap();
-        assert_eq!(report.to_values().skipped, 1);
-        assert!(values(&latents).iter().all(|value| value.is_finite()));
         assert_eq!(bits(&learner), before);
         assert!(learner.is_finite());
     }
@@ -228,84 +224,4 @@ fn the_value_function_learns_its_targets() {
     assert!(last.get("value_loss").unwrap() < 0.2 * first.get("value_loss").unwrap(), "{first:?} {last:?}");
     let explained = last.get("variance_explained").unwrap();
     assert!(explained > 0.6 && explained <= 1.0, "{last:?}");
-}
-
-#[test]
-fn a_warm_start_moves_the_mean_to_the_demonstrations_and_leaves_deviation_and_multipliers() {
-    let mut learner = learner(&training(), 1);
-    let mut unrolls = unrolls(1);
-    unrolls.mean = [0.3f32, -0.4, 0.5].repeat(UNROLLS * LENGTH);
-    let minibatch = unrolls.minibatch();
-    let head = |learner: &VmpoLearner| values(&learner.policy_store().variables()["low_level.head.weight"].detach());
-    let multipliers = |learner: &VmpoLearner| values(&learner.multipliers().parameter().detach());
-    let (head_before, multipliers_before) = (head(&learner), multipliers(&learner));
-    let first = learner.regress(&minibatch).unwrap().0.to_values();
-    for _ in 0..200 {
-        let _ = learner.regress(&minibatch).unwrap();
-    }
-    let last = learner.regress(&minibatch).unwrap().0.to_values();
-    assert!(last.get("regression_loss").unwrap() < 0.05 * first.get("regression_loss").unwrap(), "{first:?} {last:?}");
-    assert!(last.get("value_loss").unwrap() < first.get("value_loss").unwrap());
-    let half = head_before.len() / 2;
-    assert_ne!(head(&learner)[..half], head_before[..half]);
-    assert_eq!(head(&learner)[half..], head_before[half..], "the deviation's head was trained");
-    assert_eq!(multipliers(&learner), multipliers_before);
-}
-
-#[test]
-fn a_warm_starts_masked_rows_change_nothing() {
-    let base = unrolls(1);
-    let mut other = base.clone();
-    let row = 2 * LENGTH + 4;
-    other.mean[row * 3..(row + 1) * 3].fill(50.0);
-    let after = |unrolls: &Unrolls| {
-        let mut learner = learner(&training(), 1);
-        let _ = learner.regress(&unrolls.minibatch()).unwrap();
-        state(&learner)
-    };
-    assert_eq!(after(&base), after(&other));
-}
-
-#[test]
-fn a_masked_unroll_has_no_more_influence_on_a_warm_start_than_an_absent_one() {
-    let all = unrolls(1);
-    let mut masked = all.clone();
-    masked.valid[3 * LENGTH..4 * LENGTH].fill(0.0);
-    let others: Vec<usize> = (0..UNROLLS).filter(|unroll| *unroll != 3).collect();
-    let regressed = |minibatch: &MinibatchTensors| {
-        let losses = learner(&training(), 1).regress(minibatch).unwrap().0.to_values();
-        ["regression_loss", "value_loss", "latent_kl", "total_loss", "gradient_norm"]
-            .map(|name| losses.get(name).unwrap())
-    };
-    let (masked, absent) = (regressed(&masked.minibatch()), regressed(&all.minibatch().select(&others)));
-    for (masked, absent) in masked.into_iter().zip(absent) {
-        assert!((masked - absent).abs() <= 1e-5 * absent.abs(), "{masked} and {absent}");
-    }
-    assert_ne!(regressed(&all.minibatch()), absent);
-}
-
-#[test]
-fn refreshed_demonstrations_carry_each_steps_own_latent_forward() {
-    let mut learner = learner(&training(), 1);
-    let unrolls = unrolls(1);
-    let mut all = unrolls.minibatch();
-    let indices = [5, 2];
-    let (_, latents) = learner.regress(&all.select(&indices)).unwrap();
-    assert_eq!(latents.size(), [2, LENGTH as i64, 2]);
-    all.refresh_previous_latent(&indices, &latents);
-    let previous = values(&all[Field::PreviousLatent]);
-    let latents = values(&latents);
-    let row = |unroll: usize, step: usize| &previous[(unroll * LENGTH + step) * 2..][..2];
-    let latent = |index: usize, step: usize| &latents[(index * LENGTH + step) * 2..][..2];
-    assert_eq!(row(5, 0), &unrolls.previous_latent[5 * LENGTH * 2..][..2], "the step before the unroll is unknown");
-    for step in 1..LENGTH {
-        assert_eq!(row(5, step), latent(0, step - 1));
-    }
-    // Unroll 2 ends an episode at row 4: nothing before it reaches the next episode's first row.
-    assert_eq!(row(2, 3), latent(1, 2));
-    assert_eq!(row(2, 4), [0.0, 0.0]);
-    assert_eq!(row(2, 5), [0.0, 0.0]);
-    assert_eq!(row(2, 6), latent(1, 5));
-    // The others are untouched.
-    assert_eq!(row(0, 3), &unrolls.previous_latent[3 * 2..][..2]);
 }

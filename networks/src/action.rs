@@ -84,18 +84,6 @@ impl ActionDistribution {
         }
     }
 
-    /// Σ ½ ((μ − target) / scale)², `[N]`, for targets `[N, A]`. For a mixture: the mean over the components with their
-    /// weights, so every component that acts aims at the target.
-    pub fn mean_error(&self, target: &Tensor, scale: f64) -> Tensor {
-        let error = |mean: &Tensor, target: &Tensor| sum_last(&((mean - target) / scale).square()) * 0.5;
-        match self {
-            Self::Gaussian(gaussian) => error(&gaussian.mean, target),
-            Self::Mixture { log_weights, components } => {
-                sum_last(&(log_weights.exp() * error(&components.mean, &target.unsqueeze(-2))))
-            }
-        }
-    }
-
     /// The differential entropy, `[N]`. A mixture's entropy has no closed form; for a mixture this is the entropy of
     /// (component, action), which is an upper bound.
     pub fn entropy(&self) -> Tensor {

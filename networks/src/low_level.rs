@@ -2,8 +2,8 @@
 //!
 //! Each low level is one file with one [`LowLevel`]; actor and learner do not depend on which one is used. A new low
 //! level needs a file, a line in [`build`] and a line in [`low_level_layers`]. In the experiment's `network.rs` it
-//! needs a name, its sizes, its number of components, the size of its state, whether it works without a bottleneck, and
-//! whether it can learn from demonstrations.
+//! needs a name, its sizes, its number of components, the size of its state, and whether it works without a
+//! bottleneck.
 
 mod interface;
 mod lstm;

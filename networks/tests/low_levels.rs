@@ -14,7 +14,7 @@ fn random(size: &[i64]) -> Tensor {
 }
 
 fn spec() -> TaskSpec {
-    let task = TaskPart { name: "tracking".into(), observation: 11, clips: 1, max_reward: 1.0, demonstrated: true };
+    let task = TaskPart { name: "tracking".into(), observation: 11, clips: 1, max_reward: 1.0 };
     TaskSpec { proprioception: 7, task: 11, action: 3, tasks: vec![task], ..TaskSpec::default() }
 }
 

@@ -18,13 +18,7 @@ fn store() -> nn::VarStore {
         reward_terms: vec!["a".into()],
         image: 0,
         clips: vec!["x".into()],
-        tasks: vec![TaskPart {
-            name: "tracking".into(),
-            observation: 4,
-            clips: 1,
-            max_reward: 1.0,
-            demonstrated: true,
-        }],
+        tasks: vec![TaskPart { name: "tracking".into(), observation: 4, clips: 1, max_reward: 1.0 }],
     };
     let mut network =
         Network { encoder: vec![8], mlp: Mlp { hidden: vec![8] }, normaliser_steps: 1, ..Network::default() };

@@ -19,13 +19,7 @@ fn spec() -> TaskSpec {
         reward_terms: vec!["a".into(), "b".into()],
         image: 0,
         clips: vec!["x".into(), "y".into(), "z".into()],
-        tasks: vec![TaskPart {
-            name: "tracking".into(),
-            observation: 11,
-            clips: 3,
-            max_reward: 1.0,
-            demonstrated: true,
-        }],
+        tasks: vec![TaskPart { name: "tracking".into(), observation: 11, clips: 3, max_reward: 1.0 }],
     }
 }
 

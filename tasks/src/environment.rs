@@ -96,8 +96,8 @@ pub trait Environment: Debug + Send {
         errors.clear();
     }
 
-    /// Writes the servo action: the action whose servos aim at the pose of the next reference frame. It is a demonstration
-    /// and a baseline. In a task without a reference the servos aim at the current pose.
+    /// Writes the servo action: the action whose servos aim at the pose of the next reference frame. It is a baseline.
+    /// In a task without a reference the servos aim at the current pose.
     fn servo_action(&self, action: &mut [f32]);
 }
 

@@ -16,7 +16,7 @@ pub const UPDATES: u64 = 6;
 /// At this rate a version of the small policy takes seconds, so a fault can come in the middle of the run.
 pub const SLOW_BYTES_PER_SECOND: f64 = 650_000.0;
 
-/// A run in lockstep with a warm start, a normaliser that is set twice, and updates that publish no new version.
+/// A run in lockstep with a normaliser that is set several times, and updates that publish no new version.
 ///
 /// # Errors
 /// When there is no directory or port.
@@ -30,14 +30,7 @@ pub fn lockstep(overrides: &[&str]) -> Result<System> {
 /// When there is no directory or port.
 pub fn lockstep_with(options: &[&str], overrides: &[&str]) -> Result<System> {
     let updates = format!("budget.updates={UPDATES}");
-    let fields = [
-        "warm_start.steps=10",
-        "warm_start.demonstration_steps=128",
-        "vmpo.target_period=2",
-        "vmpo.gradient_steps=2",
-        "vmpo.minibatch_unrolls=4",
-        updates.as_str(),
-    ];
+    let fields = ["vmpo.target_period=2", "vmpo.gradient_steps=2", "vmpo.minibatch_unrolls=4", updates.as_str()];
     let settings = fields.iter().chain(overrides).flat_map(|field| ["--set", *field]);
     System::new(
         &SMALL.into_iter().chain(["--lockstep"]).chain(options.iter().copied()).chain(settings).collect::<Vec<_>>(),

@@ -72,7 +72,7 @@ async fn on_a_full_disk_the_parameters_are_the_same() -> Result<()> {
     fill(&filler)?;
     let relay = Relay::start(system.address(), SLOW_BYTES_PER_SECOND).await?;
     let actor = system.start_actor_of(ALL, &relay.url)?;
-    // One is the warm start's checkpoint, the other one falls in the middle of training.
+    // One falls at the beginning of training, the other one in the middle.
     fill_until_refused(&mut system, &filler, 1).await?;
     let updates = |status: &Status| metric(status, "updates");
     system.until("an update", LIMIT, |status| (updates(status) >= 1.0).then_some(())).await?;

@@ -63,7 +63,7 @@ async fn low_level(directory: &Path, name: &str, fields: &[&str]) -> Result<Path
 /// Go-to-target with this frozen low level.
 fn transfer(low_level: &Path, fields: &[&str]) -> Result<System> {
     let low_level = format!("transfer.low_level={}", low_level.display());
-    let plain = ["task=go-to-target", "vmpo.action_gradient=0", "network.initial_pose=mid-range", "warm_start.steps=0"];
+    let plain = ["task=go-to-target", "vmpo.action_gradient=0", "network.initial_pose=mid-range"];
     short(&[&plain[..], &[low_level.as_str()], fields].concat())
 }
 

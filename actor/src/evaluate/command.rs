@@ -195,7 +195,7 @@ impl Evaluate {
         let shape = UnrollShape::new(task.spec(), &experiment);
         let mut policy =
             self.policy(&experiment, task.as_ref(), own.as_ref(), low_level.as_deref(), parameters.as_deref())?;
-        let mut controller = policy.as_mut().map_or(Controller::Servo { std: 0.0 }, Controller::Policy);
+        let mut controller = policy.as_mut().map_or(Controller::Servo, Controller::Policy);
         let recorder =
             self.video.as_ref().map(|out| Recorder::new(&self.look, out, task.control_timestep())).transpose()?;
         let mut follower = Follower { recorder, failed: None };

@@ -187,13 +187,7 @@ mod tests {
             reward_terms: vec!["pose".into(), "velocity".into()],
             image: 0,
             clips: vec!["walk".into(), "run".into(), "unused".into()],
-            tasks: vec![TaskPart {
-                name: "tracking".into(),
-                observation: 1,
-                clips: 3,
-                max_reward: 1.45,
-                demonstrated: true,
-            }],
+            tasks: vec![TaskPart { name: "tracking".into(), observation: 1, clips: 3, max_reward: 1.45 }],
         }
     }
 

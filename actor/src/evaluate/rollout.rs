@@ -289,7 +289,7 @@ mod tests {
         let (fallen, whole) = ((3, 10, 3.0), (10, 10, 10.0));
         let expected = [fallen, fallen, fallen, whole, whole, whole, whole];
         for environments in [1, 2] {
-            assert_eq!(episodes(&mut Controller::Servo { std: 0.0 }, environments), expected);
+            assert_eq!(episodes(&mut Controller::Servo, environments), expected);
         }
         // One environment at a time, or the latents' law could not be read off the steps.
         assert_eq!(episodes(&mut Controller::Policy(&mut Quarter), 1), expected);

@@ -152,7 +152,7 @@ impl Cast {
         let starts: Vec<Start> = self.starts.iter().copied().cycle().take(episodes).collect();
         let mut controller = match &mut self.policy {
             Some(policy) => Controller::Policy(policy),
-            None if self.name == TaskName::Tracking => Controller::Servo { std: 0.0 },
+            None if self.name == TaskName::Tracking => Controller::Servo,
             None => Controller::Zero,
         };
         roll_out(&mut controller, &self.task, &self.shape, &starts, &self.options, audience)

@@ -118,7 +118,7 @@ async fn watch(mut client: Client, request: WatchRequest, mut assembler: Assembl
             Ok(None) => {}
             Ok(Some(Assembled::RunOver)) => return Ended::Over,
             Ok(Some(Assembled::Act(directive))) => {
-                tracing::debug!(version = directive.version, behaviour = ?directive.behaviour, "new parameters");
+                tracing::debug!(version = directive.version, "new parameters");
                 mailbox.publish(directive);
             }
             Err(error) => return Ended::Lost(error.to_string()),

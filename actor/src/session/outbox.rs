@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-use comic_proto::v1::{UnrollAck, UnrollHeader, UnrollMessage, Verdict};
+use comic_proto::v1::{Behaviour, UnrollAck, UnrollHeader, UnrollMessage, Verdict};
 use tracing::Span;
 
 use crate::worker::FinishedUnroll;
@@ -112,7 +112,7 @@ impl Outbox {
             learner_epoch: unroll.learner_epoch,
             version: unroll.version,
             layout_hash: self.layout_hash.clone(),
-            behaviour: unroll.behaviour.into(),
+            behaviour: Behaviour::Policy.into(),
             episodes: unroll.episodes.clone(),
             environment: unroll.environment,
             task: unroll.task,
@@ -158,7 +158,6 @@ impl Outbox {
 #[cfg(test)]
 mod tests {
     use bytes::Bytes;
-    use comic_proto::v1::Behaviour;
 
     use super::*;
 
@@ -167,7 +166,6 @@ mod tests {
             payload: Bytes::new(),
             learner_epoch: 1,
             version: 1,
-            behaviour: Behaviour::Policy,
             episodes: Vec::new(),
             environment: 0,
             task: 0,

@@ -28,8 +28,7 @@ pub struct Assembler {
 struct Announced {
     learner_epoch: u64,
     version: u64,
-    /// Absent when the run is over.
-    behaviour: Option<Behaviour>,
+    run_over: bool,
     total: u64,
 }
 
@@ -49,7 +48,7 @@ impl Assembler {
         let announced = Announced {
             learner_epoch: chunk.learner_epoch,
             version: chunk.version,
-            behaviour: known_behaviour(chunk)?,
+            run_over: is_end_of_run(chunk)?,
             total: chunk.total,
         };
         if chunk.offset == 0 {
@@ -84,23 +83,22 @@ impl Assembler {
     }
 }
 
-fn known_behaviour(chunk: &ParametersChunk) -> Result<Option<Behaviour>, Error> {
-    if chunk.run_over {
-        return Ok(None);
+fn is_end_of_run(chunk: &ParametersChunk) -> Result<bool, Error> {
+    if chunk.run_over || chunk.behaviour() == Behaviour::Policy {
+        return Ok(chunk.run_over);
     }
-    match Behaviour::try_from(chunk.behaviour) {
-        Ok(Behaviour::Unspecified) | Err(_) => Err(malformed(format!("no such behaviour: {}", chunk.behaviour))),
-        Ok(behaviour) => Ok(Some(behaviour)),
-    }
+    Err(malformed(format!("no such behaviour: {}", chunk.behaviour)))
 }
 
 fn complete(announced: Announced, parameters: Bytes) -> Result<Assembled, Error> {
-    let Announced { learner_epoch, version, behaviour, .. } = announced;
-    let Some(behaviour) = behaviour else { return Ok(Assembled::RunOver) };
-    if behaviour == Behaviour::Policy && parameters.is_empty() {
+    let Announced { learner_epoch, version, run_over, .. } = announced;
+    if run_over {
+        return Ok(Assembled::RunOver);
+    }
+    if parameters.is_empty() {
         return Err(malformed("a policy without parameters".into()));
     }
-    Ok(Assembled::Act(Directive { learner_epoch, version, behaviour, parameters }))
+    Ok(Assembled::Act(Directive { learner_epoch, version, parameters }))
 }
 
 fn malformed(reason: String) -> Error {
@@ -137,8 +135,7 @@ mod tests {
                 prop_assert!(complete.is_none());
                 complete = assembler.push(&chunk(8, payload.len() as u64, (index * piece) as u64, data)).unwrap();
             }
-            let expected =
-                Directive { learner_epoch: 3, version: 8, behaviour: Behaviour::Policy, parameters: payload.into() };
+            let expected = Directive { learner_epoch: 3, version: 8, parameters: payload.into() };
             prop_assert_eq!(complete, Some(Assembled::Act(expected)));
         }
 
@@ -179,6 +176,7 @@ mod tests {
             (vec![chunk(1, 4, 0, b"")], "an empty piece"),
             (vec![chunk(1, 0, 0, b"")], "without parameters"),
             (vec![behaviour(0)], "no such behaviour"),
+            (vec![behaviour(2)], "no such behaviour"),
             (vec![behaviour(99)], "no such behaviour"),
         ] {
             let found = refused(&pieces).unwrap_or_default();
@@ -187,15 +185,10 @@ mod tests {
     }
 
     #[test]
-    fn the_end_of_the_run_and_a_demonstration_need_no_parameters() {
-        let empty = chunk(1, 0, 0, b"");
+    fn the_end_of_the_run_needs_no_parameters() {
         let mut assembler = Assembler::new(10);
-        let run_over = ParametersChunk { run_over: true, behaviour: Behaviour::Unspecified.into(), ..empty.clone() };
+        let behaviour = Behaviour::Unspecified.into();
+        let run_over = ParametersChunk { run_over: true, behaviour, ..chunk(1, 0, 0, b"") };
         assert_eq!(assembler.push(&run_over).unwrap(), Some(Assembled::RunOver));
-        let demonstration = ParametersChunk { behaviour: Behaviour::Demonstration.into(), ..empty };
-        assert!(matches!(
-            assembler.push(&demonstration).unwrap(),
-            Some(Assembled::Act(directive)) if directive.behaviour == Behaviour::Demonstration
-        ));
     }
 }

@@ -3,7 +3,7 @@
 mod learner;
 
 use bytes::Bytes;
-use comic_proto::v1::{Behaviour, Environments};
+use comic_proto::v1::Environments;
 
 use super::*;
 use crate::mailbox::Directive;
@@ -29,7 +29,6 @@ fn unroll(number: u64) -> FinishedUnroll {
         payload: Bytes::from(vec![7; 100]),
         learner_epoch: 1,
         version: number,
-        behaviour: Behaviour::Policy,
         episodes: Vec::new(),
         environment: 0,
         task: 0,
@@ -169,13 +168,8 @@ async fn without_acknowledgements_the_actor_stops_at_its_window() {
 async fn parameters_reach_the_mailbox_and_the_end_of_the_run_ends_the_session() {
     let learner = FakeLearner::start(Script::default()).await;
     let running = start(&learner).await;
-    learner.publish(Behaviour::Policy, 5, b"parameters in pieces");
-    let expected = Directive {
-        learner_epoch: 1,
-        version: 5,
-        behaviour: Behaviour::Policy,
-        parameters: Bytes::from_static(b"parameters in pieces"),
-    };
+    learner.publish(5, b"parameters in pieces");
+    let expected = Directive { learner_epoch: 1, version: 5, parameters: Bytes::from_static(b"parameters in pieces") };
     assert_eq!(*first_directive(&running.mailbox).await, expected);
     learner.end_run(6);
     assert!(running.session.await.unwrap().unwrap().over);
@@ -185,9 +179,9 @@ async fn parameters_reach_the_mailbox_and_the_end_of_the_run_ends_the_session() 
 async fn parameters_that_break_the_protocol_end_only_the_connection() {
     let learner = FakeLearner::start(Script::default()).await;
     let running = start(&learner).await;
-    learner.publish(Behaviour::Policy, 5, &[1; 2000]);
+    learner.publish(5, &[1; 2000]);
     learner.until(|seen| seen.joins.len() >= 2).await;
-    learner.publish(Behaviour::Policy, 6, b"small enough");
+    learner.publish(6, b"small enough");
     assert_eq!(first_directive(&running.mailbox).await.version, 6);
     running.session.abort();
 }

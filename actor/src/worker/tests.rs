@@ -121,8 +121,8 @@ fn layout(length: usize) -> Arc<UnrollLayout> {
     }))
 }
 
-fn directive(version: u64, behaviour: Behaviour) -> Arc<Directive> {
-    Arc::new(Directive { learner_epoch: 7, version, behaviour, parameters: Bytes::from(vec![version as u8]) })
+fn directive(version: u64) -> Arc<Directive> {
+    Arc::new(Directive { learner_epoch: 7, version, parameters: Bytes::from(vec![version as u8]) })
 }
 
 /// Reads an unroll as the learner does, by the layout.
@@ -167,8 +167,8 @@ fn record_from(
 ) -> (Arc<UnrollLayout>, Vec<Vec<FinishedUnroll>>) {
     let layout = layout(length);
     let counters = environments.iter().map(|lengths| Counter::new(lengths)).collect();
-    let mut worker = Worker::new(counters, Plain::default(), Arc::clone(&layout), 0.1, first, 3).unwrap();
-    worker.adopt(&directive(0, Behaviour::Policy)).unwrap();
+    let mut worker = Worker::new(counters, Plain::default(), Arc::clone(&layout), first, 3).unwrap();
+    worker.adopt(&directive(0)).unwrap();
     let mut recorded = vec![Vec::new(); environments.len()];
     for _ in 0..unrolls {
         let finished = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap();
@@ -183,8 +183,8 @@ fn record_from(
 fn record_tasks(length: usize, lengths: &[usize], tasks: &[usize]) -> (Arc<UnrollLayout>, Vec<FinishedUnroll>) {
     let layout = layout(length);
     let environment = Counter { tasks: tasks.to_vec(), ..Counter::new(lengths) };
-    let mut worker = Worker::new(vec![environment], Plain::default(), Arc::clone(&layout), 0.1, 0, 3).unwrap();
-    worker.adopt(&directive(0, Behaviour::Policy)).unwrap();
+    let mut worker = Worker::new(vec![environment], Plain::default(), Arc::clone(&layout), 0, 3).unwrap();
+    worker.adopt(&directive(0)).unwrap();
     let unrolls = (0..12).flat_map(|_| worker.unroll(&|| false, &Progress::default()).unwrap().unwrap()).collect();
     (layout, unrolls)
 }
@@ -330,7 +330,7 @@ proptest! {
                 layout_hash: layout.hash().to_vec(),
                 episodes: unroll.episodes.clone(),
                 task: unroll.task,
-                behaviour: unroll.behaviour.into(),
+                behaviour: comic_proto::v1::Behaviour::Policy.into(),
                 ..Default::default()
             };
             let checked = comic_proto::Expected { clips: &[1, 1, 1], epoch: 0, newest_version: 0 };
@@ -381,9 +381,8 @@ proptest! {
 #[test]
 fn the_unroll_records_the_unclipped_action_and_the_simulator_sees_the_clipped_one() {
     let layout = layout(32);
-    let mut worker =
-        Worker::new(vec![Counter::new(&[1000])], Plain::default(), Arc::clone(&layout), 0.1, 0, 3).unwrap();
-    worker.adopt(&directive(1, Behaviour::Policy)).unwrap();
+    let mut worker = Worker::new(vec![Counter::new(&[1000])], Plain::default(), Arc::clone(&layout), 0, 3).unwrap();
+    worker.adopt(&directive(1)).unwrap();
     let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
     let rows = Rows { layout: &layout, payload: &unroll.payload };
     let beyond = (0..32).filter(|t| rows.one(Field::Action, *t) > 1.0).count();
@@ -398,30 +397,13 @@ fn the_unroll_records_the_unclipped_action_and_the_simulator_sees_the_clipped_on
 #[test]
 fn parameters_change_at_unroll_boundaries_only_and_the_header_names_them() {
     let layout = layout(5);
-    let mut worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), Arc::clone(&layout), 0.1, 0, 3).unwrap();
+    let mut worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), Arc::clone(&layout), 0, 3).unwrap();
     for version in 1..4 {
-        worker.adopt(&directive(version, Behaviour::Policy)).unwrap();
+        worker.adopt(&directive(version)).unwrap();
         let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
         let rows = Rows { layout: &layout, payload: &unroll.payload };
-        assert_eq!((unroll.learner_epoch, unroll.version, unroll.behaviour), (7, version, Behaviour::Policy));
+        assert_eq!((unroll.learner_epoch, unroll.version), (7, version));
         assert!((0..5).all(|t| rows.one(Field::Mean, t) == version as f32));
-    }
-}
-
-#[test]
-fn a_demonstration_is_the_servo_action_with_noise_and_no_latent() {
-    let layout = layout(8);
-    let mut worker = Worker::new(vec![Counter::new(&[5])], Plain::default(), Arc::clone(&layout), 0.25, 0, 3).unwrap();
-    worker.adopt(&directive(9, Behaviour::Demonstration)).unwrap();
-    let unroll = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap().remove(0);
-    let rows = Rows { layout: &layout, payload: &unroll.payload };
-    assert_eq!(unroll.behaviour, Behaviour::Demonstration);
-    for t in (0..8).filter(|t| rows.one(Field::Valid, *t) == 1.0) {
-        assert_eq!(rows.one(Field::Mean, t), rows.place(t).1 as f32 / 1000.0);
-        assert_eq!(rows.one(Field::Std, t), 0.25);
-        assert_ne!(rows.one(Field::Action, t), rows.one(Field::Mean, t));
-        assert_eq!(rows.row(Field::PreviousLatent, t), [0.0, 0.0]);
-        assert_ne!(rows.row(Field::LatentNoise, t), [0.0, 0.0]);
     }
 }
 

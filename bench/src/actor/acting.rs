@@ -13,7 +13,6 @@ use comic_actor::policy::TorchPolicy;
 use comic_actor::worker::{Progress, Worker};
 use comic_clips::Catalogue;
 use comic_experiment::seed::derive;
-use comic_proto::v1::Behaviour;
 use comic_proto::{UnrollLayout, UnrollShape};
 use comic_tasks::raw_physics::RawPhysics;
 use comic_tasks::{Environment, Simulated};
@@ -95,8 +94,8 @@ fn worker<E: Environment>(subject: &Subject, environments: Vec<E>, seed: u64) ->
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, experiment)));
     let policy = TorchPolicy::untrained(spec, experiment, None, seed, || Ok([0.0; 56]))?;
     let parameters = Bytes::from(policy.to_parameters()?);
-    let mut worker = Worker::new(environments, policy, layout, 0.0, 0, seed)?;
-    worker.adopt(&Arc::new(Directive { learner_epoch: 1, version: 1, behaviour: Behaviour::Policy, parameters }))?;
+    let mut worker = Worker::new(environments, policy, layout, 0, seed)?;
+    worker.adopt(&Arc::new(Directive { learner_epoch: 1, version: 1, parameters }))?;
     Ok(worker)
 }
 

@@ -106,7 +106,6 @@ fn still_unroll(layout: &UnrollLayout) -> FinishedUnroll {
         payload,
         learner_epoch: 1,
         version: 1,
-        behaviour: Behaviour::Policy,
         episodes: Vec::new(),
         environment: 0,
         task: 0,

@@ -154,22 +154,6 @@ impl MinibatchTensors {
         let indices: Vec<i64> = unrolls.iter().map(|unroll| *unroll as i64).collect();
         Tensor::from_slice(&indices).to_device(self.device())
     }
-
-    /// Replaces z_{t−1} of M unrolls by `latents`, z_t as recomputed for them, `[M, T, Z]`. Row t takes z_{t−1}; an
-    /// episode's first row takes zeros; row 0 keeps its value, because the step before it is not part of the unroll.
-    pub fn refresh_previous_latent(&mut self, unrolls: &[usize], latents: &Tensor) {
-        let indices = &self.indices(unrolls);
-        tch::no_grad(|| {
-            let steps = latents.size()[1] - 1;
-            let stored = self.fields[Field::PreviousLatent].index_select(0, indices);
-            let within = 1.0 - self.fields[Field::First].index_select(0, indices).narrow(1, 1, steps);
-            let valid = self.fields[Field::Valid].index_select(0, indices).narrow(1, 1, steps);
-            let kept: Tensor = within * valid;
-            let moved = latents.narrow(1, 0, steps) * kept.unsqueeze(-1);
-            let refreshed = Tensor::cat(&[stored.narrow(1, 0, 1), moved], 1);
-            let _ = self.fields[Field::PreviousLatent].index_copy_(0, indices, &refreshed);
-        });
-    }
 }
 
 /// A batch of unrolls of any of `tasks` tasks on the device.
@@ -177,21 +161,8 @@ impl MinibatchTensors {
 /// # Errors
 /// When the device refuses.
 pub(crate) fn to_device(batch: &Batch, tasks: usize, device: Device) -> Result<MinibatchTensors, Error> {
-    masked_to_device(batch, batch.f32(Field::Valid), tasks, device)
-}
-
-/// As [`to_device`], with `valid`, `[B, T]`, in place of the batch's own: a row counts only where it is 1.
-///
-/// # Errors
-/// When the device refuses.
-pub(crate) fn masked_to_device(
-    batch: &Batch,
-    valid: &[f32],
-    tasks: usize,
-    device: Device,
-) -> Result<MinibatchTensors, Error> {
     let shape = MinibatchShape { unrolls: batch.unrolls, tasks, unroll: *batch.layout.shape() };
-    let floats = PerField::from_fn(|field| if field == Field::Valid { valid } else { batch.f32(field) });
+    let floats = PerField::from_fn(|field| batch.f32(field));
     let source = MinibatchSource { floats, clip: batch.clip(), image: batch.image(), tasks: &batch.tasks() };
     MinibatchTensors::new(&source, &shape, device)
 }

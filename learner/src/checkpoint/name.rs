@@ -10,8 +10,6 @@ use crate::error::{Error, Result};
 pub enum Name {
     /// Before any learning; kept.
     Initial,
-    /// After the warm start, before training; kept.
-    WarmStarted,
     /// After so many updates; the newest few are kept.
     Updates(u64),
 }
@@ -21,7 +19,6 @@ impl Name {
     pub(super) fn parse(text: &str) -> Option<Self> {
         match text {
             "initial" => Some(Self::Initial),
-            "warm-started" => Some(Self::WarmStarted),
             _ => {
                 let digits = text.strip_prefix("checkpoint-")?;
                 let well_formed = digits.len() == 10 && digits.bytes().all(|byte| byte.is_ascii_digit());
@@ -40,7 +37,6 @@ impl std::fmt::Display for Name {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Initial => f.write_str("initial"),
-            Self::WarmStarted => f.write_str("warm-started"),
             Self::Updates(updates) => write!(f, "checkpoint-{updates:010}"),
         }
     }

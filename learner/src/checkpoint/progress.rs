@@ -26,8 +26,6 @@ pub(crate) struct Progress {
     pub(crate) seconds: f64,
     /// The newest published version.
     pub(crate) version: u64,
-    /// Whether the warm start is over, or was never wanted.
-    pub(crate) warm_started: bool,
     /// Decides the minibatches.
     pub(crate) random: Pcg64,
 }

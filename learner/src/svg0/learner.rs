@@ -238,10 +238,6 @@ impl Algorithm for Svg0Learner {
         Ok(Losses::pack(named, &none, &finite))
     }
 
-    fn regress(&mut self, _minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error> {
-        Err(Error::Unsupported("SVG(0) has no warm start"))
-    }
-
     fn set_normaliser(&mut self, statistics: &NormaliserStatistics) -> Result<(), Error> {
         self.online.policy.set_normaliser(statistics)?;
         Ok(self.target.policy.set_normaliser(statistics)?)
@@ -255,15 +251,8 @@ impl Algorithm for Svg0Learner {
 
     fn set_progress(&mut self, used: f64) {
         let share = self.experiment.optimiser.final_learning_rate_share;
-        self.set_learning_rate(self.experiment.optimiser.learning_rate * (1.0 - (1.0 - share) * used.clamp(0.0, 1.0)));
-    }
-
-    fn set_learning_rate(&mut self, rate: f64) {
+        let rate = self.experiment.optimiser.learning_rate * (1.0 - (1.0 - share) * used.clamp(0.0, 1.0));
         self.adam.set_learning_rate(self.group, rate);
-    }
-
-    fn reset_optimiser(&mut self) {
-        self.adam.reset();
     }
 
     fn is_finite(&self) -> bool {

@@ -71,16 +71,11 @@ impl Reports {
         environment_steps
     }
 
-    /// Counts the episodes of a batch, and the ages of its unrolls where `version` is the newest.
-    pub(super) fn count_episodes(&mut self, batch: &Batch, version: u64) {
-        self.metrics.count_episodes(batch.headers(), version);
-    }
-
     /// Counts an update on a batch whose parameters were `version`; the duration is counted by
     /// [`count_duration`](Self::count_duration).
     pub(super) fn count_update(&mut self, batch: &Batch, version: u64) {
         self.metrics.count_update();
-        self.count_episodes(batch, version);
+        self.metrics.count_episodes(batch.headers(), version);
     }
 
     /// Counts the duration of an update on unrolls of these ages, in versions.

@@ -42,7 +42,6 @@ impl State {
             environment_steps: 0,
             seconds: 0.0,
             version: 0,
-            warm_started: experiment.warm_start.steps == 0,
             random: Pcg64::seed_from_u64(experiment.seed),
         };
         let target = Bytes::from(algorithm.policy_parameters()?);

@@ -197,13 +197,7 @@ mod tests {
 
     /// Two tasks of one clip each.
     fn spec() -> TaskSpec {
-        let part = |name: &str| TaskPart {
-            name: name.into(),
-            observation: 1,
-            clips: 1,
-            max_reward: 1.0,
-            demonstrated: name == "tracking",
-        };
+        let part = |name: &str| TaskPart { name: name.into(), observation: 1, clips: 1, max_reward: 1.0 };
         TaskSpec {
             proprioception: 1,
             task: 1,

@@ -22,12 +22,9 @@ use crate::train::setup::{Ending, Setup};
 use crate::train::skipped_steps::{Recovery, SkippedSteps, remedies};
 use crate::train::state::State;
 use crate::train::versions::Versions;
-use crate::train::warm_start::WarmStart;
 
 /// How often a trainer without batches looks at the clock.
 const PATIENCE: Duration = Duration::from_millis(500);
-/// Steps of the warm start between two reports.
-const REPORTED_STEPS: u64 = 50;
 
 /// Learns from batches until the budget is used up or the batcher is closed.
 #[derive(Debug)]
@@ -85,7 +82,7 @@ impl Trainer {
         Ok(trainer)
     }
 
-    /// Demonstrations and regression if the experiment wants them, then training, then a last checkpoint.
+    /// Trains, and writes a last checkpoint.
     ///
     /// # Errors
     /// When gradient steps are still skipped after the last good state was restored, or when the disk refuses.
@@ -107,9 +104,6 @@ impl Trainer {
     }
 
     fn train(&mut self) -> Result<Ending> {
-        if !self.state.progress.warm_started && !self.warm_start()? {
-            return Ok(Ending::Stopped);
-        }
         match self.state.progress.version {
             0 => self.publish(Behaviour::Policy)?,
             _ => self.versions.announce(&self.state, Behaviour::Policy),
@@ -188,73 +182,6 @@ impl Trainer {
         self.experience.release();
         self.backend.end_step()?;
         Ok((steps, losses))
-    }
-
-    /// Gathers demonstrations, regresses on them, and writes the checkpoint `warm-started`. Returns false if the learner was
-    /// asked to stop before that; the next start then begins again.
-    fn warm_start(&mut self) -> Result<bool> {
-        let mut warm_start = WarmStart::new(&self.experiment, &self.spec);
-        self.publish(Behaviour::Demonstration)?;
-        tracing::info!(steps = self.experiment.warm_start.demonstration_steps, "gathering demonstrations");
-        while !warm_start.is_complete() {
-            match self.next_batch()? {
-                Next::Batch(batch) => self.gather(&mut warm_start, batch)?,
-                Next::Elapsed => {}
-                Next::Closed => return Ok(false),
-            }
-        }
-        if self.experiment.network.normaliser_steps > 0 {
-            self.state.set_normaliser()?;
-        }
-        // The state before this one has no scale of the observations, so it is of no use as a good one.
-        let good = self.snapshot()?;
-        self.checkpoints.set_good(good);
-        self.regress(&mut warm_start)
-    }
-
-    fn gather(&mut self, warm_start: &mut WarmStart, batch: Batch) -> Result<()> {
-        warm_start.gather(&batch, self.backend.device())?;
-        self.state.statistics.absorb(&batch);
-        self.reports.count_episodes(&batch, 0);
-        if !warm_start.is_complete() {
-            self.versions.repeat(&mut self.state, Behaviour::Demonstration);
-        }
-        self.account(batch);
-        Ok(())
-    }
-
-    fn regress(&mut self, warm_start: &mut WarmStart) -> Result<bool> {
-        let steps = self.experiment.warm_start.steps;
-        tracing::info!(steps, "regressing on them");
-        let mut step = 0;
-        // If the last step was skipped, more steps follow: a state that is not sound would not be published.
-        while step < steps || !self.is_sound() {
-            let State { algorithm, progress, .. } = &mut self.state;
-            algorithm.set_learning_rate(self.experiment.warm_start.learning_rate);
-            self.service.beat();
-            warm_start.regress(algorithm.as_mut(), &mut progress.random)?;
-            self.backend.end_step()?;
-            let reported = step.is_multiple_of(REPORTED_STEPS) || step + 1 >= steps;
-            if let Some(losses) = reported.then(|| warm_start.take_losses()).flatten() {
-                let losses = losses.to_values();
-                let (regression, latent_kl) = (losses.get("regression_loss"), losses.get("latent_kl"));
-                tracing::info!(step, regression, latent_kl, "regressing");
-                if self.report(&losses)? {
-                    step = 0;
-                    continue;
-                }
-            }
-            step += 1;
-            self.write_metrics_when_due()?;
-            if self.batcher.is_closed() {
-                return Ok(false);
-            }
-        }
-        self.state.algorithm.reset_optimiser();
-        self.state.progress.warm_started = true;
-        self.publish(Behaviour::Policy)?;
-        self.write_checkpoint_if_sound(Name::WarmStarted)?;
-        Ok(true)
     }
 
     fn next_batch(&mut self) -> Result<Next> {

@@ -17,7 +17,7 @@ use crate::algorithm::stores::{named, trainable};
 use crate::algorithm::{Algorithm, made_on};
 use crate::vmpo::improvement::{Evidence, KlLimits, policy_improvement};
 use crate::vmpo::multipliers::Multipliers;
-use crate::vmpo::report::{Descent, Pass, Terms, report};
+use crate::vmpo::report::{Descent, Pass, report};
 use crate::vmpo::returns::returns;
 
 /// The online networks, the multipliers and Adam.
@@ -185,14 +185,12 @@ impl VmpoLearner {
     }
 
     /// Clips the networks' gradients if the experiment says so, and steps networks and multipliers if every number is finite.
-    fn descend(&mut self, total: &Tensor, networks: Vec<Tensor>, multipliers: Option<Vec<Tensor>>) -> Descent {
+    fn descend(&mut self, total: &Tensor, networks: Vec<Tensor>, multipliers: Vec<Tensor>) -> Descent {
         let networks = Gradients::new(&self.adam, self.networks_group, networks);
         let norm = networks.norm();
-        let mut groups = vec![networks.clipped(self.experiment.optimiser.max_gradient_norm)];
-        if let Some(multipliers) = multipliers {
-            groups.push(Gradients::new(&self.adam, self.multipliers_group, multipliers));
-        }
-        let finite = descend(&mut self.adam, total, &groups);
+        let networks = networks.clipped(self.experiment.optimiser.max_gradient_norm);
+        let multipliers = Gradients::new(&self.adam, self.multipliers_group, multipliers);
+        let finite = descend(&mut self.adam, total, &[networks, multipliers]);
         self.multipliers.project();
         Descent { norm, finite }
     }
@@ -238,37 +236,8 @@ impl Algorithm for VmpoLearner {
         let inputs: Vec<&Tensor> = networks.iter().chain([self.multipliers.parameter()]).collect();
         let mut gradients = Tensor::f_run_backward(&[&total], &inputs, false, false)?;
         let multipliers = gradients.split_off(networks.len());
-        let descent = self.descend(&total, gradients, Some(multipliers));
-        Ok(report(
-            &pass,
-            &descent,
-            Terms { total: &total, improvement: Some(&improvement), regression: None },
-            &self.multipliers,
-        ))
-    }
-
-    /// Mean over valid steps of Σ ½ ((μ_θ − μ_stored) / initial_std)², with β times the latent's KL; the value function as
-    /// in [`step`](Algorithm::step). The policy's standard deviation gets no gradient.
-    fn regress(&mut self, minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error> {
-        minibatch.check(&self.spec, &self.experiment)?;
-        let pass = self.forward(minibatch);
-        let Experiment { network, vmpo, .. } = &self.experiment;
-        let errors = pass.acting.action.mean_error(&pass.behaviour.mean(), network.initial_std);
-        let regression = masked_mean(&errors, &pass.valid);
-        let total = &regression + &pass.value_loss * vmpo.value_weight + &pass.latent_kl * network.latent.beta;
-        let gradients = Tensor::f_run_backward(&[&total], self.adam.parameters(self.networks_group), false, false)?;
-        let descent = self.descend(&total, gradients, None);
-        let shape = minibatch.shape();
-        let sizes = [shape.unrolls, shape.unroll.length, shape.unroll.latent].map(|size| size as i64);
-        // NaN must not stay in the demonstrations.
-        let latents = pass.acting.latent.detach().reshape(sizes).nan_to_num(0.0, 0.0, 0.0);
-        let losses = report(
-            &pass,
-            &descent,
-            Terms { total: &total, improvement: None, regression: Some(&regression) },
-            &self.multipliers,
-        );
-        Ok((losses, latents))
+        let descent = self.descend(&total, gradients, multipliers);
+        Ok(report(&pass, &descent, &total, &improvement, &self.multipliers))
     }
 
     fn publishes_after(&self, updates: u64, _: u64) -> bool {
@@ -279,22 +248,14 @@ impl Algorithm for VmpoLearner {
         Ok(self.policy.set_normaliser(statistics)?)
     }
 
-    /// The multipliers keep the experiment's rate.
-    fn set_learning_rate(&mut self, rate: f64) {
-        self.set_learning_rates(rate, self.experiment.optimiser.multiplier_learning_rate);
-    }
-
-    /// The learning rate of the networks, and the standard deviation of the actions.
+    /// The learning rate of the networks, and the standard deviation of the actions. The multipliers keep the experiment's
+    /// rate.
     fn set_progress(&mut self, used: f64) {
         let Experiment { network, optimiser, .. } = &self.experiment;
         let used = used.clamp(0.0, 1.0);
         let rate = optimiser.learning_rate * (1.0 - (1.0 - optimiser.final_learning_rate_share) * used);
         self.policy.set_scheduled_std(network.initial_std * (network.final_std / network.initial_std).powf(used));
-        self.set_learning_rate(rate);
-    }
-
-    fn reset_optimiser(&mut self) {
-        self.adam.reset();
+        self.set_learning_rates(rate, optimiser.multiplier_learning_rate);
     }
 
     fn is_finite(&self) -> bool {

@@ -37,43 +37,36 @@ pub(super) struct Descent {
     pub(super) finite: Tensor,
 }
 
-/// The losses of a V-MPO step (with `improvement`) or of a regression step (with `regression`).
-pub(super) struct Terms<'a> {
-    /// The loss that was differentiated.
-    pub(super) total: &'a Tensor,
-    pub(super) improvement: Option<&'a Improvement>,
-    pub(super) regression: Option<&'a Tensor>,
-}
-
-/// The report of a step after which the multipliers are these.
-pub(super) fn report(pass: &Pass, descent: &Descent, terms: Terms<'_>, multipliers: &Multipliers) -> Losses {
-    let Terms { total, improvement, regression } = terms;
+/// The report of a step that differentiated `total`, and after which the multipliers are these.
+pub(super) fn report(
+    pass: &Pass,
+    descent: &Descent,
+    total: &Tensor,
+    improvement: &Improvement,
+    multipliers: &Multipliers,
+) -> Losses {
     tch::no_grad(|| {
         let zero = Tensor::zeros([1], (Kind::Float, pass.valid.device()));
-        let of = |entry: fn(&Improvement) -> &Tensor| improvement.map_or(&zero, entry);
         let temperatures = multipliers.temperatures();
         let [alpha_mean, alpha_std] = [multipliers.alpha_mean(), multipliers.alpha_std()];
         let alpha_discrete = multipliers.alpha_discrete();
-        let kl_weights = improvement.and_then(|improvement| improvement.kl_weights.as_ref());
         let std = pass.acting.action.std().mean_dim(-1i64, false, Kind::Float);
         let named = [
             // The loss that was differentiated.
             ("total_loss", total),
             // L_π, L_η and L_α.
-            ("policy_loss", of(|improvement| &improvement.policy)),
-            ("temperature_loss", of(|improvement| &improvement.temperature)),
-            ("alpha_loss", of(|improvement| &improvement.alpha)),
+            ("policy_loss", &improvement.policy),
+            ("temperature_loss", &improvement.temperature),
+            ("alpha_loss", &improvement.alpha),
             // ½ (V − G)², mean over valid steps, summed over reward terms.
             ("value_loss", &pass.value_loss),
-            // 0 in a V-MPO step.
-            ("regression_loss", regression.unwrap_or(&zero)),
             // KL of the latent to its prior, nats a step.
             ("latent_kl", &pass.latent_kl),
             // Mean KL_μ and KL_Σ to the behaviour policy, and that of a mixture's weights (0 for one Gaussian), nats a
             // step.
-            ("kl_mean", of(|improvement| &improvement.kl_mean)),
-            ("kl_std", of(|improvement| &improvement.kl_std)),
-            ("kl_weights", kl_weights.unwrap_or(&zero)),
+            ("kl_mean", &improvement.kl_mean),
+            ("kl_std", &improvement.kl_std),
+            ("kl_weights", improvement.kl_weights.as_ref().unwrap_or(&zero)),
             // η after the step; the mean if there are several.
             ("temperature", &temperatures.mean(Kind::Float)),
             // α_μ, α_Σ and α_discrete (0 for one Gaussian) after the step.
@@ -86,7 +79,7 @@ pub(super) fn report(pass: &Pass, descent: &Descent, terms: Terms<'_>, multiplie
             ("gradient_norm", &descent.norm),
             // 1 − Var(G − V) / Var(G), of the return summed over reward terms.
             ("variance_explained", &variance_explained(pass)),
-            // Fraction of the rows that are transitions, and in a warm start are demonstrated.
+            // Fraction of the rows that are transitions.
             ("valid_share", &pass.valid_share),
         ];
         Losses::pack(named, &temperatures, &descent.finite)

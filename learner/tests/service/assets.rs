@@ -81,7 +81,7 @@ fn offer(folder: &Path, updates: u64, policy: &str) -> Offer {
     let random = serde_json::to_string(&Pcg64::seed_from_u64(1)).unwrap();
     let progress = format!(
         r#"{{"run": 7, "epoch": 3, "updates": {updates}, "environment_steps": 70, "seconds": 2.5, "version": 9,
-            "warm_started": true, "random": {random}}}"#
+            "random": {random}}}"#
     );
     let mut snapshot = Snapshot::default();
     for (name, text) in [("progress.json", progress.as_str()), ("experiment.toml", ""), ("policy.safetensors", policy)]

@@ -30,13 +30,7 @@ pub(crate) fn spec() -> TaskSpec {
         reward_terms: vec!["near".into(), "far".into()],
         image: 0,
         clips: vec!["walk".into(), "run".into(), "jump".into()],
-        tasks: vec![TaskPart {
-            name: "tracking".into(),
-            observation: WIDTHS.task,
-            clips: 3,
-            max_reward: 1.0,
-            demonstrated: true,
-        }],
+        tasks: vec![TaskPart { name: "tracking".into(), observation: WIDTHS.task, clips: 3, max_reward: 1.0 }],
     }
 }
 
@@ -45,7 +39,7 @@ pub(crate) fn joint_spec() -> TaskSpec {
     let mut spec = spec();
     spec.reward_terms = vec!["reward".into()];
     spec.clips.push("lie".into());
-    spec.tasks.push(TaskPart { name: "get-up".into(), observation: 2, clips: 1, max_reward: 1.0, demonstrated: false });
+    spec.tasks.push(TaskPart { name: "get-up".into(), observation: 2, clips: 1, max_reward: 1.0 });
     spec
 }
 

@@ -58,8 +58,7 @@ impl RunDirectory {
     /// The policies that exist, each with its name.
     pub(super) fn policies(&self) -> Vec<(&'static str, PathBuf)> {
         let checkpoints = self.0.join("checkpoints");
-        let mut policies =
-            vec![("untrained", checkpoints.join("initial")), ("warm-started", checkpoints.join("warm-started"))];
+        let mut policies = vec![("untrained", checkpoints.join("initial"))];
         let newest = fs::read_dir(&checkpoints).into_iter().flatten().flatten().map(|entry| entry.path());
         let newest = newest
             .filter(|path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("checkpoint-")))

@@ -109,20 +109,20 @@ impl FakeLearner {
         self.inner.experiment.lock().unwrap().seed += 1;
     }
 
-    pub(super) fn publish(&self, behaviour: Behaviour, version: u64, parameters: &[u8]) {
-        self.send_parameters(behaviour, version, parameters, false);
+    pub(super) fn publish(&self, version: u64, parameters: &[u8]) {
+        self.send_parameters(version, parameters, false);
     }
 
     pub(super) fn end_run(&self, version: u64) {
-        self.send_parameters(Behaviour::Unspecified, version, &[], true);
+        self.send_parameters(version, &[], true);
     }
 
-    fn send_parameters(&self, behaviour: Behaviour, version: u64, parameters: &[u8], run_over: bool) {
+    fn send_parameters(&self, version: u64, parameters: &[u8], run_over: bool) {
         let total = parameters.len() as u64;
         let piece = |(index, data): (usize, &[u8])| ParametersChunk {
             learner_epoch: 1,
             version,
-            behaviour: behaviour.into(),
+            behaviour: Behaviour::Policy.into(),
             total,
             offset: (index * PIECE) as u64,
             data: data.to_vec().into(),

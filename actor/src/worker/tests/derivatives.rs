@@ -8,8 +8,8 @@ fn an_unroll_has_a_derivative_for_each_transition_or_none() {
         let shape = UnrollShape { action_gradient: 56, ..*layout(4).shape() };
         let layout = Arc::new(UnrollLayout::new(shape));
         let environment = Counter { derivatives, ..Counter::new(&[2, 9]) };
-        let mut worker = Worker::new(vec![environment], Plain::default(), Arc::clone(&layout), 0.1, 0, 3).unwrap();
-        worker.adopt(&directive(0, Behaviour::Policy)).unwrap();
+        let mut worker = Worker::new(vec![environment], Plain::default(), Arc::clone(&layout), 0, 3).unwrap();
+        worker.adopt(&directive(0)).unwrap();
         let unrolls = worker.unroll(&|| false, &Progress::default()).map_err(|error| error.to_string())?.unwrap();
         let rows = Rows { layout: &layout, payload: &unrolls[0].payload };
         Ok::<_, String>((0..4).map(|t| rows.one(Field::ActionGradient, t)).collect::<Vec<_>>())

@@ -5,15 +5,10 @@ use super::*;
 #[test]
 fn in_lockstep_a_version_makes_one_unroll_of_every_environment() {
     let environments = vec![Counter::new(&[3]), Counter::new(&[4])];
-    let worker = Worker::new(environments, Plain::default(), layout(4), 0.1, 0, 3).unwrap();
+    let worker = Worker::new(environments, Plain::default(), layout(4), 0, 3).unwrap();
     let mailbox = Mailbox::default();
     let publish = |learner_epoch, version| {
-        mailbox.publish(Directive {
-            learner_epoch,
-            version,
-            behaviour: Behaviour::Policy,
-            parameters: Bytes::from_static(b"1"),
-        });
+        mailbox.publish(Directive { learner_epoch, version, parameters: Bytes::from_static(b"1") });
     };
     // The channel has room for more unrolls than the worker makes.
     let (sender, mut receiver) = mpsc::channel(16);
@@ -41,14 +36,9 @@ fn in_lockstep_a_version_makes_one_unroll_of_every_environment() {
 #[test]
 fn a_closed_mailbox_ends_the_worker_and_a_full_channel_holds_it() {
     let layout = layout(4);
-    let worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), layout, 0.1, 0, 3).unwrap();
+    let worker = Worker::new(vec![Counter::new(&[3])], Plain::default(), layout, 0, 3).unwrap();
     let mailbox = Mailbox::default();
-    mailbox.publish(Directive {
-        learner_epoch: 1,
-        version: 1,
-        behaviour: Behaviour::Policy,
-        parameters: Bytes::from_static(b"1"),
-    });
+    mailbox.publish(Directive { learner_epoch: 1, version: 1, parameters: Bytes::from_static(b"1") });
     let progress = Progress::default();
     let (sender, mut receiver) = mpsc::channel(1);
     std::thread::scope(|scope| {

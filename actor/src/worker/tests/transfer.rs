@@ -37,9 +37,8 @@ impl ForwardPass for WithLowLevel {
 #[test]
 fn the_simulator_gets_the_low_levels_command_and_the_unroll_the_policys_action() {
     let layout = layout(9);
-    let mut worker =
-        Worker::new(vec![Counter::new(&[4])], WithLowLevel::default(), Arc::clone(&layout), 0.1, 0, 3).unwrap();
-    worker.adopt(&directive(0, Behaviour::Policy)).unwrap();
+    let mut worker = Worker::new(vec![Counter::new(&[4])], WithLowLevel::default(), Arc::clone(&layout), 0, 3).unwrap();
+    worker.adopt(&directive(0)).unwrap();
     let unrolls = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap();
     let rows = Rows { layout: &layout, payload: &unrolls[0].payload };
     for t in (0..9).filter(|t| rows.one(Field::Valid, *t) == 1.0) {
@@ -55,21 +54,14 @@ fn one_by_one_every_environment_has_its_own_low_level_state() {
     let lengths = [vec![3], vec![5]];
     let counters = || lengths.iter().map(|lengths| Counter::new(lengths)).collect::<Vec<_>>();
     let layout = layout(12);
-    let mut together = Worker::new(counters(), WithLowLevel::default(), Arc::clone(&layout), 0.1, 0, 3).unwrap();
+    let mut together = Worker::new(counters(), WithLowLevel::default(), Arc::clone(&layout), 0, 3).unwrap();
     let alone = crate::forward_pass::OneByOne::new(WithLowLevel::default(), layout.shape());
-    let mut alone = Worker::new(counters(), alone, Arc::clone(&layout), 0.1, 0, 3).unwrap();
-    together.adopt(&directive(0, Behaviour::Policy)).unwrap();
-    alone.adopt(&directive(0, Behaviour::Policy)).unwrap();
+    let mut alone = Worker::new(counters(), alone, Arc::clone(&layout), 0, 3).unwrap();
+    together.adopt(&directive(0)).unwrap();
+    alone.adopt(&directive(0)).unwrap();
     let payloads = |unrolls: Option<Vec<FinishedUnroll>>| {
         unrolls.unwrap().into_iter().map(|unroll| unroll.payload).collect::<Vec<_>>()
     };
     let one = payloads(together.unroll(&|| false, &Progress::default()).unwrap());
     assert_eq!(one, payloads(alone.unroll(&|| false, &Progress::default()).unwrap()));
-}
-
-#[test]
-fn a_demonstration_is_refused_where_a_low_level_acts() {
-    let mut worker = Worker::new(vec![Counter::new(&[4])], WithLowLevel::default(), layout(9), 0.1, 0, 3).unwrap();
-    let refused = worker.adopt(&directive(1, Behaviour::Demonstration)).unwrap_err();
-    assert!(refused.to_string().contains("demonstration"), "{refused}");
 }

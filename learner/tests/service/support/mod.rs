@@ -105,13 +105,7 @@ impl World {
             reward_terms: vec!["posture".into(), "progress".into()],
             image: 0,
             clips: vec!["walk".into(), "run".into()],
-            tasks: vec![TaskPart {
-                name: "tracking".into(),
-                observation: 3,
-                clips: 2,
-                max_reward: 1.0,
-                demonstrated: true,
-            }],
+            tasks: vec![TaskPart { name: "tracking".into(), observation: 3, clips: 2, max_reward: 1.0 }],
         };
         let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
         let config = Config { unrolls: BATCH, max_staleness: 5, ahead: 2, order: BatchOrder::Arrival };
