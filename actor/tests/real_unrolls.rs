@@ -11,7 +11,7 @@ use comic_actor::policy::TorchPolicy;
 use comic_actor::worker::{FinishedUnroll, Progress, Worker};
 use comic_clips::Catalogue;
 use comic_experiment::{Experiment, resolve};
-use comic_proto::v1::{Behaviour, UnrollHeader};
+use comic_proto::v1::UnrollHeader;
 use comic_proto::{Expected, Field, UnrollBuffer, UnrollLayout, UnrollShape, validate};
 use comic_tasks::Task;
 
@@ -52,7 +52,6 @@ fn unrolls_pass_the_learners_validation() {
             learner_epoch: unroll.learner_epoch,
             version: unroll.version,
             layout_hash: setup.layout.hash().to_vec(),
-            behaviour: Behaviour::Policy.into(),
             episodes: unroll.episodes,
             task: unroll.task,
             ..UnrollHeader::default()

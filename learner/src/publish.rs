@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use comic_proto::frame;
-use comic_proto::v1::{Behaviour, ParametersChunk};
+use comic_proto::v1::ParametersChunk;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
@@ -48,8 +48,6 @@ impl Default for Holding {
 pub struct Published {
     /// The number of the version.
     pub version: u64,
-    /// How actors act with it; unspecified when the run is over.
-    pub behaviour: Behaviour,
     /// Whether this is the end of the run.
     pub run_over: bool,
     /// Grows with every publication, also when the same version is published again.
@@ -60,23 +58,20 @@ pub struct Published {
 }
 
 impl Published {
-    /// `behaviour` is absent at the end of the run.
-    fn new(learner_epoch: u64, version: u64, behaviour: Option<Behaviour>, serial: u64, payload: &Bytes) -> Self {
-        let (behaviour, run_over) = (behaviour.unwrap_or_default(), behaviour.is_none());
-        // An empty payload has a piece too, because the piece says how to act.
+    fn new(learner_epoch: u64, version: u64, run_over: bool, serial: u64, payload: &Bytes) -> Self {
+        // An empty payload has a piece too, because the piece says that the run is over.
         let offsets = (0..payload.len().max(1)).step_by(PIECE);
         let frames = offsets.map(|offset| {
             frame(&ParametersChunk {
                 learner_epoch,
                 version,
-                behaviour: behaviour.into(),
                 total: payload.len() as u64,
                 offset: offset as u64,
                 data: payload.slice(offset..payload.len().min(offset + PIECE)),
                 run_over,
             })
         });
-        Self { version, behaviour, run_over, serial, frames: frames.collect(), readers: AtomicUsize::new(0) }
+        Self { version, run_over, serial, frames: frames.collect(), readers: AtomicUsize::new(0) }
     }
 
     /// Every [`ParametersChunk`] as gRPC sends it; there is at least one.
@@ -122,23 +117,23 @@ impl Publisher {
 
     /// Makes this the newest version, without waiting for readers. Versions grow, but the same version may be published
     /// again. An older one is refused with an error in the log.
-    pub fn publish(&self, version: u64, behaviour: Behaviour, payload: &Bytes) {
-        self.replace(version, Some(behaviour), payload);
+    pub fn publish(&self, version: u64, payload: &Bytes) {
+        self.replace(version, false, payload);
     }
 
     /// Tells every reader that the run is over, under the newest version's number and without parameters. It is the last
     /// publication.
     pub fn end_run(&self) {
-        self.replace(self.newest_version(), None, &Bytes::new());
+        self.replace(self.newest_version(), true, &Bytes::new());
     }
 
-    fn replace(&self, version: u64, behaviour: Option<Behaviour>, payload: &Bytes) {
+    fn replace(&self, version: u64, run_over: bool, payload: &Bytes) {
         let (newest, serial) = self.newest().map_or((0, 0), |published| (published.version, published.serial));
         if version < newest {
             tracing::error!(version, newest, "an older version is not published");
             return;
         }
-        let published = Published::new(self.inner.epoch, version, behaviour, serial + 1, payload);
+        let published = Published::new(self.inner.epoch, version, run_over, serial + 1, payload);
         self.newest.send_replace(Some(Arc::new(published)));
     }
 

@@ -18,7 +18,7 @@ use comic_learner::service::quarantine::QuarantineArguments;
 use comic_learner::service::{self, Service};
 use comic_learner::train::setup::{Ending, Setup};
 use comic_learner::train::trainer::Trainer;
-use comic_proto::v1::{Behaviour, UnrollHeader};
+use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Outcome, Phase};
 use rand::{Rng as _, SeedableRng as _};
@@ -165,12 +165,7 @@ fn live_evaluated(
                 let (actor, incarnation) = (joined.actor, INCARNATION);
                 let header = UnrollHeader { actor, incarnation, sequence, learner_epoch: epoch, ..Default::default() };
                 let task = (sequence % spec.tasks.len() as u64) as u32;
-                let header = UnrollHeader {
-                    version: batcher.phase().version,
-                    behaviour: Behaviour::Policy.into(),
-                    task,
-                    ..header
-                };
+                let header = UnrollHeader { version: batcher.phase().version, task, ..header };
                 let mut unroll = recorded(&layout, &spec, sequence);
                 alter(sequence, &mut unroll);
                 match futures::executor::block_on(batcher.insert(&header, unroll.into_bytes())) {
@@ -360,6 +355,6 @@ fn frames_of(version: &Published, checkpoint: &Snapshot) -> Vec<Bytes> {
     // The first epoch of a run.
     let publisher = Publisher::new(1);
     let parameters = Bytes::copy_from_slice(checkpoint.part("policy.safetensors").unwrap());
-    publisher.publish(version.version, version.behaviour, &parameters);
+    publisher.publish(version.version, &parameters);
     publisher.newest().unwrap().frames().to_vec()
 }

@@ -54,4 +54,4 @@ pub use validate::{Expected, Invalid, MAX_SEQUENCE, validate};
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
 /// Version of the protocol. `Join` compares it. It changes if an older peer would misunderstand a newer one.
-pub const PROTOCOL_VERSION: u32 = 3;
+pub const PROTOCOL_VERSION: u32 = 4;

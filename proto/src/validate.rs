@@ -8,7 +8,7 @@ use thiserror::Error;
 use crate::field::Field;
 use crate::layout::UnrollLayout;
 use crate::pieces::Pieces;
-use crate::v1::{Behaviour, EpisodeEnd, EpisodeStatistics, UnrollHeader};
+use crate::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
 
 /// Sequence numbers are below this. With a thousand unrolls per second an actor reaches it after thirty years, so a
 /// larger number is an error. If it were accepted, all numbers that it skips would be counted as lost.
@@ -108,12 +108,6 @@ pub enum Invalid {
         /// The row of `valid`.
         row: usize,
     },
-    /// The behaviour is unspecified or unknown.
-    #[error("the header names no known behaviour: {behaviour}")]
-    Behaviour {
-        /// The received value.
-        behaviour: i32,
-    },
     /// The experiment does not have the task.
     #[error("the header names task {task}, but the experiment has {tasks} tasks, counted from 0")]
     Task {
@@ -205,9 +199,6 @@ fn check_header(
     }
     if header.layout_hash != layout.hash() {
         return Err(Invalid::LayoutHash);
-    }
-    if header.behaviour() == Behaviour::Unspecified {
-        return Err(Invalid::Behaviour { behaviour: header.behaviour });
     }
     if header.learner_epoch > expected.epoch {
         return Err(Invalid::Epoch { found: header.learner_epoch, newest: expected.epoch });

@@ -40,17 +40,17 @@ fn bytes() -> impl Strategy<Value = Vec<u8>> {
 }
 
 fn header() -> impl Strategy<Value = Option<UnrollHeader>> {
-    let numbers = (any::<u64>(), any::<u64>(), any::<u64>(), any::<i32>());
+    let numbers = (any::<u64>(), any::<u64>(), any::<u64>(), any::<u32>());
     let returns = prop::collection::vec(any::<f32>().prop_filter("compared", |value| !value.is_nan()), 0..6);
     prop::option::of((numbers, prop::collection::vec(returns, 0..4)).prop_map(|(numbers, returns)| {
-        let (actor, incarnation, sequence, behaviour) = numbers;
+        let (actor, incarnation, sequence, environment) = numbers;
         let episodes =
             returns.into_iter().map(|returns| EpisodeStatistics { returns, steps: 3, ..Default::default() }).collect();
         UnrollHeader {
             actor,
             incarnation,
             sequence,
-            behaviour,
+            environment,
             episodes,
             layout_hash: vec![7; 32],
             ..UnrollHeader::default()

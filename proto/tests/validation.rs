@@ -4,7 +4,7 @@
 
 use bytes::Bytes;
 use comic_experiment::LARGEST_ACTION_GRADIENT;
-use comic_proto::v1::{Behaviour, EpisodeEnd, EpisodeStatistics, UnrollHeader, UnrollMessage};
+use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader, UnrollMessage};
 use comic_proto::{Expected, Field, Invalid, MAX_SEQUENCE, Pieces, UnrollBuffer, UnrollLayout, UnrollShape, validate};
 use proptest::prelude::*;
 use prost::Message as _;
@@ -42,7 +42,6 @@ fn header() -> UnrollHeader {
         learner_epoch: 2,
         version: 9,
         layout_hash: layout().hash().to_vec(),
-        behaviour: Behaviour::Policy.into(),
         episodes: vec![episode],
         environment: 0,
         task: 0,
@@ -133,14 +132,6 @@ fn padding_repeats_the_previous_observation_and_is_valid() {
     }
     unroll.row_mut(Field::Valid, 3)[0] = 0.0;
     assert_eq!(refusal(&header(), &unroll), None);
-}
-
-#[test]
-fn an_unknown_behaviour_in_the_header_is_refused() {
-    assert_eq!(header_refusal(|header| header.behaviour = Behaviour::Demonstration.into()), None);
-    for behaviour in [0, 3, -1] {
-        assert_eq!(header_refusal(|header| header.behaviour = behaviour), Some(Invalid::Behaviour { behaviour }));
-    }
 }
 
 #[test]

@@ -154,7 +154,7 @@ impl Batcher {
     /// Begins a phase. Waiting unrolls of another epoch or phase are dropped as superseded.
     pub fn set_phase(&self, phase: Phase) {
         let mut state = self.lock();
-        let terms = |phase: Phase| (phase.epoch, phase.oldest, phase.behaviour);
+        let terms = |phase: Phase| (phase.epoch, phase.oldest);
         let has_changed = terms(state.phase) != terms(phase);
         state.phase = phase;
         if has_changed {
@@ -257,8 +257,8 @@ impl Batcher {
         if let Some(outcome) = refuse_unaccountable(&mut state.ledger, header) {
             return Some(outcome);
         }
-        let Phase { epoch, version, oldest, behaviour } = state.phase;
-        let other = header.learner_epoch != epoch || header.behaviour() != behaviour || header.version < oldest;
+        let Phase { epoch, version, oldest } = state.phase;
+        let other = header.learner_epoch != epoch || header.version < oldest;
         let reason = if other {
             Reason::Superseded
         } else if payload.len() != self.inner.layout.size() {

@@ -20,7 +20,7 @@
 //!    dropped as **lost at restart**. An actor that joins sends the number up to which it was acknowledged, and the
 //!    account moves there in the same way.
 //! 3. The unroll is either dropped or copied into a slot of the open batch; then it is *in flight*. The reasons to drop
-//!    it are **invalid**; **superseded**: made in another epoch or phase (each behaviour is a phase); **stale**: made
+//!    it are **invalid**; **superseded**: made in another epoch or in an earlier phase; **stale**: made
 //!    with parameters that are more than `max_staleness` published versions old. If each environment has its own slot
 //!    ([`BatchOrder::Environment`]), an unroll is invalid if its environment has no slot or a full one.
 //! 4. An unroll in flight ends in one way: its batch is trained on, or it is dropped. A change of phase drops the

@@ -1,7 +1,5 @@
 //! The phase of the training.
 
-use comic_proto::v1::Behaviour;
-
 /// The phase of the training: which unrolls the trainer uses at this moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Phase {
@@ -11,13 +9,11 @@ pub struct Phase {
     pub version: u64,
     /// Unrolls with an older version than this are superseded: they were made in an earlier phase.
     pub oldest: u64,
-    /// Unrolls with another behaviour are superseded.
-    pub behaviour: Behaviour,
 }
 
 impl Phase {
-    /// The first phase of a learner epoch: no version is published yet, and the policy acts.
+    /// The first phase of a learner epoch: no version is published yet.
     pub fn begin(epoch: u64) -> Self {
-        Self { epoch, version: 0, oldest: 0, behaviour: Behaviour::Policy }
+        Self { epoch, version: 0, oldest: 0 }
     }
 }

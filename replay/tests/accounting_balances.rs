@@ -6,7 +6,6 @@ mod common;
 
 use std::collections::{HashMap, HashSet};
 
-use comic_proto::v1::Behaviour;
 use comic_replay::{Batch, Batcher, Ledger, LedgerSnapshot, Outcome, Phase, Reason, TaskAccounting};
 use common::{Actor, CONFIG, PHASE, TASKS, batch_now, insert_now, layout, task_of, with_tasks};
 use proptest::prelude::*;
@@ -15,7 +14,7 @@ const ACTORS: u64 = 3;
 
 #[derive(Clone, Debug)]
 enum Event {
-    Send { actor: u64, skip: u64, version: u64, other_behaviour: bool },
+    Send { actor: u64, skip: u64, version: u64, earlier_phase: bool },
     SendAgain { actor: u64, back: u64 },
     SendInvalid { actor: u64 },
     SendUnknown,
@@ -35,7 +34,7 @@ fn event() -> impl Strategy<Value = Event> {
     let reason = prop_oneof![Just(Reason::Stale), Just(Reason::Superseded)];
     prop_oneof![
         20 => (0..ACTORS, prop_oneof![9 => Just(0u64), 1 => 1u64..5], 0u64..7, prop::bool::weighted(0.1))
-            .prop_map(|(actor, skip, version, other_behaviour)| Event::Send { actor, skip, version, other_behaviour }),
+            .prop_map(|(actor, skip, version, earlier_phase)| Event::Send { actor, skip, version, earlier_phase }),
         3 => (0..ACTORS, 1u64..5).prop_map(|(actor, back)| Event::SendAgain { actor, back }),
         1 => (0..ACTORS).prop_map(|actor| Event::SendInvalid { actor }),
         1 => Just(Event::SendUnknown),
@@ -61,10 +60,6 @@ struct Known {
     /// Unrolls of each task, and of no task, that the batcher accepted or dropped.
     decided: [u64; TASKS.len() + 1],
     refused: u64,
-}
-
-fn other(behaviour: Behaviour) -> Behaviour {
-    if behaviour == Behaviour::Policy { Behaviour::Demonstration } else { Behaviour::Policy }
 }
 
 struct World {
@@ -95,13 +90,14 @@ impl World {
         }
     }
 
-    fn send(&mut self, actor: u64, sequence: u64, version: u64, other_behaviour: bool) {
+    fn send(&mut self, actor: u64, sequence: u64, version: u64, earlier_phase: bool) {
         let actor = self.actors[actor as usize];
         let mut header = actor.header(sequence);
         header.learner_epoch = self.phase.epoch;
         header.version = self.phase.version.saturating_sub(version);
-        let behaviour = if other_behaviour { other(self.phase.behaviour) } else { self.phase.behaviour };
-        header.behaviour = behaviour.into();
+        if earlier_phase {
+            header.version = header.version.min(self.phase.oldest.saturating_sub(1));
+        }
         let outcome = insert_now(&self.batcher, &header);
         let cursor = self.known.cursors.entry(actor.incarnation).or_default();
         match outcome {
@@ -146,8 +142,8 @@ impl World {
 
     fn happen(&mut self, event: Event) {
         match event {
-            Event::Send { actor, skip, version, other_behaviour } => {
-                self.send(actor, self.next_sequence(actor) + skip, version, other_behaviour);
+            Event::Send { actor, skip, version, earlier_phase } => {
+                self.send(actor, self.next_sequence(actor) + skip, version, earlier_phase);
             }
             Event::SendAgain { actor, back } => {
                 if let Some(sequence) = self.next_sequence(actor).checked_sub(back) {
@@ -184,7 +180,8 @@ impl World {
                 self.batcher.set_phase(self.phase);
             }
             Event::SwitchPhase => {
-                self.phase.behaviour = other(self.phase.behaviour);
+                self.phase.version += 1;
+                self.phase.oldest = self.phase.version;
                 self.batcher.set_phase(self.phase);
             }
             Event::Reconnect { actor } => {

@@ -6,9 +6,8 @@ mod common;
 
 use std::time::Duration;
 
-use comic_proto::v1::Behaviour;
-use comic_replay::{Next, Outcome, Phase};
-use common::{Actor, CONFIG, PHASE, SLOTS, batch_now, batcher, now, payload};
+use comic_replay::{Next, Outcome};
+use common::{Actor, CONFIG, NEXT_PHASE, SLOTS, batch_now, batcher, now, payload};
 
 #[test]
 fn no_more_unrolls_than_an_open_and_a_full_batch_are_accepted() {
@@ -80,7 +79,7 @@ fn a_change_of_phase_ends_the_waiting_of_inserts_for_the_old_phase() {
     let header = actor.header(SLOTS as u64);
     let mut waiting = Box::pin(batcher.insert(&header, payload(&header)));
     assert_eq!(now(&mut waiting), None);
-    batcher.set_phase(Phase { behaviour: Behaviour::Demonstration, ..PHASE });
+    batcher.set_phase(NEXT_PHASE);
     assert_eq!(now(&mut waiting), Some(Outcome::Superseded));
 }
 

@@ -5,9 +5,8 @@
 mod common;
 
 use comic_proto::MAX_SEQUENCE;
-use comic_proto::v1::Behaviour;
 use comic_replay::{Dropped, Outcome, Phase, Reason};
-use common::{Actor, CONFIG, PHASE, batch_now, batcher, insert_now, payload};
+use common::{Actor, CONFIG, NEXT_PHASE, PHASE, batch_now, batcher, insert_now, payload};
 
 #[test]
 fn an_unroll_that_is_sent_twice_is_accepted_once() {
@@ -89,17 +88,16 @@ fn staleness_is_counted_in_published_versions() {
 }
 
 #[test]
-fn unrolls_of_another_epoch_or_phase_are_superseded() {
+fn unrolls_of_another_epoch_are_superseded() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
-    let (mut earlier, mut demonstration) = (actor.header(0), actor.header(1));
-    earlier.learner_epoch = 0;
-    demonstration.behaviour = Behaviour::Demonstration.into();
+    let (mut earlier, mut later) = (actor.header(0), actor.header(1));
+    (earlier.learner_epoch, later.learner_epoch) = (PHASE.epoch - 1, PHASE.epoch + 1);
     assert_eq!(insert_now(&batcher, &earlier), Some(Outcome::Superseded));
-    assert_eq!(insert_now(&batcher, &demonstration), Some(Outcome::Superseded));
-    batcher.set_phase(Phase { behaviour: Behaviour::Demonstration, ..PHASE });
-    demonstration.sequence = 2;
-    assert_eq!(insert_now(&batcher, &demonstration), Some(Outcome::Taken));
+    assert_eq!(insert_now(&batcher, &later), Some(Outcome::Superseded));
+    batcher.set_phase(Phase { epoch: PHASE.epoch + 1, ..PHASE });
+    later.sequence = 2;
+    assert_eq!(insert_now(&batcher, &later), Some(Outcome::Taken));
     assert_eq!(batcher.accounting().dropped.superseded, 2);
 }
 
@@ -108,7 +106,7 @@ fn an_unroll_older_than_the_oldest_version_of_the_phase_is_superseded() {
     let batcher = batcher();
     let actor = Actor::join(&batcher, 5);
     assert_eq!(actor.send(&batcher, 0), Some(Outcome::Taken));
-    batcher.set_phase(Phase { version: PHASE.version + 1, oldest: PHASE.version + 1, ..PHASE });
+    batcher.set_phase(NEXT_PHASE);
     assert_eq!(actor.send(&batcher, 1), Some(Outcome::Superseded));
     assert_eq!(batcher.accounting().dropped.superseded, 2);
 }
@@ -121,13 +119,13 @@ fn a_change_of_phase_drops_the_unrolls_of_the_old_phase() {
         assert_eq!(actor.send(&batcher, sequence), Some(Outcome::Taken));
     }
     assert_eq!(actor.send(&batcher, 6), None);
-    batcher.set_phase(Phase { behaviour: Behaviour::Demonstration, ..PHASE });
+    batcher.set_phase(NEXT_PHASE);
     let accounting = batcher.accounting();
     assert_eq!((accounting.dropped.superseded, accounting.in_flight), (6, 0));
     assert!(batch_now(&batcher).is_none());
     for sequence in 6..12 {
         let mut header = actor.header(sequence);
-        header.behaviour = Behaviour::Demonstration.into();
+        header.version = NEXT_PHASE.version;
         assert_eq!(insert_now(&batcher, &header), Some(Outcome::Taken), "all slots are free again");
     }
     assert!(batcher.accounting().balance());

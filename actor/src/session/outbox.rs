@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-use comic_proto::v1::{Behaviour, UnrollAck, UnrollHeader, UnrollMessage, Verdict};
+use comic_proto::v1::{UnrollAck, UnrollHeader, UnrollMessage, Verdict};
 use tracing::Span;
 
 use crate::worker::FinishedUnroll;
@@ -112,7 +112,6 @@ impl Outbox {
             learner_epoch: unroll.learner_epoch,
             version: unroll.version,
             layout_hash: self.layout_hash.clone(),
-            behaviour: Behaviour::Policy.into(),
             episodes: unroll.episodes.clone(),
             environment: unroll.environment,
             task: unroll.task,

@@ -1,7 +1,7 @@
 //! Assembles parameters from the pieces in which they arrive.
 
 use bytes::{Bytes, BytesMut};
-use comic_proto::v1::{Behaviour, ParametersChunk};
+use comic_proto::v1::ParametersChunk;
 
 use crate::Error;
 use crate::mailbox::Directive;
@@ -48,7 +48,7 @@ impl Assembler {
         let announced = Announced {
             learner_epoch: chunk.learner_epoch,
             version: chunk.version,
-            run_over: is_end_of_run(chunk)?,
+            run_over: chunk.run_over,
             total: chunk.total,
         };
         if chunk.offset == 0 {
@@ -83,13 +83,6 @@ impl Assembler {
     }
 }
 
-fn is_end_of_run(chunk: &ParametersChunk) -> Result<bool, Error> {
-    if chunk.run_over || chunk.behaviour() == Behaviour::Policy {
-        return Ok(chunk.run_over);
-    }
-    Err(malformed(format!("no such behaviour: {}", chunk.behaviour)))
-}
-
 fn complete(announced: Announced, parameters: Bytes) -> Result<Assembled, Error> {
     let Announced { learner_epoch, version, run_over, .. } = announced;
     if run_over {
@@ -112,15 +105,7 @@ mod tests {
     use super::*;
 
     fn chunk(version: u64, total: u64, offset: u64, data: &[u8]) -> ParametersChunk {
-        ParametersChunk {
-            learner_epoch: 3,
-            version,
-            behaviour: Behaviour::Policy.into(),
-            total,
-            offset,
-            data: data.to_vec().into(),
-            run_over: false,
-        }
+        ParametersChunk { learner_epoch: 3, version, total, offset, data: data.to_vec().into(), run_over: false }
     }
 
     proptest! {
@@ -166,7 +151,6 @@ mod tests {
             let mut assembler = Assembler::new(10);
             pieces.iter().map(|piece| assembler.push(piece)).find_map(Result::err).map(|error| error.to_string())
         };
-        let behaviour = |behaviour| ParametersChunk { behaviour, ..chunk(1, 1, 0, b"a") };
         for (pieces, reason) in [
             (vec![chunk(1, 11, 0, b"a")], "at most 10 fit"),
             (vec![chunk(1, 4, 2, b"a")], "does not start at 0"),
@@ -175,9 +159,6 @@ mod tests {
             (vec![chunk(1, 4, 0, b"ab"), chunk(1, 4, 2, b"cde")], "more than the 4"),
             (vec![chunk(1, 4, 0, b"")], "an empty piece"),
             (vec![chunk(1, 0, 0, b"")], "without parameters"),
-            (vec![behaviour(0)], "no such behaviour"),
-            (vec![behaviour(2)], "no such behaviour"),
-            (vec![behaviour(99)], "no such behaviour"),
         ] {
             let found = refused(&pieces).unwrap_or_default();
             assert!(found.contains(reason), "{reason}: {found}");
@@ -187,8 +168,7 @@ mod tests {
     #[test]
     fn the_end_of_the_run_needs_no_parameters() {
         let mut assembler = Assembler::new(10);
-        let behaviour = Behaviour::Unspecified.into();
-        let run_over = ParametersChunk { run_over: true, behaviour, ..chunk(1, 0, 0, b"") };
+        let run_over = ParametersChunk { run_over: true, ..chunk(1, 0, 0, b"") };
         assert_eq!(assembler.push(&run_over).unwrap(), Some(Assembled::RunOver));
     }
 }

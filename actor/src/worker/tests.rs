@@ -330,7 +330,6 @@ proptest! {
                 layout_hash: layout.hash().to_vec(),
                 episodes: unroll.episodes.clone(),
                 task: unroll.task,
-                behaviour: comic_proto::v1::Behaviour::Policy.into(),
                 ..Default::default()
             };
             let checked = comic_proto::Expected { clips: &[1, 1, 1], epoch: 0, newest_version: 0 };

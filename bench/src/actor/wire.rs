@@ -31,7 +31,7 @@ pub(super) fn wire(subject: &Subject) -> Result<Figure> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start tokio")?;
     let (spec, experiment) = (subject.task.spec(), &subject.experiment);
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, experiment)));
-    let phase = Phase { epoch: 1, version: 1, oldest: 0, behaviour: Behaviour::Policy };
+    let phase = Phase { epoch: 1, version: 1, oldest: 0 };
     let config = Config {
         unrolls: experiment.unroll.batch,
         max_staleness: experiment.unroll.max_staleness,

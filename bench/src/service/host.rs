@@ -17,7 +17,7 @@ use comic_learner::service::process::{allow_descriptors, runtime};
 use comic_learner::service::quarantine::QuarantineArguments;
 use comic_learner::service::{Service, Setup, serve};
 use comic_proto::v1::learner_server::{Learner, LearnerServer};
-use comic_proto::v1::{self, Behaviour, UnrollAck, UnrollMessage, Verdict};
+use comic_proto::v1::{self, UnrollAck, UnrollMessage, Verdict};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Next, Phase};
 use futures::stream::{self, BoxStream, StreamExt as _};
 use serde_json::{Value, json};
@@ -189,7 +189,7 @@ impl StandIn {
     fn publish(&self) {
         let version = self.publisher.newest_version() + 1;
         self.batcher.set_phase(Phase { version, ..self.batcher.phase() });
-        self.publisher.publish(version, Behaviour::Policy, &self.payload);
+        self.publisher.publish(version, &self.payload);
     }
 
     fn answer(&self, request: &str) -> Value {

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use anyhow::{Context as _, Result};
 use bytes::Bytes;
-use comic_proto::v1::{Behaviour, JoinReply, UnrollAck, UnrollHeader, UnrollMessage};
+use comic_proto::v1::{JoinReply, UnrollAck, UnrollHeader, UnrollMessage};
 use tokio::sync::mpsc;
 
 /// One incarnation of an actor.
@@ -52,7 +52,6 @@ impl Identity {
                 learner_epoch: reply.learner_epoch,
                 version,
                 layout_hash: layout_hash.clone(),
-                behaviour: Behaviour::Policy.into(),
                 ..UnrollHeader::default()
             };
             self.next_sequence += 1;

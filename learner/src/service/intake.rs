@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use comic_proto::v1::{Behaviour, UnrollAck, UnrollHeader, Verdict};
+use comic_proto::v1::{UnrollAck, UnrollHeader, Verdict};
 use comic_proto::{Expected, Invalid, Pieces, ReceivedUnroll, validate};
 use comic_replay::{Batcher, Outcome};
 use tonic::Status;
@@ -144,11 +144,8 @@ impl Intake {
         if header.learner_epoch != epoch {
             return (Verdict::Rejoin, format!("made in learner epoch {}, this is {epoch}", header.learner_epoch));
         }
-        let wanted = match self.batcher.phase().behaviour {
-            Behaviour::Demonstration => "demonstrations",
-            Behaviour::Policy | Behaviour::Unspecified => "the policy's own unrolls",
-        };
-        (Verdict::Superseded, format!("the learner wants {wanted} now"))
+        let (version, oldest) = (header.version, self.batcher.phase().oldest);
+        (Verdict::Superseded, format!("version {version} is of an earlier phase, which ended before version {oldest}"))
     }
 
     fn ack(&self, sequence: u64, verdict: Verdict, detail: String) -> UnrollAck {

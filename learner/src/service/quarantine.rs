@@ -135,7 +135,6 @@ impl Store {
             "sequence": header.sequence,
             "learner_epoch": header.learner_epoch,
             "version": header.version,
-            "behaviour": header.behaviour().as_str_name(),
             "layout_hash": hash,
             "episodes": header.episodes.len(),
             "payload_bytes": payload.len(),

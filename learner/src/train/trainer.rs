@@ -3,7 +3,6 @@
 use std::time::{Duration, Instant};
 
 use comic_experiment::{Experiment, TaskSpec};
-use comic_proto::v1::Behaviour;
 use comic_replay::{Batch, Batcher, Next, Reason};
 
 use crate::algorithm::Parts;
@@ -105,8 +104,8 @@ impl Trainer {
 
     fn train(&mut self) -> Result<Ending> {
         match self.state.progress.version {
-            0 => self.publish(Behaviour::Policy)?,
-            _ => self.versions.announce(&self.state, Behaviour::Policy),
+            0 => self.publish()?,
+            _ => self.versions.announce(&self.state),
         }
         while self.budget.used(&self.state.progress) < 1.0 {
             match self.next_batch()? {
@@ -134,9 +133,9 @@ impl Trainer {
         let ages = batch.headers().iter().map(|header| version.saturating_sub(header.version)).collect();
         // Before the batch's memory is free: actors that wait for it then continue with these parameters.
         if restored || publishes {
-            self.publish(Behaviour::Policy)?;
+            self.publish()?;
         } else {
-            self.versions.repeat(&mut self.state, Behaviour::Policy);
+            self.versions.repeat(&mut self.state);
         }
         self.account(batch);
         self.reports.count_duration(began.elapsed(), ages);
@@ -159,7 +158,7 @@ impl Trainer {
     /// nothing. Unrolls so far were made with another scale.
     fn skip_batch(&mut self, batch: Batch) -> Result<()> {
         self.versions.supersede(&self.state);
-        self.publish(Behaviour::Policy)?;
+        self.publish()?;
         self.batcher.discard(batch, Reason::Superseded);
         self.after_update()
     }
@@ -202,13 +201,13 @@ impl Trainer {
 
     /// Publishes the online policy as the next version, if it is sound: actors that cannot act would send nothing that
     /// shows the failure.
-    fn publish(&mut self, behaviour: Behaviour) -> Result<()> {
+    fn publish(&mut self) -> Result<()> {
         if self.is_sound() {
-            return self.versions.publish(&mut self.state, behaviour);
+            return self.versions.publish(&mut self.state);
         }
         let update = self.state.progress.updates;
         tracing::warn!(update, "not published: the last gradient steps were not finite");
-        self.versions.repeat(&mut self.state, behaviour);
+        self.versions.repeat(&mut self.state);
         Ok(())
     }
 

@@ -1,7 +1,6 @@
 //! Publishing versions of the parameters.
 
 use bytes::Bytes;
-use comic_proto::v1::Behaviour;
 use comic_replay::{Batcher, Phase};
 
 use crate::error::Result;
@@ -27,28 +26,28 @@ impl Versions {
     ///
     /// # Errors
     /// When the parameters cannot be read from the device.
-    pub(super) fn publish(&self, state: &mut State, behaviour: Behaviour) -> Result<()> {
+    pub(super) fn publish(&self, state: &mut State) -> Result<()> {
         let _publish = tracing::debug_span!("publish", version = state.progress.version + 1).entered();
         state.target = Bytes::from(state.algorithm.policy_parameters()?);
         state.progress.version += 1;
-        self.announce(state, behaviour);
+        self.announce(state);
         Ok(())
     }
 
     /// In lockstep, publishes the same parameters as the next version. There, actors make one unroll of each environment
     /// with each version, so they need a version after every batch.
-    pub(super) fn repeat(&self, state: &mut State, behaviour: Behaviour) {
+    pub(super) fn repeat(&self, state: &mut State) {
         if self.lockstep {
             state.progress.version += 1;
-            self.announce(state, behaviour);
+            self.announce(state);
         }
     }
 
     /// Tells actors and batcher of the newest version, for instance after a restart.
-    pub(super) fn announce(&self, state: &State, behaviour: Behaviour) {
+    pub(super) fn announce(&self, state: &State) {
         let (epoch, version, oldest) = (state.progress.epoch, state.progress.version, self.oldest);
-        self.batcher.set_phase(Phase { epoch, version, oldest, behaviour });
-        self.publisher.publish(version, behaviour, &state.target);
+        self.batcher.set_phase(Phase { epoch, version, oldest });
+        self.publisher.publish(version, &state.target);
     }
 
     /// With the next version, unrolls of all versions so far are superseded.

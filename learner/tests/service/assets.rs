@@ -11,7 +11,7 @@ use comic_clips::Asset;
 use comic_learner::checkpoint::{Name, Snapshot, Store};
 use comic_learner::service::offer::Offer;
 use comic_learner::train::writer::Writer;
-use comic_proto::v1::{AssetRequest, Behaviour, CheckpointReply, CheckpointRequest};
+use comic_proto::v1::{AssetRequest, CheckpointReply, CheckpointRequest};
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
 use sha2::{Digest as _, Sha256};
@@ -120,7 +120,7 @@ async fn an_evaluator_learns_of_the_newest_checkpoint_and_fetches_its_files() {
     writer.finish().unwrap();
     let kept = |updates| run.path().join(format!("checkpoints/checkpoint-{updates:010}")).exists();
     assert_eq!([4, 5, 6].map(kept), [true, false, true]);
-    world.publisher.publish(1, Behaviour::Policy, &Bytes::from_static(b"parameters"));
+    world.publisher.publish(1, &Bytes::from_static(b"parameters"));
     world.publisher.end_run();
     assert!(ask().await.run_over);
 }

@@ -8,7 +8,7 @@ use comic_learner::publish::Publisher;
 use comic_learner::security::{ConnectionLimits, Security};
 use comic_learner::service::quarantine::QuarantineArguments;
 use comic_learner::service::{Service, Setup};
-use comic_proto::v1::{Behaviour, Environments, JoinRequest, StatusRequest, Verdict, WatchRequest};
+use comic_proto::v1::{Environments, JoinRequest, StatusRequest, Verdict, WatchRequest};
 use comic_proto::{PROTOCOL_VERSION, UnrollLayout, UnrollShape};
 use tonic::Code;
 
@@ -85,7 +85,7 @@ async fn parameters_are_for_actors_that_have_joined() {
     let unknown = WatchRequest { incarnation: 71, ..WatchRequest::default() };
     let refused = world.client().await.watch_parameters(unknown).await.unwrap_err();
     assert_eq!(refused.code(), Code::FailedPrecondition, "{refused}");
-    world.publisher.publish(1, Behaviour::Policy, &parameters(1, 10));
+    world.publisher.publish(1, &parameters(1, 10));
     let mut watch = world.actor(70).await.watch().await;
     assert_eq!(watch.message().await.unwrap().unwrap().version, 1);
 }

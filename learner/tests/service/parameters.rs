@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use crate::support::{EPOCH, World, parameters, within};
 use comic_learner::publish::{Holding, Publisher};
-use comic_proto::v1::{Behaviour, ParametersChunk};
+use comic_proto::v1::ParametersChunk;
 use tonic::Streaming;
 
 const MEGABYTE: usize = 1024 * 1024;
@@ -34,7 +34,7 @@ async fn each_version_arrives_whole_and_a_late_reader_gets_the_newest() {
     let mut actor = world.actor(70).await;
     let mut early = actor.watch().await;
     for number in 1..4 {
-        world.publisher.publish(number, Behaviour::Policy, &parameters(number, MEGABYTE + 1));
+        world.publisher.publish(number, &parameters(number, MEGABYTE + 1));
         assert_eq!(version(&mut early).await, (number, vec![number as u8; MEGABYTE + 1]));
     }
     let mut late = actor.watch().await;
@@ -47,11 +47,11 @@ async fn a_slow_reader_skips_the_versions_in_between() {
     let mut actor = world.actor(70).await;
     let mut slow = actor.watch().await;
     // Far more than windows and buffers hold, so the reader still reads the first version when the others are published.
-    world.publisher.publish(1, Behaviour::Policy, &parameters(1, 16 * MEGABYTE));
+    world.publisher.publish(1, &parameters(1, 16 * MEGABYTE));
     let begun = slow.message().await.unwrap().unwrap();
     assert_eq!((begun.version, begun.offset), (1, 0));
     for number in 2..5 {
-        world.publisher.publish(number, Behaviour::Policy, &parameters(number, 100));
+        world.publisher.publish(number, &parameters(number, 100));
     }
     let mut pieces = vec![begun];
     while pieces.last().unwrap().version == 1 {
@@ -74,12 +74,12 @@ fn impatient(versions: usize) -> Publisher {
 #[tokio::test]
 async fn a_slow_reader_finishes_its_version_while_many_others_are_published() {
     let publisher = Publisher::new(EPOCH);
-    publisher.publish(1, Behaviour::Policy, &parameters(1, MEGABYTE));
+    publisher.publish(1, &parameters(1, MEGABYTE));
     let pieces = publisher.newest().unwrap().frames().len() as u64;
     let mut slow = publisher.subscribe();
     for number in 2..=pieces {
         assert_eq!(slow.next().await.unwrap().version, 1);
-        publisher.publish(number, Behaviour::Policy, &parameters(number, MEGABYTE));
+        publisher.publish(number, &parameters(number, MEGABYTE));
         // Other readers begin each version, and some never finish.
         let mut other = publisher.subscribe();
         other.next().await.unwrap();
@@ -92,12 +92,12 @@ async fn a_slow_reader_finishes_its_version_while_many_others_are_published() {
 #[tokio::test]
 async fn a_stalled_reader_starts_again_with_the_newest_version_after_its_own_was_replaced() {
     let publisher = impatient(1);
-    publisher.publish(1, Behaviour::Policy, &parameters(1, MEGABYTE));
+    publisher.publish(1, &parameters(1, MEGABYTE));
     let mut stalled = publisher.subscribe();
     assert_eq!(stalled.next().await.unwrap().version, 1);
-    publisher.publish(2, Behaviour::Policy, &parameters(2, MEGABYTE));
+    publisher.publish(2, &parameters(2, MEGABYTE));
     assert_eq!(publisher.subscribe().next().await.unwrap().version, 2);
-    publisher.publish(3, Behaviour::Policy, &parameters(3, MEGABYTE));
+    publisher.publish(3, &parameters(3, MEGABYTE));
     let newest = publisher.subscribe().next().await;
     assert_eq!(newest.as_ref().unwrap().version, 3);
     assert_eq!(stalled.next().await, newest);
@@ -107,12 +107,12 @@ async fn a_stalled_reader_starts_again_with_the_newest_version_after_its_own_was
 async fn when_no_version_can_be_added_a_reader_begins_the_newest_held_one_or_waits() {
     let patient = Holding { versions: 1, idle: Duration::from_secs(3600), longest: Duration::from_secs(3600) };
     let publisher = Publisher::holding(EPOCH, patient);
-    publisher.publish(1, Behaviour::Policy, &parameters(1, MEGABYTE));
+    publisher.publish(1, &parameters(1, MEGABYTE));
     let mut first = publisher.subscribe();
     assert_eq!(first.next().await.unwrap().version, 1);
     let pieces = publisher.newest().unwrap().frames().len();
-    publisher.publish(2, Behaviour::Policy, &parameters(2, 1));
-    publisher.publish(3, Behaviour::Policy, &parameters(3, MEGABYTE));
+    publisher.publish(2, &parameters(2, 1));
+    publisher.publish(3, &parameters(3, MEGABYTE));
     let mut second = publisher.subscribe();
     for _ in 0..pieces {
         assert_eq!(second.next().await.unwrap().version, 1);
@@ -130,7 +130,7 @@ async fn the_versions_in_memory_are_bounded_while_readers_stall() {
     let publisher = impatient(4);
     let mut stalled = Vec::new();
     for number in 1..100 {
-        publisher.publish(number, Behaviour::Policy, &parameters(number, MEGABYTE));
+        publisher.publish(number, &parameters(number, MEGABYTE));
         let mut reader = publisher.subscribe();
         assert_eq!(reader.next().await.unwrap().version, number);
         stalled.push(reader);
@@ -143,7 +143,7 @@ async fn the_versions_in_memory_are_bounded_while_readers_stall() {
 #[tokio::test]
 async fn readers_share_one_encoded_copy() {
     let publisher = Publisher::new(EPOCH);
-    publisher.publish(1, Behaviour::Policy, &parameters(1, MEGABYTE));
+    publisher.publish(1, &parameters(1, MEGABYTE));
     let pieces = [publisher.subscribe().next().await.unwrap(), publisher.subscribe().next().await.unwrap()];
     assert_eq!(pieces[0].frame.as_ptr(), pieces[1].frame.as_ptr());
 }
@@ -151,11 +151,11 @@ async fn readers_share_one_encoded_copy() {
 #[tokio::test]
 async fn a_piece_that_is_being_sent_keeps_no_other_piece_in_memory() {
     let publisher = Publisher::new(EPOCH);
-    publisher.publish(1, Behaviour::Policy, &parameters(1, MEGABYTE));
+    publisher.publish(1, &parameters(1, MEGABYTE));
     let mut stalled = publisher.subscribe();
     let [held, next] = [stalled.next().await.unwrap().frame, stalled.next().await.unwrap().frame];
     drop(next);
-    publisher.publish(2, Behaviour::Policy, &parameters(2, 1));
+    publisher.publish(2, &parameters(2, 1));
     drop(stalled);
     assert!(held.is_unique(), "the piece shares its memory with no other");
 }
@@ -165,8 +165,8 @@ async fn the_end_of_the_run_is_sent_and_ends_the_stream() {
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut stream = actor.watch().await;
-    world.publisher.publish(1, Behaviour::Demonstration, &parameters(1, 10));
-    assert_eq!(stream.message().await.unwrap().unwrap().behaviour(), Behaviour::Demonstration);
+    world.publisher.publish(1, &parameters(1, 10));
+    assert!(!stream.message().await.unwrap().unwrap().run_over);
     world.publisher.end_run();
     let last = within(Duration::from_secs(10), stream.message()).await.unwrap().unwrap();
     assert_eq!((last.run_over, last.total), (true, 0));
@@ -176,7 +176,7 @@ async fn the_end_of_the_run_is_sent_and_ends_the_stream() {
 #[tokio::test]
 async fn an_older_version_is_not_published() {
     let publisher = Publisher::new(EPOCH);
-    publisher.publish(5, Behaviour::Policy, &parameters(5, 1));
-    publisher.publish(4, Behaviour::Policy, &parameters(4, 1));
+    publisher.publish(5, &parameters(5, 1));
+    publisher.publish(4, &parameters(4, 1));
     assert_eq!(publisher.newest_version(), 5);
 }

@@ -5,7 +5,7 @@
 use std::time::{Duration, Instant};
 
 use crate::support::{BATCH, World, joining, parameters, within};
-use comic_proto::v1::{Behaviour, StatusRequest, Verdict};
+use comic_proto::v1::{StatusRequest, Verdict};
 use tonic::{Code, Status};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
@@ -86,8 +86,8 @@ async fn the_end_of_the_run_is_delivered_while_the_server_closes() {
     let mut world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut watch = actor.watch().await;
-    world.publisher.publish(1, Behaviour::Policy, &parameters(1, 10));
-    assert_eq!(watch.message().await.unwrap().unwrap().behaviour(), Behaviour::Policy);
+    world.publisher.publish(1, &parameters(1, 10));
+    assert_eq!(watch.message().await.unwrap().unwrap().version, 1);
     world.publisher.end_run();
     world.begin_shutdown();
     let last = within(LIMIT, watch.message()).await.unwrap().unwrap();
@@ -99,7 +99,7 @@ async fn the_end_of_the_run_is_delivered_while_the_server_closes() {
 async fn an_actor_that_does_not_read_cannot_delay_the_end() {
     let mut world = World::start().await;
     let mut actor = world.actor(70).await;
-    world.publisher.publish(1, Behaviour::Policy, &parameters(1, 64 * 1024 * 1024));
+    world.publisher.publish(1, &parameters(1, 64 * 1024 * 1024));
     let unread = actor.watch().await;
     let begun = Instant::now();
     world.begin_shutdown();

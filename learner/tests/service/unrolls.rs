@@ -7,7 +7,7 @@ use std::time::Duration;
 use crate::support::{BATCH, EPOCH, World, within};
 use bytes::Bytes;
 use comic_learner::service::quarantine::QuarantineArguments;
-use comic_proto::v1::{Behaviour, UnrollMessage, Verdict};
+use comic_proto::v1::{UnrollMessage, Verdict};
 use comic_proto::{Field, UnrollBuffer};
 use comic_replay::{Next, Phase};
 use tonic::Code;
@@ -106,7 +106,7 @@ async fn old_unrolls_are_stale_and_those_of_another_epoch_or_phase_superseded() 
     let world = World::start().await;
     let mut actor = world.actor(70).await;
     let mut unrolls = actor.stream().await;
-    world.batcher.set_phase(Phase { epoch: EPOCH, version: 6, oldest: 0, behaviour: Behaviour::Policy });
+    world.batcher.set_phase(Phase { epoch: EPOCH, version: 6, oldest: 0 });
     let ack = unrolls.send(actor.unroll(0)).await.unwrap();
     assert_eq!((ack.verdict(), ack.detail.as_str()), (Verdict::Stale, "version 0 is too old, the newest is 6"));
 
@@ -116,10 +116,10 @@ async fn old_unrolls_are_stale_and_those_of_another_epoch_or_phase_superseded() 
     let ack = unrolls.send(earlier).await.unwrap();
     assert_eq!((ack.verdict(), ack.detail.as_str()), (Verdict::Rejoin, "made in learner epoch 2, this is 3"));
 
-    let demonstration = actor.unroll_with(2, |header| header.behaviour = Behaviour::Demonstration.into());
-    let ack = unrolls.send(demonstration).await.unwrap();
-    assert_eq!(ack.verdict(), Verdict::Superseded);
-    assert!(ack.detail.contains("the policy's own unrolls"), "{}", ack.detail);
+    world.batcher.set_phase(Phase { epoch: EPOCH, version: 6, oldest: 6 });
+    let ack = unrolls.send(actor.unroll(2)).await.unwrap();
+    let detail = "version 0 is of an earlier phase, which ended before version 6";
+    assert_eq!((ack.verdict(), ack.detail.as_str()), (Verdict::Superseded, detail));
     let accounting = actor.accounting().await;
     assert_eq!((accounting.dropped_stale, accounting.dropped_superseded, accounting.in_flight), (1, 2, 0));
 }

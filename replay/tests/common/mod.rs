@@ -6,11 +6,13 @@ use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 
 use bytes::Bytes;
-use comic_proto::v1::{Behaviour, UnrollHeader};
+use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{Batch, BatchOrder, Batcher, Config, Ledger, Next, Outcome, Phase};
 
-pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, oldest: 0, behaviour: Behaviour::Policy };
+pub(crate) const PHASE: Phase = Phase { epoch: 1, version: 10, oldest: 0 };
+/// The phase after it: unrolls of its version are superseded.
+pub(crate) const NEXT_PHASE: Phase = Phase { version: PHASE.version + 1, oldest: PHASE.version + 1, ..PHASE };
 pub(crate) const CONFIG: Config = Config { unrolls: 3, max_staleness: 4, ahead: 2, order: BatchOrder::Arrival };
 /// Slots that can be filled without a trainer: those of the open batch and of the full one.
 pub(crate) const SLOTS: usize = 2 * CONFIG.unrolls;
@@ -70,7 +72,6 @@ impl Actor {
             learner_epoch: PHASE.epoch,
             version: PHASE.version,
             layout_hash: layout().hash().to_vec(),
-            behaviour: PHASE.behaviour.into(),
             episodes: Vec::new(),
             environment: 0,
             task: task_of(sequence) as u32,

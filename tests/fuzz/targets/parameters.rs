@@ -8,7 +8,7 @@ use bytes::Bytes;
 use comic_actor::session::{Assembled, Assembler};
 use comic_fuzz::{experiment, seed, spec};
 use comic_networks::{VmpoPolicy, from_safetensors, to_safetensors};
-use comic_proto::v1::{Behaviour, ParametersChunk};
+use comic_proto::v1::ParametersChunk;
 use libfuzzer_sys::fuzz_target;
 use prost::Message;
 use tch::{Device, nn};
@@ -29,7 +29,6 @@ fn store() -> nn::VarStore {
     let piece = |offset: usize, data: Bytes| ParametersChunk {
         learner_epoch: 1,
         version: 1,
-        behaviour: Behaviour::Policy.into(),
         total: whole.len() as u64,
         offset: offset as u64,
         data,

@@ -6,7 +6,7 @@ use std::sync::{Arc, LazyLock};
 
 use bytes::Bytes;
 use comic_fuzz::{experiment, layout, seed, spec};
-use comic_proto::v1::{Behaviour, UnrollHeader, UnrollMessage};
+use comic_proto::v1::{UnrollHeader, UnrollMessage};
 use comic_proto::{Expected, Field, Pieces, ReceivedUnroll, UnrollBuffer, UnrollLayout, validate};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Phase, TaskAccounting};
 use futures::executor::block_on;
@@ -31,7 +31,6 @@ static SERVICE: LazyLock<Service> = LazyLock::new(|| {
     }
     let header = UnrollHeader {
         layout_hash: layout.hash().to_vec(),
-        behaviour: Behaviour::Policy.into(),
         ..UnrollHeader::default()
     };
     let message = UnrollMessage { header: Some(header), payload: unroll.into_bytes() }.encode_to_vec();

@@ -122,7 +122,6 @@ impl FakeLearner {
         let piece = |(index, data): (usize, &[u8])| ParametersChunk {
             learner_epoch: 1,
             version,
-            behaviour: Behaviour::Policy.into(),
             total,
             offset: (index * PIECE) as u64,
             data: data.to_vec().into(),

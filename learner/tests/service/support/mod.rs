@@ -17,7 +17,7 @@ use comic_learner::service::quarantine::QuarantineArguments;
 use comic_learner::service::{Service, Setup, serve};
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{
-    Behaviour, JoinReply, JoinRequest, ParametersChunk, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict,
+    JoinReply, JoinRequest, ParametersChunk, StatusRequest, UnrollAck, UnrollHeader, UnrollMessage, Verdict,
     WatchRequest,
 };
 use comic_proto::{Access, Client, Field, PROTOCOL_VERSION, UnrollBuffer, UnrollLayout, UnrollShape};
@@ -109,7 +109,7 @@ impl World {
         };
         let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
         let config = Config { unrolls: BATCH, max_staleness: 5, ahead: 2, order: BatchOrder::Arrival };
-        let phase = Phase { epoch: EPOCH, version: 0, oldest: 0, behaviour: Behaviour::Policy };
+        let phase = Phase { epoch: EPOCH, version: 0, oldest: 0 };
         let batcher = Batcher::new(layout, config, phase, Ledger::new());
         let publisher = Publisher::new(EPOCH);
         let setup = Setup {
@@ -225,7 +225,6 @@ impl Actor {
             learner_epoch: self.reply.learner_epoch,
             version: 0,
             layout_hash: self.layout.hash().to_vec(),
-            behaviour: Behaviour::Policy.into(),
             episodes: Vec::new(),
             environment: 0,
             task: 0,
