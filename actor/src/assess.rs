@@ -22,9 +22,9 @@ use serde::Serialize;
 
 use crate::Error;
 use crate::acting_loop::{ActingLoop, Controller, Recorder, Rollout};
+use crate::film::recorder::{Look, Recorder as Film};
 use crate::forward_pass::{ActingBatch, ActingRow, ForwardPass, LowLevelShape};
 use crate::policy::actuate;
-use crate::render::recorder::{Look, Recorder as Film};
 
 /// Height of the head below which the humanoid has fallen, m.
 const FALLEN: f64 = 1.2;

@@ -13,7 +13,7 @@
 //! - [`run`] is the actor process made of these parts.
 //! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads the learner's checkpoints.
 //! - [`latents`] collects latents for a prior, and [`assess`] measures a low level before anything is learned with it.
-//! - [`render`] films a policy, or shows it in a window.
+//! - [`film`] draws and writes films; [`render`] films a policy, or shows it in a window.
 //! - [`clips`] is `comic-actor clips`: motion capture from files and from the network.
 //!
 //! No loss is computed here. All memory is bounded: full unrolls wait in a bounded channel, unrolls without
@@ -26,6 +26,7 @@ pub mod clips;
 pub mod dump;
 mod error;
 pub mod evaluate;
+pub mod film;
 pub mod forward_pass;
 pub mod latents;
 pub mod liveness;

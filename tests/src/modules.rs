@@ -3,8 +3,9 @@
 //! Module A needs module B when a path in A leads to B. Every path counts: in `use`, in expressions, in types, in macros and
 //! in attributes. Code under `#[cfg(test)]` does not count.
 //!
-//! A module and the modules inside it may need each other: the outer module declares the inner ones and re-exports their
-//! items, and the inner ones use its types. No other circle is allowed.
+//! A module stands for itself and all modules inside it: a folder is one module to its siblings. Inside, a module and the
+//! modules in it may need each other: the outer module declares the inner ones and re-exports their items, and the inner
+//! ones use its types. No other circle is allowed.
 
 mod source;
 mod tree;
@@ -25,7 +26,7 @@ pub struct Circle {
     pub modules: Vec<String>,
     /// A shortest chain among them: the module, the one that it needs, and the place of the path, as `file:line`.
     pub chain: Vec<(String, String, String)>,
-    /// Every place where one of the modules needs another.
+    /// Every place where one of the modules, or a module inside it, needs another.
     pub edges: Vec<(String, String, String)>,
 }
 
@@ -46,35 +47,19 @@ impl fmt::Display for Circle {
 pub fn circles(root: &str, files: &BTreeMap<&str, &str>) -> Result<Vec<Circle>> {
     let tree = Tree::read(root, files)?;
     let edges = tree.edges();
-    let mut found = Vec::new();
-    search(&tree, &edges, (0..tree.modules.len()).collect(), &mut found);
-    Ok(found)
-}
-
-/// Looks for circles among `members`.
-fn search(tree: &Tree, edges: &[Edge], members: Vec<Id>, found: &mut Vec<Circle>) {
-    for component in components(edges, &members) {
-        // A module that contains all others may be in a circle with them. The others may have circles without it.
-        let outer = component.iter().find(|outer| component.iter().all(|id| id == *outer || tree.holds(**outer, *id)));
-        match outer {
-            Some(outer) => search(tree, edges, component.iter().copied().filter(|id| id != outer).collect(), found),
-            None => found.push(circle(tree, edges, &component)),
-        }
-    }
+    Ok(components(&edges, tree.modules.len()).iter().map(|component| circle(&tree, &edges, component)).collect())
 }
 
 /// The strongly connected components of at least two modules.
-fn components(edges: &[Edge], members: &[Id]) -> Vec<Vec<Id>> {
-    let mut graph = DiGraph::<Id, ()>::new();
-    let nodes: BTreeMap<Id, NodeIndex> = members.iter().map(|id| (*id, graph.add_node(*id))).collect();
+fn components(edges: &[Edge], modules: usize) -> Vec<Vec<Id>> {
+    let mut graph = DiGraph::<(), ()>::new();
+    let nodes: Vec<NodeIndex> = (0..modules).map(|_| graph.add_node(())).collect();
     for edge in edges {
-        if let (Some(from), Some(to)) = (nodes.get(&edge.from), nodes.get(&edge.to)) {
-            graph.add_edge(*from, *to, ());
-        }
+        graph.add_edge(nodes[edge.from], nodes[edge.to], ());
     }
     let components = tarjan_scc(&graph).into_iter().filter(|component| component.len() > 1);
     let mut components: Vec<Vec<Id>> =
-        components.map(|component| component.into_iter().map(|node| graph[node]).collect()).collect();
+        components.map(|component| component.into_iter().map(NodeIndex::index).collect()).collect();
     for component in &mut components {
         component.sort_unstable();
     }
@@ -85,21 +70,16 @@ fn components(edges: &[Edge], members: &[Id]) -> Vec<Vec<Id>> {
 fn circle(tree: &Tree, edges: &[Edge], component: &[Id]) -> Circle {
     let inside: Vec<&Edge> =
         edges.iter().filter(|edge| component.contains(&edge.from) && component.contains(&edge.to)).collect();
-    // The chain contains an edge between two modules with different outermost modules. So no module contains all the others.
-    let outermost = |id: Id| component.iter().copied().find(|outer| *outer == id || tree.holds(*outer, id));
-    let crossing = inside.iter().filter(|edge| outermost(edge.from) != outermost(edge.to));
-    let chain = crossing
-        .filter_map(|edge| {
-            let mut chain = shortest(&inside, edge.to, edge.from)?;
-            chain.insert(0, edge);
-            Some(chain)
-        })
-        .min_by_key(Vec::len);
-    let say =
-        |edge: &&Edge| (tree.modules[edge.from].name.clone(), tree.modules[edge.to].name.clone(), tree.place(edge));
+    let chains = inside.iter().filter_map(|edge| {
+        let mut chain = shortest(&inside, edge.to, edge.from)?;
+        chain.insert(0, edge);
+        Some(chain)
+    });
+    let name = |id: Id| tree.modules[id].name.clone();
+    let say = |edge: &&Edge| (name(edge.from), name(edge.to), edge.place.clone());
     Circle {
-        modules: component.iter().map(|id| tree.modules[*id].name.clone()).collect(),
-        chain: chain.unwrap_or_default().iter().map(say).collect(),
+        modules: component.iter().copied().map(name).collect(),
+        chain: chains.min_by_key(Vec::len).unwrap_or_default().iter().map(say).collect(),
         edges: inside.iter().map(say).collect(),
     }
 }

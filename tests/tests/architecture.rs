@@ -68,7 +68,7 @@ fn shipped_programs_contain_no_benchmarks() -> Result<()> {
     ["comic-actor", "comic-learner"].iter().try_for_each(|package| does_not_depend_on(package, &[&["comic-bench"]]))
 }
 
-/// A module and the modules inside it may need each other. With `--no-capture` this lists every circle in full.
+/// A folder is one module to its siblings; a module and the modules inside it may need each other. With `--no-capture` this lists every circle in full.
 #[test]
 fn no_modules_import_each_other_in_a_circle() -> Result<()> {
     let sources = sources()?;

@@ -18,9 +18,9 @@ use super::{Audience, Report, evaluate, watch};
 use crate::Error;
 use crate::acting_loop::Controller;
 use crate::checkpoint::{self, Checkpoint, Position};
+use crate::film::encode::Format;
+use crate::film::recorder::{Look, Recorder};
 use crate::policy::TorchPolicy;
-use crate::render::encode::Format;
-use crate::render::recorder::{Look, Recorder};
 
 const JSON_HELP: &str = "\
 With --json one object goes to standard output:

@@ -20,8 +20,8 @@ use super::settings::{RolloutSettings, Starts};
 use super::{Audience, Report, evaluate};
 use crate::Error;
 use crate::acting_loop::Controller;
+use crate::film::recorder::{Look, Recorder};
 use crate::policy::TorchPolicy;
-use crate::render::recorder::{Look, Recorder};
 use crate::session::{Failure, Fetched, Follower};
 
 /// Episodes of an evaluation, at most. They always start at the same frames.

@@ -6,10 +6,11 @@ use std::path::PathBuf;
 use clap::Args;
 use comic_tasks::Simulated;
 
-use super::recorder::{Look, Recorder};
 use super::scene::Scene;
 use crate::Error;
 use crate::evaluate::Audience;
+use crate::film::encode::Format;
+use crate::film::recorder::{Look, Recorder};
 
 /// The most seconds of an episode that are filmed unless asked for.
 const USUAL_SECONDS: f64 = 10.0;
@@ -38,7 +39,7 @@ impl Render {
     /// A wrong command line, a checkpoint that cannot be used, a failing rollout or film.
     pub fn run(&self) -> Result<(), Error> {
         // Errors of the film's options are reported before the task is built.
-        super::encode::Format::of(&self.out)?;
+        Format::of(&self.out)?;
         self.look.suits(self.scene.task())?;
         let mut cast = self.scene.cast()?;
         let step = cast.task.control_timestep();

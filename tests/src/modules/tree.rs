@@ -27,12 +27,12 @@ pub(super) struct Module {
     contents: Contents,
 }
 
-/// A module uses something of another one.
+/// A module, or one inside it, uses something of another one, or of a module inside that one. Both have the same parent.
 pub(super) struct Edge {
     pub(super) from: Id,
     pub(super) to: Id,
-    /// Where `from` does so.
-    pub(super) line: usize,
+    /// Where, as `path:line`.
+    pub(super) place: String,
 }
 
 impl Tree {
@@ -81,17 +81,17 @@ impl Tree {
 
     /// Whether `ancestor` contains `module`, at any depth.
     pub(super) fn holds(&self, ancestor: Id, module: Id) -> bool {
-        let mut at = self.modules[module].parent;
-        while let Some(id) = at {
-            if id == ancestor {
-                return true;
-            }
-            at = self.modules[id].parent;
-        }
-        false
+        module != ancestor && self.chain(module).contains(&ancestor)
     }
 
-    /// Every edge between two modules, with its first line.
+    /// The root, and so on down to the module itself.
+    fn chain(&self, module: Id) -> Vec<Id> {
+        let mut chain: Vec<Id> = std::iter::successors(Some(module), |at| self.modules[*at].parent).collect();
+        chain.reverse();
+        chain
+    }
+
+    /// Every edge, with the first line of each module that causes it.
     pub(super) fn edges(&self) -> Vec<Edge> {
         let mut first: BTreeMap<(Id, Id), usize> = BTreeMap::new();
         for (from, module) in self.modules.iter().enumerate() {
@@ -103,7 +103,13 @@ impl Tree {
                 }
             }
         }
-        first.into_iter().map(|((from, to), line)| Edge { from, to, line }).collect()
+        let edge = |((user, used), line): ((Id, Id), usize)| {
+            // If one module is inside the other, there is no edge.
+            let mut levels = self.chain(user).into_iter().zip(self.chain(used));
+            let (from, to) = levels.find(|(from, to)| from != to)?;
+            Some(Edge { from, to, place: format!("{}:{line}", self.modules[user].file) })
+        };
+        first.into_iter().filter_map(edge).collect()
     }
 
     /// The module that a path leads to. `user` names it; `at` is the module in which it is written.
@@ -156,11 +162,6 @@ impl Tree {
             let imported = || contents.imports.iter().any(|import| import.name.as_deref() == Some(name));
             children.contains_key(name) || contents.defined.contains(name) || imported()
         })
-    }
-
-    /// The place of an edge, as `path:line`.
-    pub(super) fn place(&self, edge: &Edge) -> String {
-        format!("{}:{}", self.modules[edge.from].file, edge.line)
     }
 }
 
