@@ -1,8 +1,9 @@
-//! Renders the overlays of the Kubernetes manifests as kustomize does, and reads them strictly.
+//! Renders the overlays of the Kubernetes manifests with kubectl, and reads them strictly.
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use anyhow::{Context, Result, bail, ensure};
 use k8s_openapi::api::batch::v1::Job;
@@ -37,66 +38,16 @@ pub fn applicable() -> Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-/// The fields of a kustomization that the overlays use.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields, rename_all = "camelCase")]
-struct Kustomization {
-    api_version: String,
-    kind: String,
-    namespace: Option<String>,
-    #[serde(default)]
-    resources: Vec<PathBuf>,
-    #[serde(default)]
-    patches: Vec<Patch>,
-}
-
-/// A file of JSON patches (RFC 6902) and the manifest that they change.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Patch {
-    path: PathBuf,
-    target: Target,
-}
-
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Target {
-    kind: String,
-    name: String,
-}
-
 /// The manifests that `kubectl apply --kustomize DIRECTORY` applies.
 ///
 /// # Errors
-/// Missing files, unknown fields of a kustomization, patches that do not apply.
+/// When kubectl, which `cargo xtask test` installs, does not exist or refuses the directory.
 pub fn render(directory: &Path) -> Result<Manifests> {
-    let file = directory.join("kustomization.yaml");
-    let read = || anyhow::Ok(serde_yaml_ng::from_str::<Kustomization>(&fs::read_to_string(&file)?)?);
-    let kustomization = read().with_context(|| file.display().to_string())?;
-    ensure!(kustomization.kind == "Kustomization", "{}: {}", file.display(), kustomization.kind);
-    ensure!(kustomization.api_version == "kustomize.config.k8s.io/v1beta1", "{}", kustomization.api_version);
-    let mut manifests = Manifests::new();
-    for resource in &kustomization.resources {
-        let path = directory.join(resource);
-        let found = if path.is_dir() { render(&path)? } else { manifests_in(&fs::read_to_string(&path)?)? };
-        for (name, manifest) in found {
-            ensure!(manifests.insert(name.clone(), manifest).is_none(), "{name:?} is there twice");
-        }
-    }
-    if let Some(namespace) = &kustomization.namespace {
-        for ((kind, name), manifest) in &mut manifests {
-            match kind.as_str() {
-                "Namespace" => ensure!(name == namespace, "another namespace: {name}"),
-                _ => manifest["metadata"]["namespace"] = namespace.as_str().into(),
-            }
-        }
-    }
-    for Patch { path, target: Target { kind, name } } in kustomization.patches {
-        let operations: json_patch::Patch = serde_yaml_ng::from_str(&fs::read_to_string(directory.join(&path))?)?;
-        let manifest = manifests.get_mut(&(kind, name)).with_context(|| format!("{}: no target", path.display()))?;
-        json_patch::patch(manifest, &operations).with_context(|| format!("{} does not fit", path.display()))?;
-    }
-    Ok(manifests)
+    let kubectl = root().join(".deps/python/requirements-kubectl/bin/kubectl");
+    ensure!(kubectl.exists(), "no file {}; `cargo xtask test` makes it", kubectl.display());
+    let output = Command::new(kubectl).arg("kustomize").arg(directory).output().context("cannot start kubectl")?;
+    ensure!(output.status.success(), "{}: {}", directory.display(), String::from_utf8_lossy(&output.stderr));
+    manifests_in(str::from_utf8(&output.stdout)?)
 }
 
 /// The manifests of a file with several documents.

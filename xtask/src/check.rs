@@ -36,7 +36,8 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
         return test_xla(&options.arguments);
     }
     setup::run(&setup::Options::default())?;
-    // dm_control's own loader and TensorBoard read files of these programs, and policies act in dm_control's environment.
+    // dm_control's own loader and TensorBoard read files of these programs, policies act in dm_control's environment, and
+    // kubectl renders the manifests.
     python::prepare_tests()?;
     // The whole-system tests start the programs.
     workspace::build()?;
@@ -113,11 +114,6 @@ fn demanding(options: &TestOptions) -> Vec<Demanding> {
             prefix: "containers_",
             what: "run the images: they need `cargo xtask test --docker`",
             possible: options.docker,
-        },
-        Demanding {
-            prefix: "kustomize_",
-            what: "render the Kubernetes manifests a second time: they need kustomize or kubectl",
-            possible: answers("kustomize", &["version"]) || answers("kubectl", &["version", "--client"]),
         },
     ]
 }

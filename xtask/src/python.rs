@@ -40,9 +40,13 @@ pub(crate) fn fixtures(options: &FixtureOptions) -> Result<()> {
     Ok(())
 }
 
-/// Makes the environment in which tests run dm_control, torch and TensorBoard. Takes less than a second if it exists.
+/// Makes the environments in which tests run dm_control, torch and TensorBoard, and kubectl. Takes less than a second if
+/// they exist.
 pub(crate) fn prepare_tests() -> Result<()> {
-    environment(&workspace::root().join("tests/python/requirements-export.txt")).map(drop)
+    let directory = workspace::root().join("tests/python");
+    ["requirements-export.txt", "requirements-kubectl.txt"]
+        .iter()
+        .try_for_each(|name| environment(&directory.join(name)).map(drop))
 }
 
 /// A command that runs `tests/python/SCRIPT` with the packages of `tests/python/REQUIREMENTS`.
