@@ -2,13 +2,15 @@
 #![allow(clippy::unwrap_used, reason = "helpers of tests may panic")]
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use comic_experiment::{AlgorithmName, Experiment, TaskPart, TaskSpec};
 use comic_learner::algorithm::Algorithm as _;
-use comic_learner::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
+use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::algorithm::shape::MinibatchShape;
 use comic_learner::svg0::Svg0Learner;
-use comic_proto::{Field, PerField, UnrollShape};
+use comic_proto::{Field, UnrollLayout, UnrollShape};
+use comic_replay::Unrolls;
 use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 use tch::{Device, Tensor};
@@ -54,7 +56,7 @@ fn learner(experiment: &Experiment) -> Svg0Learner {
 /// Sequences as they come over the wire.
 #[derive(Clone)]
 struct Sequences {
-    floats: PerField<Vec<f32>>,
+    unrolls: Unrolls,
     shape: MinibatchShape,
 }
 
@@ -62,36 +64,29 @@ impl Sequences {
     fn new(experiment: &Experiment, count: usize, seed: u64) -> Self {
         let unroll = UnrollShape::new(&spec(), experiment);
         let mut random = Pcg64::seed_from_u64(seed);
-        let floats = PerField::from_fn(|field| {
-            let elements = match field {
-                Field::Clip | Field::Image => 0,
-                _ => count * field.rows(unroll.length) * field.width(&unroll),
-            };
-            let number = |_| match field {
+        let mut unrolls = Unrolls::new(Arc::new(UnrollLayout::new(unroll)), count);
+        for field in Field::ALL {
+            unrolls.f32_mut(field).fill_with(|| match field {
                 Field::Std => random.random_range(0.5..1.0),
                 Field::Discount | Field::Valid => 1.0,
                 Field::First => 0.0,
                 Field::State => random.random_range(-0.2..0.2),
                 _ => random.random_range(-1.0_f32..1.0),
-            };
-            (0..elements).map(number).collect()
-        });
-        Self { floats, shape: MinibatchShape { unrolls: count, tasks: 1, unroll } }
+            });
+        }
+        Self { unrolls, shape: MinibatchShape { unrolls: count, tasks: 1, unroll } }
     }
 
     fn tensors(&self) -> MinibatchTensors {
-        let rows = self.shape.unroll.length + 1;
-        let (clip, tasks) = (vec![0; self.shape.unrolls * rows], vec![0; self.shape.unrolls]);
-        let floats = self.floats.each_ref().map(|_, values| values.as_slice());
-        let source = MinibatchSource { floats, clip: &clip, image: &[], tasks: &tasks };
-        MinibatchTensors::new(&source, &self.shape, Device::Cpu).unwrap()
+        let tasks = vec![0; self.shape.unrolls];
+        MinibatchTensors::new(&self.unrolls, &tasks, &self.shape, Device::Cpu).unwrap()
     }
 
     /// The numbers of one row of a sequence.
     fn row(&mut self, field: Field, sequence: usize, t: usize) -> &mut [f32] {
         let (rows, width) = (field.rows(self.shape.unroll.length), field.width(&self.shape.unroll));
         let start = (sequence * rows + t) * width;
-        &mut self.floats[field][start..start + width]
+        &mut self.unrolls.f32_mut(field)[start..start + width]
     }
 
     /// Row `t` holds an episode's last observation.

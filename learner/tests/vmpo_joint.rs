@@ -244,7 +244,8 @@ fn a_batch_of_other_tasks_is_refused() {
     let mut learner = learner(&experiment);
     let mut unrolls = unrolls(&learner, &experiment, 6);
     unrolls.tasks[2] = 2;
-    let error = MinibatchTensors::new(&unrolls.source(), &unrolls.shape(), tch::Device::Cpu).unwrap_err();
+    let error =
+        MinibatchTensors::new(&unrolls.arrays(), &unrolls.tasks, &unrolls.shape(), tch::Device::Cpu).unwrap_err();
     assert_eq!(error.to_string(), "an unroll is of task 2, but there are only 2 tasks");
     unrolls.task_count = 3;
     let error = learner.step(&unrolls.minibatch()).unwrap_err().to_string();

@@ -178,9 +178,10 @@ fn a_clip_index_is_refused_if_the_task_has_fewer_clips() {
 
 #[test]
 fn a_field_of_the_wrong_length_is_named() {
-    let mut unrolls = unrolls(8);
-    unrolls.reward.pop();
-    let error = MinibatchTensors::new(&unrolls.source(), &unrolls.shape(), Device::Cpu).unwrap_err();
+    let unrolls = unrolls(8);
+    let mut shape = unrolls.shape();
+    shape.unroll.reward_terms += 1;
+    let error = MinibatchTensors::new(&unrolls.arrays(), &unrolls.tasks, &shape, Device::Cpu).unwrap_err();
     assert!(matches!(error, Error::Length { field: "reward", .. }));
 }
 

@@ -1,13 +1,14 @@
 //! A batch at the trainer.
 
-use std::fmt;
 use std::sync::Arc;
+use std::{fmt, mem};
 
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, Invalid, Pieces, UnrollLayout};
 
 use crate::accounting::Reason;
 use crate::buffer::Buffer;
+use crate::unrolls::Unrolls;
 
 /// Takes the memory of a batch back, and accounts for its unrolls.
 pub(crate) trait TakeBack: Send + Sync {
@@ -25,13 +26,13 @@ pub struct Batch {
     pub layout: Arc<UnrollLayout>,
     /// B, the number of unrolls.
     pub unrolls: usize,
-    buffer: Option<Box<Buffer>>,
+    buffer: Box<Buffer>,
     owner: Option<Box<dyn TakeBack>>,
 }
 
 impl Batch {
     pub(crate) fn new(layout: Arc<UnrollLayout>, buffer: Buffer, owner: Box<dyn TakeBack>) -> Self {
-        Self { layout, unrolls: buffer.len(), buffer: Some(Box::new(buffer)), owner: Some(owner) }
+        Self { layout, unrolls: buffer.len(), buffer: Box::new(buffer), owner: Some(owner) }
     }
 
     /// A batch of these unrolls that belongs to no batcher, for example from a recording.
@@ -43,36 +44,41 @@ impl Batch {
         unrolls: impl IntoIterator<Item = (UnrollHeader, impl Into<Pieces>), IntoIter: ExactSizeIterator>,
     ) -> Result<Self, Invalid> {
         let unrolls = unrolls.into_iter();
-        let mut buffer = Buffer::new(&layout, unrolls.len());
+        let mut buffer = Buffer::new(Arc::clone(&layout), unrolls.len());
         for (slot, (header, payload)) in unrolls.enumerate() {
             let payload = payload.into();
             if payload.len() != layout.size() {
                 return Err(Invalid::Length { found: payload.len(), expected: layout.size() });
             }
-            buffer.put(&layout, slot, header, &payload);
+            buffer.put(slot, header, &payload);
         }
-        Ok(Self { layout, unrolls: buffer.len(), buffer: Some(Box::new(buffer)), owner: None })
+        Ok(Self { layout, unrolls: buffer.len(), buffer: Box::new(buffer), owner: None })
+    }
+
+    /// The arrays of its unrolls.
+    pub fn as_unrolls(&self) -> &Unrolls {
+        &self.buffer.unrolls
     }
 
     /// A field of `f32`, `[B, rows, width]`. It is empty for [`Field::Clip`] and [`Field::Image`]; see
     /// [`clip`](Self::clip) and [`image`](Self::image).
     pub fn f32(&self, field: Field) -> &[f32] {
-        self.buffer.as_ref().map_or(&[], |buffer| &buffer.floats[field])
+        self.buffer.unrolls.f32(field)
     }
 
     /// The indices of the clips, `[B, T+1]`.
     pub fn clip(&self) -> &[u32] {
-        self.buffer.as_ref().map_or(&[], |buffer| &buffer.clips)
+        self.buffer.unrolls.clip()
     }
 
     /// The camera images, `[B, T+1, I]`; empty if the humanoid has no camera.
     pub fn image(&self) -> &[u8] {
-        self.buffer.as_ref().map_or(&[], |buffer| &buffer.images)
+        self.buffer.unrolls.image()
     }
 
     /// The headers, `[B]`, without the layout hash, which is equal in all of them.
     pub fn headers(&self) -> &[UnrollHeader] {
-        self.buffer.as_ref().map_or(&[], |buffer| &buffer.headers)
+        &self.buffer.headers
     }
 
     /// The task of each unroll, `[B]`: its index among the tasks of the experiment.
@@ -86,8 +92,9 @@ impl Batch {
     }
 
     fn give_back(&mut self, dropped: Option<Reason>) {
-        if let (Some(buffer), Some(owner)) = (self.buffer.take(), self.owner.take()) {
-            owner.take_back(*buffer, dropped);
+        if let Some(owner) = self.owner.take() {
+            let nothing = Buffer::new(Arc::clone(&self.layout), 0);
+            owner.take_back(mem::replace(&mut *self.buffer, nothing), dropped);
         }
     }
 }

@@ -82,7 +82,7 @@ impl Batcher {
         // The next unroll of an environment belongs to the next batch, so no batch can be assembled ahead.
         let ahead = if config.order == BatchOrder::Environment { 0 } else { config.ahead };
         let config = Config { unrolls: config.unrolls.max(1), ahead, ..config };
-        let mut free: Vec<_> = (0..=config.ahead).map(|_| Buffer::new(&layout, config.unrolls)).collect();
+        let mut free: Vec<_> = (0..=config.ahead).map(|_| Buffer::new(Arc::clone(&layout), config.unrolls)).collect();
         let open = free.pop();
         let state = Mutex::new(State { ledger, phase, next: None, open, free, closed: false });
         let slots = Semaphore::new(config.unrolls);
@@ -127,7 +127,7 @@ impl Batcher {
             ledger.refuse();
             return Outcome::Invalid;
         }
-        batch.put(&self.inner.layout, index, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
+        batch.put(index, UnrollHeader { layout_hash: Vec::new(), ..header.clone() }, &payload);
         slot.forget();
         self.settle(&mut state);
         Outcome::Taken
@@ -279,11 +279,11 @@ impl Batcher {
     /// Drops unrolls that wait in the batcher and frees their slots. Reservations of waiting inserts stay. The
     /// remaining unrolls of the open batch fill the next one.
     fn drop_waiting(&self, state: &mut State, reason: Reason, dropped: impl Fn(&UnrollHeader) -> bool) {
-        let (layout, State { ledger, next, open, .. }) = (&self.inner.layout, state);
+        let State { ledger, next, open, .. } = state;
         let waiting = [&mut *next, &mut *open].into_iter().flatten();
         let removed: Vec<u32> = waiting.flat_map(|batch| batch.retain(|header| !dropped(header))).collect();
         if let (Some(next), Some(open)) = (next, open) {
-            next.fill_from(layout, open);
+            next.fill_from(open);
         }
         self.inner.slots.add_permits(removed.len());
         removed.into_iter().for_each(|task| ledger.end(Some(task), Some(reason)));

@@ -4,6 +4,7 @@
 //! # Layout
 //! - [`Batcher`] connects service and trainer: the service's async tasks [`insert`](Batcher::insert) unrolls; the
 //!   trainer's thread takes [`Batch`]es and returns them with [`trained`](Batcher::trained).
+//! - [`Unrolls`] are arrays of unrolls: those of a batch, of a store, of a sample.
 //! - [`Ledger`] has the account of every actor (its next sequence number) and the sums.
 //! - [`Accounting`] has the sums, [`TaskAccounting`] those of one task. [`LedgerSnapshot`] is the ledger in a
 //!   checkpoint.
@@ -55,6 +56,7 @@ mod snapshot;
 mod store;
 mod streaming;
 mod tasks;
+mod unrolls;
 
 pub use accounting::{Accounting, AccountingByTask, Dropped, Reason, TaskAccounting};
 pub use batch::Batch;
@@ -64,3 +66,4 @@ pub use ledger::{JoinError, Joined, Ledger};
 pub use phase::Phase;
 pub use snapshot::{Account, Error, LedgerSnapshot};
 pub use store::{Sample, Store, StoreError};
+pub use unrolls::Unrolls;

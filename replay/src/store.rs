@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
-use comic_proto::{Field, PerField, UnrollLayout};
+use comic_proto::UnrollLayout;
 use rand::Rng;
 use rand::seq::index;
 
 use crate::batch::Batch;
+use crate::unrolls::Unrolls;
 
 /// A store that is too large for this machine, or too small for a minibatch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -38,14 +39,10 @@ pub enum StoreError {
 /// Sequences, which are unrolls, with the oldest overwritten first. Memory is allocated once; the system commits it when it is
 /// first written.
 ///
-/// An unroll enters once: the batcher gives it to the trainer once, in one batch. How often it is sampled is not limited.
+/// A batch is handed to the trainer once, in one batch. How often it is sampled is not limited.
 #[derive(Debug)]
 pub struct Store {
-    layout: Arc<UnrollLayout>,
-    capacity: usize,
-    floats: PerField<Vec<f32>>,
-    clips: Vec<u32>,
-    images: Vec<u8>,
+    sequences: Unrolls,
     tasks: Vec<usize>,
     /// Sequences inserted since the beginning. Sequence n is in slot n mod capacity.
     inserted: u64,
@@ -53,15 +50,11 @@ pub struct Store {
     sampled: u64,
 }
 
-/// Sequences that were sampled, as contiguous arrays `[B, rows, width]`. It is reused from sample to sample.
+/// Sequences that were sampled. It is reused from sample to sample.
 #[derive(Debug)]
 pub struct Sample {
-    /// Every field of `f32`; empty for clips and images.
-    pub floats: PerField<Vec<f32>>,
-    /// The indices of the clips, `[B, T+1]`.
-    pub clips: Vec<u32>,
-    /// The camera images, `[B, T+1, I]`.
-    pub images: Vec<u8>,
+    /// The sequences, B of them.
+    pub unrolls: Unrolls,
     /// The task of each sequence, `[B]`.
     pub tasks: Vec<usize>,
 }
@@ -80,18 +73,17 @@ impl Store {
         if needed > limit {
             return Err(StoreError::Memory { steps, needed, limit });
         }
-        let Sample { floats, clips, images, tasks } = Sample::new(&layout, capacity);
-        Ok(Self { layout, capacity, floats, clips, images, tasks, inserted: 0, sampled: 0 })
+        Ok(Self { sequences: Unrolls::new(layout, capacity), tasks: vec![0; capacity], inserted: 0, sampled: 0 })
     }
 
     /// Sequences that fit.
     pub fn capacity(&self) -> usize {
-        self.capacity
+        self.tasks.len()
     }
 
     /// Sequences that are there.
     pub fn len(&self) -> usize {
-        usize::try_from(self.inserted).map_or(self.capacity, |inserted| inserted.min(self.capacity))
+        usize::try_from(self.inserted).map_or(self.capacity(), |inserted| inserted.min(self.capacity()))
     }
 
     /// Whether there is none.
@@ -107,16 +99,8 @@ impl Store {
     /// Copies every unroll of a batch. The oldest sequences make room.
     pub fn insert(&mut self, batch: &Batch) {
         for (unroll, task) in batch.tasks().into_iter().enumerate() {
-            let slot = (self.inserted % self.capacity as u64) as usize;
-            for field in Field::ALL {
-                let elements = self.layout.elements(field);
-                let (from, to) = (unroll * elements..(unroll + 1) * elements, slot * elements..(slot + 1) * elements);
-                match field {
-                    Field::Clip => self.clips[to].copy_from_slice(&batch.clip()[from]),
-                    Field::Image => self.images[to].copy_from_slice(&batch.image()[from]),
-                    _ => self.floats[field][to].copy_from_slice(&batch.f32(field)[from]),
-                }
-            }
+            let slot = (self.inserted % self.capacity() as u64) as usize;
+            self.sequences.copy(slot, batch.as_unrolls(), unroll);
             self.tasks[slot] = task;
             self.inserted += 1;
         }
@@ -130,15 +114,7 @@ impl Store {
             return false;
         }
         for (place, slot) in index::sample(random, self.len(), count).into_iter().enumerate() {
-            for field in Field::ALL {
-                let elements = self.layout.elements(field);
-                let (from, to) = (slot * elements..(slot + 1) * elements, place * elements..(place + 1) * elements);
-                match field {
-                    Field::Clip => sample.clips[to].copy_from_slice(&self.clips[from]),
-                    Field::Image => sample.images[to].copy_from_slice(&self.images[from]),
-                    _ => sample.floats[field][to].copy_from_slice(&self.floats[field][from]),
-                }
-            }
+            sample.unrolls.copy(place, &self.sequences, slot);
             sample.tasks[place] = self.tasks[slot];
         }
         self.sampled += count as u64;
@@ -148,16 +124,7 @@ impl Store {
 
 impl Sample {
     /// Room for `sequences` sequences.
-    pub fn new(layout: &UnrollLayout, sequences: usize) -> Self {
-        let elements = |field: Field| layout.elements(field) * sequences;
-        Self {
-            floats: PerField::from_fn(|field| match field {
-                Field::Clip | Field::Image => Vec::new(),
-                _ => vec![0.0; elements(field)],
-            }),
-            clips: vec![0; elements(Field::Clip)],
-            images: vec![0; elements(Field::Image)],
-            tasks: vec![0; sequences],
-        }
+    pub fn new(layout: Arc<UnrollLayout>, sequences: usize) -> Self {
+        Self { unrolls: Unrolls::new(layout, sequences), tasks: vec![0; sequences] }
     }
 }

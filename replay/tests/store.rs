@@ -27,7 +27,7 @@ fn batches(count: u64, mut keep: impl FnMut(&Batch)) {
 /// The number of each sequence of a sample.
 fn numbers(sample: &Sample) -> Vec<u32> {
     let rows = layout().elements(Field::Clip);
-    sample.clips.chunks_exact(rows).map(|clips| clips[0]).collect()
+    sample.unrolls.clip().chunks_exact(rows).map(|clips| clips[0]).collect()
 }
 
 fn store(sequences: usize) -> Store {
@@ -43,7 +43,7 @@ fn the_oldest_sequences_make_room_and_the_rest_is_as_it_was_inserted() {
         assert!(store.len() <= 7);
     });
     assert_eq!((store.len(), store.counts()), (7, (15, 0)));
-    let mut sample = Sample::new(&layout(), 7);
+    let mut sample = Sample::new(layout(), 7);
     assert!(store.sample(&mut sample, &mut Pcg64::seed_from_u64(1)));
     let mut found = numbers(&sample);
     let header = |number: u32| Actor::join(&batcher(), 5).header(u64::from(number));
@@ -52,7 +52,7 @@ fn the_oldest_sequences_make_room_and_the_rest_is_as_it_was_inserted() {
             let (rows, width) = (layout().rows(field), layout().width(field));
             for t in 0..rows {
                 let start = (place * rows + t) * width;
-                let own = &sample.floats[field][start..start + width];
+                let own = &sample.unrolls.f32(field)[start..start + width];
                 assert_eq!(own, vec![mark(&header(*number), field, t); width], "{field}[{t}] of {number}");
             }
         }
@@ -65,7 +65,7 @@ fn the_oldest_sequences_make_room_and_the_rest_is_as_it_was_inserted() {
 fn every_sequence_is_equally_likely_and_none_comes_twice_in_a_sample() {
     let mut store = store(20);
     batches(7, |batch| store.insert(batch));
-    let (mut sample, mut random) = (Sample::new(&layout(), 5), Pcg64::seed_from_u64(2));
+    let (mut sample, mut random) = (Sample::new(layout(), 5), Pcg64::seed_from_u64(2));
     let mut counts = [0_u32; 20];
     let draws: u32 = 20_000;
     for _ in 0..draws {
@@ -86,7 +86,7 @@ fn every_sequence_is_equally_likely_and_none_comes_twice_in_a_sample() {
 #[test]
 fn a_store_with_too_few_sequences_gives_no_sample() {
     let mut store = store(20);
-    let mut sample = Sample::new(&layout(), 5);
+    let mut sample = Sample::new(layout(), 5);
     assert!(store.is_empty() && !store.sample(&mut sample, &mut Pcg64::seed_from_u64(3)));
     batches(1, |batch| store.insert(batch));
     assert!(!store.sample(&mut sample, &mut Pcg64::seed_from_u64(3)));

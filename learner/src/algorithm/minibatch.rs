@@ -5,25 +5,12 @@ use std::ops::Index;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_networks::Routing;
 use comic_proto::{Field, PerField, UnrollShape};
-use comic_replay::Batch;
+use comic_replay::{Batch, Unrolls};
 use tch::{Device, Tensor};
 
 use crate::algorithm::error::Error;
 use crate::algorithm::shape::MinibatchShape;
 use crate::device::upload;
-
-/// The fields of a batch as contiguous slices, `[B, rows, width]` each, in the wire's own element types.
-#[derive(Clone, Debug)]
-pub struct MinibatchSource<'a> {
-    /// Every field of `f32`; empty for [`Field::Clip`] and [`Field::Image`].
-    pub floats: PerField<&'a [f32]>,
-    /// [`Field::Clip`].
-    pub clip: &'a [u32],
-    /// [`Field::Image`]; empty when the task has no camera.
-    pub image: &'a [u8],
-    /// The task of each unroll, `[B]`.
-    pub tasks: &'a [usize],
-}
 
 /// A minibatch of unrolls, batch first, one tensor for each field: float32, but int64 for [`Field::Clip`] and uint8 for
 /// [`Field::Image`], which is undefined when the task has no camera. A field with one number in each row is `[B, rows]`,
@@ -43,32 +30,32 @@ pub struct MinibatchTensors {
 }
 
 impl MinibatchTensors {
-    /// Copies the fields onto `device`.
+    /// Copies unrolls of these tasks, `[B]`, onto `device`.
     ///
     /// # Errors
-    /// [`Error::Length`] when a slice is not as long as `shape` says; [`Error::Task`] when there is no such task.
-    pub fn new(source: &MinibatchSource<'_>, shape: &MinibatchShape, device: Device) -> Result<Self, Error> {
-        check_length("tasks", source.tasks.len(), &[shape.unrolls])?;
-        if let Some(task) = source.tasks.iter().copied().find(|task| *task >= shape.tasks) {
+    /// [`Error::Length`] when an array is not as long as `shape` says; [`Error::Task`] when there is no such task.
+    pub fn new(unrolls: &Unrolls, tasks: &[usize], shape: &MinibatchShape, device: Device) -> Result<Self, Error> {
+        check_length("tasks", tasks.len(), &[shape.unrolls])?;
+        if let Some(task) = tasks.iter().copied().find(|task| *task >= shape.tasks) {
             return Err(Error::Task { task, tasks: shape.tasks });
         }
         let uploaded = |field: Field| {
             let size = size(field, shape);
             let elements = match field {
-                Field::Clip => source.clip.len(),
-                Field::Image => source.image.len(),
-                _ => source.floats[field].len(),
+                Field::Clip => unrolls.clip().len(),
+                Field::Image => unrolls.image().len(),
+                _ => unrolls.f32(field).len(),
             };
             check_length(field.name(), elements, &size)?;
             let size: Vec<i64> = size.into_iter().map(|size| size as i64).collect();
             let tensor = match field {
                 Field::Clip => {
-                    let clips: Vec<i64> = source.clip.iter().map(|clip| i64::from(*clip)).collect();
+                    let clips: Vec<i64> = unrolls.clip().iter().map(|clip| i64::from(*clip)).collect();
                     upload(&clips, &size, device)
                 }
                 Field::Image if shape.unroll.image == 0 => Ok(Tensor::new()),
-                Field::Image => upload(source.image, &size, device),
-                _ => upload(source.floats[field], &size, device),
+                Field::Image => upload(unrolls.image(), &size, device),
+                _ => upload(unrolls.f32(field), &size, device),
             };
             Ok::<Tensor, Error>(tensor?)
         };
@@ -86,9 +73,9 @@ impl MinibatchTensors {
         Ok(Self {
             fields,
             shape: *shape,
-            clips: source.clip.iter().max().map_or(0, |clip| *clip as usize + 1),
-            routing: Routing::blocked(source.tasks, shape.tasks, device),
-            tasks: source.tasks.to_vec(),
+            clips: unrolls.clip().iter().max().map_or(0, |clip| *clip as usize + 1),
+            routing: Routing::blocked(tasks, shape.tasks, device),
+            tasks: tasks.to_vec(),
         })
     }
 
@@ -162,9 +149,7 @@ impl MinibatchTensors {
 /// When the device refuses.
 pub(crate) fn to_device(batch: &Batch, tasks: usize, device: Device) -> Result<MinibatchTensors, Error> {
     let shape = MinibatchShape { unrolls: batch.unrolls, tasks, unroll: *batch.layout.shape() };
-    let floats = PerField::from_fn(|field| batch.f32(field));
-    let source = MinibatchSource { floats, clip: batch.clip(), image: batch.image(), tasks: &batch.tasks() };
-    MinibatchTensors::new(&source, &shape, device)
+    MinibatchTensors::new(batch.as_unrolls(), &batch.tasks(), &shape, device)
 }
 
 /// The tensor of a field.

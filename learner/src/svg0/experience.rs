@@ -9,7 +9,7 @@ use rand_pcg::Pcg64;
 use tch::Device;
 
 use crate::algorithm::experience::Experience;
-use crate::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
+use crate::algorithm::minibatch::MinibatchTensors;
 use crate::algorithm::shape::MinibatchShape;
 use crate::error::{Error, Result};
 use crate::memory_limit::memory_limit;
@@ -50,7 +50,7 @@ impl Replay {
         let store =
             store.map_err(|error| Error::configuration(format!("replay.max_size, replay.memory_mib: {error}")))?;
         Ok(Self {
-            sample: Sample::new(layout, minibatch),
+            sample: Sample::new(Arc::clone(layout), minibatch),
             shape: MinibatchShape { unrolls: minibatch, tasks, unroll: *layout.shape() },
             device,
             samples_per_insert: replay.samples_per_insert,
@@ -78,9 +78,7 @@ impl Experience for Replay {
         if !self.store.sample(&mut self.sample, random) {
             return Err(Error::Defect("the replay holds no minibatch".into()));
         }
-        let Sample { floats, clips, images, tasks } = &self.sample;
-        let floats = floats.each_ref().map(|_, values| values.as_slice());
-        let source = MinibatchSource { floats, clip: clips, image: images, tasks };
-        Ok(MinibatchTensors::new(&source, &self.shape, self.device)?)
+        let Sample { unrolls, tasks } = &self.sample;
+        Ok(MinibatchTensors::new(unrolls, tasks, &self.shape, self.device)?)
     }
 }

@@ -1,13 +1,15 @@
 //! Small tasks and generated unrolls for the tests of V-MPO.
 #![allow(dead_code, reason = "each test uses its part")]
 
+use std::sync::Arc;
+
 use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives, TaskPart, TaskSpec};
 use comic_learner::algorithm::Algorithm as _;
-use comic_learner::algorithm::minibatch::{MinibatchSource, MinibatchTensors};
+use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::algorithm::shape::MinibatchShape;
 use comic_learner::vmpo::VmpoLearner;
 use comic_networks::{Acting, Policy as _, RecurrentState, Routing};
-use comic_proto::{Field, PerField, UnrollShape};
+use comic_proto::{Field, UnrollLayout, UnrollShape};
 use tch::{Device, Kind, Tensor};
 
 pub(crate) const UNROLLS: usize = 6;
@@ -228,7 +230,10 @@ impl Unrolls {
         MinibatchShape { unrolls: self.count, tasks: self.task_count, unroll }
     }
 
-    pub(crate) fn source(&self) -> MinibatchSource<'_> {
+    /// The same numbers as a batch has them.
+    pub(crate) fn arrays(&self) -> comic_replay::Unrolls {
+        let layout = UnrollLayout::new(self.shape().unroll);
+        let mut arrays = comic_replay::Unrolls::new(Arc::new(layout), self.count);
         let floats = |field| match field {
             Field::Proprioception => &self.proprioception[..],
             Field::Task => &self.task,
@@ -246,7 +251,11 @@ impl Unrolls {
             Field::ActionGradient => &self.action_gradient,
             Field::Clip | Field::Image => &[],
         };
-        MinibatchSource { floats: PerField::from_fn(floats), clip: &self.clip, image: &[], tasks: &self.tasks }
+        for field in Field::ALL {
+            arrays.f32_mut(field).copy_from_slice(floats(field));
+        }
+        arrays.clip_mut().copy_from_slice(&self.clip);
+        arrays
     }
 
     pub(crate) fn minibatch(&self) -> MinibatchTensors {
@@ -254,7 +263,7 @@ impl Unrolls {
     }
 
     pub(crate) fn minibatch_on(&self, device: Device) -> MinibatchTensors {
-        MinibatchTensors::new(&self.source(), &self.shape(), device).unwrap()
+        MinibatchTensors::new(&self.arrays(), &self.tasks, &self.shape(), device).unwrap()
     }
 
     /// Replaces actions and behaviour by what `learner`'s policy does in these observations, `rows` at a time.
