@@ -50,6 +50,14 @@ pub struct Position {
     pub updates: u64,
 }
 
+/// What matters here of `progress.json`.
+#[derive(serde::Deserialize)]
+struct Progress {
+    format: Option<u32>,
+    #[serde(flatten)]
+    position: Position,
+}
+
 /// Reads the newest complete checkpoint that `path` names: a run directory (which holds `checkpoints/`), a directory of
 /// checkpoints (`checkpoint-NNNNNNNNNN`), or one checkpoint. If `path` is a file, reads the policy that was exported to it.
 /// A damaged checkpoint among several is skipped with a warning.
@@ -71,6 +79,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, Error> {
     for candidate in numbered(&directory)?.into_iter().rev() {
         match read_one(&candidate) {
             Ok(checkpoint) => return Ok(checkpoint),
+            Err(error @ Error::CheckpointFormat { .. }) => return Err(error),
             // With its causes: the last one says what is wrong.
             Err(error) => tracing::warn!("skipped a damaged checkpoint: {:#}", anyhow::Error::from(error)),
         }
@@ -111,11 +120,14 @@ fn read_one(path: &Path) -> Result<Checkpoint, Error> {
     let manifest = std::fs::read(path.join(MANIFEST)).map_err(|error| refuse(path, format!("{MANIFEST}: {error}")))?;
     let manifest: BTreeMap<String, String> =
         serde_json::from_slice(&manifest).map_err(|error| refuse(path, format!("{MANIFEST}: {error}")))?;
+    let Progress { format, position } = serde_json::from_slice(&part(path, &manifest, PROGRESS)?)
+        .map_err(|error| refuse(path, format!("{PROGRESS}: {error}")))?;
+    // First, because the parts of another format may have another meaning.
+    comic_experiment::check_checkpoint_format(format)
+        .map_err(|source| Error::CheckpointFormat { path: path.to_path_buf(), source })?;
     let experiment = String::from_utf8(part(path, &manifest, EXPERIMENT)?)
         .map_err(|error| refuse(path, format!("{EXPERIMENT}: {error}")))?;
     let experiment = Experiment::from_toml(&path.join(EXPERIMENT).display().to_string(), &experiment)?;
-    let position = serde_json::from_slice(&part(path, &manifest, PROGRESS)?)
-        .map_err(|error| refuse(path, format!("{PROGRESS}: {error}")))?;
     let policy = part(path, &manifest, POLICY)?;
     let low_level = experiment.transfer.is_on().then(|| part(path, &manifest, LOW_LEVEL)).transpose()?;
     Ok(Checkpoint { path: path.to_path_buf(), experiment, policy, low_level, position })
@@ -143,7 +155,7 @@ mod tests {
         std::fs::create_dir_all(path).unwrap();
         let mut manifest = BTreeMap::new();
         let experiment = Experiment::default().to_toml().unwrap();
-        let progress = br#"{"epoch": 2, "version": 30, "updates": 29}"#;
+        let progress = br#"{"format": 2, "epoch": 2, "version": 30, "updates": 29}"#;
         for (name, bytes) in [(EXPERIMENT, experiment.as_bytes()), (PROGRESS, progress), (POLICY, policy)] {
             std::fs::write(path.join(name), bytes).unwrap();
             manifest.insert(name, hex::encode(Sha256::digest(bytes)));
@@ -174,6 +186,22 @@ mod tests {
         assert_eq!(read(run.path()).unwrap().policy, b"older");
         let error = read(&newest).unwrap_err();
         assert!(error.is_configuration() && error.to_string().contains("SHA-256 differs"), "{error}");
+    }
+
+    /// It is whole, so the older ones are of that release, too.
+    #[test]
+    fn a_checkpoint_of_another_format_is_refused_and_not_skipped() {
+        let run = run_with_two();
+        let newest = run.path().join("checkpoints/checkpoint-0000000010");
+        let progress = br#"{"epoch": 2, "version": 30, "updates": 29}"#;
+        std::fs::write(newest.join(PROGRESS), progress).unwrap();
+        let manifest = std::fs::read(newest.join(MANIFEST)).unwrap();
+        let mut manifest: BTreeMap<String, String> = serde_json::from_slice(&manifest).unwrap();
+        manifest.insert(PROGRESS.into(), hex::encode(Sha256::digest(progress)));
+        std::fs::write(newest.join(MANIFEST), serde_json::to_vec(&manifest).unwrap()).unwrap();
+        let error = read(run.path()).unwrap_err();
+        let said = format!("{:#}", anyhow::Error::from(error));
+        assert!(said.contains("has format 1, and this release reads format 2"), "{said}");
     }
 
     #[test]

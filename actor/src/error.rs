@@ -115,6 +115,14 @@ pub enum Error {
         /// Why not.
         reason: String,
     },
+    /// A checkpoint of another format.
+    #[error("checkpoint {}", path.display())]
+    CheckpointFormat {
+        /// Where it lies.
+        path: PathBuf,
+        /// Its format, the one that is read, and the remedy.
+        source: comic_experiment::Error,
+    },
     /// The command line is wrong.
     #[error("{0}")]
     Usage(String),
@@ -185,6 +193,7 @@ impl Error {
             | Self::Misfit { .. }
             | Self::NoCache
             | Self::Checkpoint { .. }
+            | Self::CheckpointFormat { .. }
             | Self::Usage(_) => true,
             Self::Clips(error) | Self::Task(comic_tasks::Error::Clips(error)) => match error {
                 comic_clips::Error::Unreadable { reason, .. } => {

@@ -60,4 +60,15 @@ pub enum Error {
         /// What is allowed.
         remedy: String,
     },
+    /// A checkpoint of another release.
+    #[error(
+        "the checkpoint has format {found}, and this release reads format {known}: continue the run with the release that wrote \
+         it, or export its policy there (`comic-learner export`), which this release reads"
+    )]
+    Format {
+        /// The checkpoint's format.
+        found: u32,
+        /// The format of this release.
+        known: u32,
+    },
 }

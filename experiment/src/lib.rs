@@ -6,6 +6,7 @@
 //! - [`presets`] holds the built-in documents: every file `presets/*.toml`.
 //! - [`resolve()`] turns a preset or a file plus `--set key=value` overrides into an [`Experiment`]. It refuses unknown
 //!   fields and names the nearest known one.
+//! - `saved` reads documents of the release before, and knows the format of checkpoints.
 //! - [`find_field`] finds a field by the end of its name. [`Experiment::differences`] compares two experiments.
 //! - [`for_each_algorithm`] lists the learning algorithms, and [`for_each_task`] the tasks. [`TaskSpec`] is what networks, wire and learner know of a task: sizes and names.
 //! - [`seed`] derives independent seeds; [`statistics`] has the median. Every crate uses the same ones.
@@ -28,6 +29,7 @@ mod network;
 pub mod presets;
 mod replay;
 mod resolve;
+mod saved;
 pub mod seed;
 mod settings;
 mod spec;
@@ -47,6 +49,7 @@ pub use nearest::nearest;
 pub use network::{InitialPose, Latent, LowLevelName, Lstm, Mlp, Network, Primitives, Prior};
 pub use replay::Replay;
 pub use resolve::resolve;
+pub use saved::{CHECKPOINT_FORMAT, check_checkpoint_format};
 pub use settings::{Actor, Budget, LARGEST_ACTION_GRADIENT, LONGEST_UNROLL, Learner, Optimiser, Unroll};
 pub use spec::{TaskPart, TaskSpec};
 pub use tasks::*;

@@ -74,6 +74,11 @@ impl Experiment {
         Ok(experiment)
     }
 
+    /// As [`from_toml`](Self::from_toml), with the default of every field that the algorithm does not read.
+    pub(crate) fn from_toml_with_unread(origin: &str, text: &str) -> Result<Self, Error> {
+        Self::from_toml(origin, &with_unread_at_defaults(&decode(origin, text)?)?.to_toml()?)
+    }
+
     /// The whole document with every field.
     ///
     /// # Errors

@@ -321,3 +321,18 @@ proptest! {
 fn a_part_in_json_is_spelt_as_on_the_command_line() {
     assert_eq!(serde_json::to_string(&"encoder:get-up".parse::<Part>().unwrap()).unwrap(), "\"encoder:get-up\"");
 }
+
+/// Files that the release before wrote (`comic-learner export`, commit e16633f), with fields that have other names now.
+#[test]
+fn files_of_the_format_before_are_read() {
+    let stored = |name: &str| {
+        let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fixtures/exported");
+        std::fs::read(folder.join(format!("format_1_{name}.safetensors"))).unwrap()
+    };
+    let policy = Exported::read(stored("policy")).unwrap();
+    assert_eq!((policy.spec.format, policy.experiment.network.encoder.as_slice()), (1, &[4][..]));
+    assert!(policy.spec.experiment.contains("[warm_start]"));
+    let low_level = Exported::read(stored("low-level")).unwrap();
+    assert!(low_level.freeze(&comic_experiment::Transfer::default()).is_ok());
+    assert!(Exported::read(low_level.bytes.clone()).is_ok());
+}

@@ -7,6 +7,7 @@ use std::fs;
 use anyhow::{Context as _, Result, ensure};
 use comic_tests::steps::{LIMIT, checkpoint_in, leaves, newest_checkpoint};
 use comic_tests::system::{SMALL, System};
+use sha2::{Digest as _, Sha256};
 
 #[tokio::test]
 async fn an_incompatible_checkpoint_ends_the_learner_with_2() -> Result<()> {
@@ -34,6 +35,26 @@ async fn an_incompatible_checkpoint_ends_the_learner_with_2() -> Result<()> {
             ensure!(said.contains(word), "no `{word}`: {said}");
         }
     }
+    // A checkpoint of the release before: whole, but of another format.
+    let file = manifest.with_file_name("progress.json");
+    let progress = fs::read(&file)?;
+    let mut earlier: serde_json::Value = serde_json::from_slice(&progress)?;
+    earlier.as_object_mut().and_then(|fields| fields.remove("format")).context("no format")?;
+    let earlier = serde_json::to_vec(&earlier)?;
+    let mut parts = parts;
+    parts.insert("progress.json".into(), hex::encode(Sha256::digest(&earlier)));
+    fs::write(&file, &earlier)?;
+    fs::write(&manifest, serde_json::to_vec(&parts)?)?;
+    let _ = system.start_learner(LIMIT).await;
+    let mut learner = system.learner.take().context("no learner")?;
+    let status = learner.until_it_ends(LIMIT).await?;
+    let said = learner.log();
+    ensure!(
+        status.code() == Some(2) && said.contains("has format 1, and this release reads format 2"),
+        "{status}: {said}"
+    );
+
+    fs::write(&file, &progress)?;
     fs::write(&manifest, &whole)?;
     system.start_learner(LIMIT).await.context("the run does not resume from the whole checkpoint").map(drop)
 }

@@ -7,7 +7,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::checkpoint::name::Name;
-use crate::checkpoint::progress::PROGRESS;
+use crate::checkpoint::snapshot::PROGRESS;
 use crate::checkpoint::steps::{Step, carry_out, hidden, put, replace};
 use crate::error::{Error, Result};
 

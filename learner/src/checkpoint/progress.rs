@@ -3,16 +3,15 @@
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 
-use crate::checkpoint::snapshot::Snapshot;
+use crate::checkpoint::snapshot::{PROGRESS, Snapshot};
 use crate::error::{Error, Result};
-
-/// The part of a checkpoint that holds a [`Progress`].
-pub(crate) const PROGRESS: &str = "progress.json";
 
 /// Everything that is counted, in checkpoints as `progress.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Progress {
+    /// The format of the checkpoint: [`CHECKPOINT_FORMAT`](comic_experiment::CHECKPOINT_FORMAT).
+    pub(crate) format: u32,
     /// The run's number; absent from checkpoints of learners that had none.
     #[serde(default)]
     pub(crate) run: Option<u64>,

@@ -11,6 +11,8 @@ use crate::error::{Error, Result};
 
 /// The file of a checkpoint that holds the SHA-256 of each part.
 pub(super) const MANIFEST: &str = "MANIFEST.json";
+/// The part that says how far the run had come.
+pub(crate) const PROGRESS: &str = "progress.json";
 /// In transfer: the part that is the file of the frozen low level.
 pub(crate) const LOW_LEVEL: &str = "low_level.safetensors";
 /// What the path of a checkpoint has to name.
@@ -33,6 +35,18 @@ impl Snapshot {
         part.ok_or_else(|| Error::Checkpoint(format!("the checkpoint has no part `{name}`")))
     }
 
+    /// # Errors
+    /// When it is of another format: other parts may then have another meaning.
+    pub(crate) fn check_format(&self) -> Result<()> {
+        #[derive(serde::Deserialize)]
+        struct Named {
+            format: Option<u32>,
+        }
+        let named: Named =
+            serde_json::from_slice(self.part(PROGRESS)?).map_err(Error::json("the checkpoint's progress"))?;
+        Ok(comic_experiment::check_checkpoint_format(named.format)?)
+    }
+
     /// One part that is text.
     ///
     /// # Errors
@@ -53,13 +67,13 @@ pub(super) fn checksum(bytes: &[u8]) -> String {
 /// changed.
 ///
 /// # Errors
-/// [`Error::Configuration`] when there is none, or the one that was named is damaged; otherwise when the directory cannot be
-/// listed.
+/// [`Error::Configuration`] when there is none, or the one that was named is damaged or of another format; otherwise when the
+/// directory cannot be listed.
 pub fn find(path: &Path) -> Result<(PathBuf, Snapshot)> {
     let refused = |reason: &str| Error::configuration(format!("checkpoint {}: {reason}; {WANTED}", path.display()));
     if path.join(MANIFEST).is_file() {
-        let snapshot = read(path).map_err(|error| refused(&comic_proto::chain(&error)))?;
-        return Ok((path.to_path_buf(), snapshot));
+        let snapshot = read(path).and_then(|snapshot| snapshot.check_format().map(|()| snapshot));
+        return Ok((path.to_path_buf(), snapshot.map_err(|error| refused(&comic_proto::chain(&error)))?));
     }
     if !path.is_dir() {
         return Err(refused("no such directory"));
@@ -68,7 +82,10 @@ pub fn find(path: &Path) -> Result<(PathBuf, Snapshot)> {
     let directory = if below.is_dir() { below } else { path.to_path_buf() };
     for (_, path) in numbered(&directory)?.into_iter().rev() {
         match read(&path) {
-            Ok(snapshot) => return Ok((path, snapshot)),
+            Ok(snapshot) => {
+                snapshot.check_format().map_err(|error| refused(&comic_proto::chain(&error)))?;
+                return Ok((path, snapshot));
+            }
             Err(error) => {
                 let error = comic_proto::chain(&error);
                 tracing::warn!(checkpoint = %path.display(), "skipped a damaged checkpoint: {error}");

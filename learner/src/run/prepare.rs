@@ -27,6 +27,9 @@ pub(super) fn prepare(
 ) -> Result<(Setup, Service)> {
     let store = Store::open(&options.run, experiment.learner.checkpoints_kept)?;
     let newest = store.newest()?;
+    if let Some((_, snapshot)) = &newest {
+        snapshot.check_format().map_err(|error| incompatible(&options.run, error))?;
+    }
     let low_level = LowLevel::find(&mut experiment, newest.as_ref().map(|(_, snapshot)| snapshot))?;
     let catalogue = Catalogue::open(&experiment.clips)?;
     let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();

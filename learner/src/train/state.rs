@@ -1,14 +1,14 @@
 //! What changes in training and decides its future: what a checkpoint holds and restores.
 
 use bytes::Bytes;
-use comic_experiment::{Experiment, TaskSpec};
+use comic_experiment::{CHECKPOINT_FORMAT, Experiment, TaskSpec};
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
 
 use crate::algorithm::{Algorithm, Parts};
 use crate::algorithms;
-use crate::checkpoint::progress::{PROGRESS, Progress};
-use crate::checkpoint::snapshot::{self, Snapshot};
+use crate::checkpoint::progress::Progress;
+use crate::checkpoint::snapshot::{self, PROGRESS, Snapshot};
 use crate::error::{Error, Result};
 use crate::tensors;
 use crate::train::statistics::ObservationStatistics;
@@ -36,6 +36,7 @@ impl State {
         tch::manual_seed(experiment.seed as i64);
         let algorithm = algorithms::learner(parts)?;
         let progress = Progress {
+            format: CHECKPOINT_FORMAT,
             run: Some(run),
             epoch,
             updates: 0,

@@ -110,7 +110,8 @@ impl Exported {
         let (_, metadata) = SafeTensors::read_metadata(&bytes)?;
         let text = metadata.metadata().as_ref().and_then(|entries| entries.get(KEY));
         let spec = parse(text.ok_or_else(|| wrong(KEY, "is missing: `comic-learner export` writes it"))?)?;
-        let experiment = Experiment::from_toml("its experiment", &spec.experiment).map_err(Error::Experiment)?;
+        let read = if spec.format == FORMAT { Experiment::from_toml } else { Experiment::from_earlier_toml };
+        let experiment = read("its experiment", &spec.experiment).map_err(Error::Experiment)?;
         agree(&spec, &experiment)?;
         let sizes = task_spec(&experiment)?;
         let prior = spec.prior.as_ref().map_or(&[][..], |prior| &prior.hidden);
@@ -291,8 +292,9 @@ fn parse(text: &str) -> Result<Spec, Error> {
     let malformed = |error: serde_json::Error| wrong(KEY, format!("is not a valid description: {error}"));
     let value: serde_json::Value = serde_json::from_str(text).map_err(malformed)?;
     // The format is checked first, because another format has other fields.
-    if value["format"] != FORMAT {
-        let problem = format!("is {}, but this program reads {FORMAT}: export the policy again", value["format"]);
+    if value["format"] != FORMAT && value["format"] != FORMAT - 1 {
+        let (found, before) = (&value["format"], FORMAT - 1);
+        let problem = format!("is {found}, but this program reads {before} and {FORMAT}: export the policy again");
         return Err(wrong("format", problem));
     }
     serde_json::from_value(value).map_err(malformed)

@@ -8,8 +8,8 @@ use crate::error::Error;
 use crate::normaliser::NORMALISED_LIMIT;
 
 /// Version of the file format. It changes when the same tensors get another meaning, for example if an encoder reads
-/// its inputs in another order.
-pub const FORMAT: u32 = 1;
+/// its inputs in another order, or when fields of the experiment are renamed. Files of format 1 are read, too.
+pub const FORMAT: u32 = 2;
 
 /// The content of a file, its inputs and outputs, and its source.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
