@@ -1,9 +1,11 @@
 //! `cargo xtask test` and `cargo xtask lint`.
 
+use std::fs;
 use std::process::Command;
 
 use anyhow::Result;
 
+use crate::durations::Durations;
 use crate::workspace::{answers, cargo, cargo_has, run};
 use crate::{images, python, setup, workspace};
 
@@ -35,14 +37,17 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
     if options.xla {
         return test_xla(&options.arguments);
     }
-    setup::run(&setup::Options::default())?;
-    // dm_control's own loader and TensorBoard read files of these programs, policies act in dm_control's environment, and
-    // kubectl renders the manifests.
-    python::prepare_tests()?;
+    let mut durations = Durations::default();
+    durations.of("set-up", || {
+        setup::run(&setup::Options::default())?;
+        // dm_control's own loader and TensorBoard read files of these programs, policies act in dm_control's environment,
+        // and kubectl renders the manifests.
+        python::prepare_tests()
+    })?;
     // The whole-system tests start the programs.
-    workspace::build()?;
+    durations.of("build of the programs", workspace::build)?;
     if options.docker {
-        images::build()?;
+        durations.of("images", images::build)?;
     }
     let mut command = cargo();
     let nextest = cargo_has("nextest");
@@ -65,7 +70,13 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
         command.arg("--").args(left_out.iter().map(|tests| format!("--skip={}", tests.prefix)));
     }
     eprintln!("running `{}`", workspace::describe(&command));
-    let ended = run(&mut command);
+    let report = workspace::root().join("target/nextest/default/junit.xml");
+    let _ = fs::remove_file(&report);
+    let ended = durations.of("tests", || run(&mut command));
+    if let Ok(report) = fs::read_to_string(report) {
+        durations.split_tests(&report);
+    }
+    eprint!("{durations}");
     if !left_out.is_empty() {
         let names: Vec<_> = left_out.iter().map(|tests| tests.prefix).collect();
         eprintln!("NOT RUN: {} groups of tests ({}), as explained above", names.len(), names.join(", "));
@@ -124,7 +135,7 @@ fn can_draw() -> bool {
     let Ok(actor) = workspace::program("comic-actor") else { return true };
     let arguments = ["render", "--task", "get-up", "--seconds", "0.03", "--size", "16x16", "--out"];
     let asked = Command::new(actor).args(arguments).arg(&film).output();
-    let _ = std::fs::remove_file(film);
+    let _ = fs::remove_file(film);
     !asked.is_ok_and(|output| String::from_utf8_lossy(&output.stderr).contains("no OpenGL"))
 }
 

@@ -2,7 +2,8 @@
 //!
 //! # Layout
 //! - [`setup`] fills `.deps` with the native libraries; everything else calls it first.
-//! - [`check`] runs the tests and the linters; [`images`] builds the Docker images for some of the tests.
+//! - [`check`] runs the tests and the linters; [`images`] builds the Docker images for some of the tests, and [`durations`]
+//!   says what took the time.
 //! - [`documentation`] builds the pages of the crates and the book.
 //! - [`fuzz`] feeds random bytes to everything that reads bytes from outside.
 //! - [`train`] runs one learner and its actors on this machine and shows their progress.
@@ -16,6 +17,7 @@
 mod bench;
 mod check;
 mod documentation;
+mod durations;
 mod evaluations;
 mod film;
 mod fuzz;
