@@ -4,11 +4,12 @@
 //! # Layout
 //! - [`Batcher`] connects service and trainer: the service's async tasks [`insert`](Batcher::insert) unrolls; the
 //!   trainer's thread takes [`Batch`]es and returns them with [`trained`](Batcher::trained).
-//! - [`Unrolls`] are arrays of unrolls: those of a batch, of a store, of a sample.
+//! - [`Unrolls`] are arrays of unrolls: those of a batch, of a table, of a sample.
 //! - [`Ledger`] has the account of every actor (its next sequence number) and the sums.
 //! - [`Accounting`] has the sums, [`TaskAccounting`] those of one task. [`LedgerSnapshot`] is the ledger in a
 //!   checkpoint.
-//! - [`Store`] is the replay of off-policy learning: the trainer inserts batches, and samples sequences.
+//! - [`Table`] is the replay of off-policy learning: the trainer inserts the unrolls of batches and draws a [`Sample`] for
+//!   each gradient step. [`RateLimiter`] says when. Both have the names and rules of Reverb.
 //!
 //! # The rules
 //! An actor process is an *incarnation*: a random number that it draws once. Joining opens an account, `(actor index,
@@ -52,9 +53,10 @@ mod buffer;
 mod config;
 mod ledger;
 mod phase;
+mod rate_limiter;
 mod snapshot;
-mod store;
 mod streaming;
+mod table;
 mod tasks;
 mod unrolls;
 
@@ -64,6 +66,7 @@ pub use batcher::{Batcher, Next, Outcome};
 pub use config::{BatchOrder, Config};
 pub use ledger::{JoinError, Joined, Ledger};
 pub use phase::Phase;
+pub use rate_limiter::{RateError, RateLimiter};
 pub use snapshot::{Account, Error, LedgerSnapshot};
-pub use store::{Sample, Store, StoreError};
+pub use table::{Counts, Sample, Table, TableConfig, TableError};
 pub use unrolls::Unrolls;

@@ -7,6 +7,9 @@ use comic_proto::{Field, PerField, Pieces, UnrollLayout};
 
 use crate::streaming;
 
+/// A page of memory is at least so many bytes.
+const PAGE: usize = 4096;
+
 /// N unrolls of one layout: one contiguous array `[N, rows, width]` for each field.
 ///
 /// Its memory is allocated once. A part of the slots may be in use ([`set_len`](Self::set_len)); then the arrays are those
@@ -140,6 +143,17 @@ impl Unrolls {
         for field in Field::ALL {
             let start = self.layout.range(field).start;
             payload.copy_by(start, self.bytes_mut(field, slot), streaming::copy);
+        }
+    }
+
+    /// Writes to every page, so that the system commits the memory now and not when it is first used. The unrolls are
+    /// undefined then.
+    pub(crate) fn commit(&mut self) {
+        let floats = self.floats.iter_mut().map(|(_, values)| bytemuck::cast_slice_mut(values));
+        for bytes in floats.chain([bytemuck::cast_slice_mut(&mut self.clips), &mut self.images]) {
+            // Not 0: the compiler may remove the writing of zeros to zeroed memory.
+            bytes.iter_mut().step_by(PAGE).for_each(|byte| *byte = 1);
+            bytes.iter_mut().next_back().into_iter().for_each(|byte| *byte = 1);
         }
     }
 
