@@ -16,7 +16,8 @@ pub(crate) trait TakeBack: Send + Sync {
     fn take_back(&self, buffer: Buffer, dropped: Option<Reason>);
 }
 
-/// A full batch at the trainer.
+/// A batch at the trainer. It is full, unless the trainer asked for the unrolls that wait
+/// ([`Batcher::next_available_within`](crate::Batcher::next_available_within)).
 ///
 /// The trainer returns it with [`Batcher::trained`](crate::Batcher::trained) or
 /// [`Batcher::discard`](crate::Batcher::discard). The unrolls of a batch that is dropped
@@ -31,7 +32,9 @@ pub struct Batch {
 }
 
 impl Batch {
-    pub(crate) fn new(layout: Arc<UnrollLayout>, buffer: Buffer, owner: Box<dyn TakeBack>) -> Self {
+    /// The unrolls of `buffer` must be in its first slots.
+    pub(crate) fn new(layout: Arc<UnrollLayout>, mut buffer: Buffer, owner: Box<dyn TakeBack>) -> Self {
+        buffer.unrolls.set_len(buffer.len());
         Self { layout, unrolls: buffer.len(), buffer: Box::new(buffer), owner: Some(owner) }
     }
 
@@ -78,7 +81,7 @@ impl Batch {
 
     /// The headers, `[B]`, without the layout hash, which is equal in all of them.
     pub fn headers(&self) -> &[UnrollHeader] {
-        &self.buffer.headers
+        &self.buffer.headers[..self.buffer.len()]
     }
 
     /// The task of each unroll, `[B]`: its index among the tasks of the experiment.

@@ -39,7 +39,7 @@ pub enum Outcome {
 /// The result of waiting for a batch.
 #[derive(Debug)]
 pub enum Next {
-    /// A full batch.
+    /// A batch.
     Batch(Batch),
     /// The time has elapsed.
     Elapsed,
@@ -66,7 +66,10 @@ struct Inner {
     /// One permit for each slot of `next` and `open` that is neither filled nor reserved by an insert. Inserts get
     /// permits in the order in which they wait. A waiting insert needs only its own memory.
     slots: Semaphore,
+    /// A batch is full.
     filled: Condvar,
+    /// An unroll waits, or memory for the trainer is free.
+    arrived: Condvar,
 }
 
 /// Assembles batches in bounded memory, with each unroll in at most one batch. A batcher is a handle that can be
@@ -82,11 +85,13 @@ impl Batcher {
         // The next unroll of an environment belongs to the next batch, so no batch can be assembled ahead.
         let ahead = if config.order == BatchOrder::Environment { 0 } else { config.ahead };
         let config = Config { unrolls: config.unrolls.max(1), ahead, ..config };
-        let mut free: Vec<_> = (0..=config.ahead).map(|_| Buffer::new(Arc::clone(&layout), config.unrolls)).collect();
+        let mut free: Vec<_> =
+            (0..=config.ahead + config.spare()).map(|_| Buffer::new(Arc::clone(&layout), config.unrolls)).collect();
         let open = free.pop();
         let state = Mutex::new(State { ledger, phase, next: None, open, free, closed: false });
         let slots = Semaphore::new(config.unrolls);
-        Self { inner: Arc::new(Inner { layout, config, state, slots, filled: Condvar::new() }) }
+        let (filled, arrived) = (Condvar::new(), Condvar::new());
+        Self { inner: Arc::new(Inner { layout, config, state, slots, filled, arrived }) }
     }
 
     /// Opens an account, or finds the account of this incarnation. See [`Ledger::join`].
@@ -180,25 +185,17 @@ impl Batcher {
 
     /// The next full batch, if there is one within this time. Blocks the calling thread.
     pub fn next_batch_within(&self, timeout: Duration) -> Next {
-        // A timeout that is too long for the clock is no deadline.
-        let deadline = Instant::now().checked_add(timeout);
-        let mut state = self.lock();
-        loop {
-            if state.closed {
-                return Next::Closed;
-            }
-            if let Some(buffer) = self.take_next(&mut state) {
-                state.ledger.hand_out(buffer.tasks());
-                self.settle(&mut state);
-                drop(state);
-                return Next::Batch(Batch::new(self.inner.layout.clone(), buffer, Box::new(self.clone())));
-            }
-            let left = deadline.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
-            if left.is_zero() {
-                return Next::Elapsed;
-            }
-            self.inner.filled.wait_for(&mut state, left);
-        }
+        self.next_within(timeout, &self.inner.filled, |state| self.take_next(state))
+    }
+
+    /// The unrolls that wait now, at least one and at most `at_most`, the oldest first, as soon as there is one within this
+    /// time. They need not fill a batch, and are in the first slots of the batch that is returned. The trainer should return
+    /// it before it asks for more: memory for one such batch is certain. Blocks the calling thread.
+    ///
+    /// Lockstep ([`BatchOrder::Environment`]) takes full batches and must not use this.
+    pub fn next_available_within(&self, timeout: Duration, at_most: usize) -> Next {
+        debug_assert_eq!(self.inner.config.order, BatchOrder::Arrival, "lockstep takes full batches");
+        self.next_within(timeout, &self.inner.arrived, |state| self.take_available(state, at_most))
     }
 
     /// Accounts for a batch as trained on, and reuses its memory.
@@ -238,6 +235,7 @@ impl Batcher {
         self.lock().closed = true;
         self.inner.slots.close();
         self.inner.filled.notify_all();
+        self.inner.arrived.notify_all();
     }
 
     /// Whether the batcher is closed.
@@ -276,17 +274,64 @@ impl Batcher {
         Some(drop_unroll(&mut state.ledger, header, task, reason))
     }
 
-    /// Drops unrolls that wait in the batcher and frees their slots. Reservations of waiting inserts stay. The
-    /// remaining unrolls of the open batch fill the next one.
-    fn drop_waiting(&self, state: &mut State, reason: Reason, dropped: impl Fn(&UnrollHeader) -> bool) {
-        let State { ledger, next, open, .. } = state;
-        let waiting = [&mut *next, &mut *open].into_iter().flatten();
-        let removed: Vec<u32> = waiting.flat_map(|batch| batch.retain(|header| !dropped(header))).collect();
-        if let (Some(next), Some(open)) = (next, open) {
-            next.fill_from(open);
+    /// Waits until `take` gives a buffer. It is tried again after each signal of `changed`.
+    fn next_within(&self, timeout: Duration, changed: &Condvar, take: impl Fn(&mut State) -> Option<Buffer>) -> Next {
+        // A timeout that is too long for the clock is no deadline.
+        let deadline = Instant::now().checked_add(timeout);
+        let mut state = self.lock();
+        loop {
+            if state.closed {
+                return Next::Closed;
+            }
+            if let Some(buffer) = take(&mut state) {
+                state.ledger.hand_out(buffer.tasks());
+                self.settle(&mut state);
+                drop(state);
+                return Next::Batch(Batch::new(self.inner.layout.clone(), buffer, Box::new(self.clone())));
+            }
+            let left = deadline.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
+            if left.is_zero() {
+                return Next::Elapsed;
+            }
+            changed.wait_for(&mut state, left);
         }
-        self.inner.slots.add_permits(removed.len());
-        removed.into_iter().for_each(|task| ledger.end(Some(task), Some(reason)));
+    }
+
+    /// Drops unrolls that wait in the batcher and frees their slots.
+    fn drop_waiting(&self, state: &mut State, reason: Reason, dropped: impl Fn(&UnrollHeader) -> bool) {
+        let waiting = [&mut state.next, &mut state.open].into_iter().flatten();
+        let removed: Vec<u32> = waiting.flat_map(|batch| batch.retain(|header| !dropped(header))).collect();
+        self.reuse_slots(state, removed.len());
+        removed.into_iter().for_each(|task| state.ledger.end(Some(task), Some(reason)));
+    }
+
+    /// Gives the slots of `removed` unrolls to other inserts. Reservations of waiting inserts stay. The remaining unrolls of
+    /// the open batch fill the next one, so those of the next batch are always older.
+    fn reuse_slots(&self, state: &mut State, removed: usize) {
+        if let (Some(next), Some(open)) = (&mut state.next, &mut state.open) {
+            next.move_from(open, usize::MAX);
+        }
+        self.inner.slots.add_permits(removed);
+    }
+
+    /// At most `at_most` of the waiting unrolls, after stale unrolls are dropped.
+    fn take_available(&self, state: &mut State, at_most: usize) -> Option<Buffer> {
+        let version = state.phase.version;
+        self.drop_waiting(state, Reason::Stale, |header| self.is_stale(header, version));
+        if at_most >= self.inner.config.unrolls
+            && let Some(full) = state.next.take_if(|next| next.is_full() && next.is_in_order())
+        {
+            return Some(full);
+        }
+        if at_most == 0 || state.waiting().next().is_none() {
+            return None;
+        }
+        let mut taken = state.free.pop()?;
+        for batch in [&mut state.next, &mut state.open].into_iter().flatten() {
+            taken.move_from(batch, at_most - taken.len());
+        }
+        self.reuse_slots(state, taken.len());
+        Some(taken)
     }
 
     /// The next batch, if it is full after stale unrolls are dropped.
@@ -311,7 +356,7 @@ impl Batcher {
     }
 
     /// Moves buffers: a full open batch becomes the next one if there is none, and a free buffer becomes the open
-    /// batch.
+    /// batch. One buffer stays free for [`take_available`](Self::take_available).
     fn settle(&self, state: &mut State) {
         if state.next.is_none() {
             state.next = state.open.take_if(|open| open.is_full());
@@ -319,7 +364,11 @@ impl Batcher {
         if state.next.as_ref().is_some_and(Buffer::is_full) {
             self.inner.filled.notify_one();
         }
+        if state.waiting().next().is_some() {
+            self.inner.arrived.notify_one();
+        }
         if state.open.is_none()
+            && state.free.len() > self.inner.config.spare()
             && let Some(buffer) = state.free.pop()
         {
             state.open = Some(buffer);

@@ -14,8 +14,8 @@ pub(crate) struct Buffer {
     /// One header per slot. A free slot has the header of an earlier unroll.
     pub(crate) headers: Vec<UnrollHeader>,
     filled: Vec<bool>,
-    /// Number of slots in use.
-    used: usize,
+    /// The slots in use, that of the oldest unroll first.
+    arrivals: Vec<usize>,
 }
 
 impl Buffer {
@@ -24,18 +24,23 @@ impl Buffer {
             unrolls: Unrolls::new(layout, unrolls),
             headers: vec![UnrollHeader::default(); unrolls],
             filled: vec![false; unrolls],
-            used: 0,
+            arrivals: Vec::with_capacity(unrolls),
         }
     }
 
     /// Number of slots in use.
     pub(crate) fn len(&self) -> usize {
-        self.used
+        self.arrivals.len()
     }
 
     /// Whether every slot is in use.
     pub(crate) fn is_full(&self) -> bool {
-        self.used == self.filled.len()
+        self.arrivals.len() == self.filled.len()
+    }
+
+    /// Whether the unrolls are in the first slots in the order in which they arrived.
+    pub(crate) fn is_in_order(&self) -> bool {
+        self.arrivals.iter().enumerate().all(|(place, slot)| place == *slot)
     }
 
     /// The first free slot; the number of slots if there is none.
@@ -50,51 +55,51 @@ impl Buffer {
 
     /// The task of each unroll.
     pub(crate) fn tasks(&self) -> impl Iterator<Item = u32> {
-        self.filled.iter().zip(&self.headers).filter(|(filled, _)| **filled).map(|(_, header)| header.task)
+        self.arrivals.iter().filter_map(|slot| self.headers.get(*slot)).map(|header| header.task)
     }
 
     /// Frees every slot.
     pub(crate) fn clear(&mut self) {
         self.filled.fill(false);
-        self.used = 0;
+        self.arrivals.clear();
+        self.unrolls.set_len(self.filled.len());
     }
 
     /// Copies an unroll into a free slot. The payload must have the size of the layout.
     pub(crate) fn put(&mut self, slot: usize, header: UnrollHeader, payload: &Pieces) {
         self.unrolls.put(slot, payload);
-        self.headers[slot] = header;
-        self.filled[slot] = true;
-        self.used += 1;
+        self.occupy(slot, header);
     }
 
     /// Frees the slots of the unrolls that are not `kept`. Returns the tasks of the removed unrolls.
     pub(crate) fn retain(&mut self, kept: impl Fn(&UnrollHeader) -> bool) -> Vec<u32> {
         let mut removed = Vec::new();
-        for (filled, header) in self.filled.iter_mut().zip(&self.headers) {
-            if *filled && !kept(header) {
-                *filled = false;
-                self.used -= 1;
+        let Self { headers, filled, arrivals, .. } = self;
+        arrivals.retain(|slot| {
+            let header = &headers[*slot];
+            filled[*slot] = kept(header);
+            if !filled[*slot] {
                 removed.push(header.task);
             }
-        }
+            filled[*slot]
+        });
         removed
     }
 
-    /// Moves unrolls from `other` into the free slots of this buffer.
-    pub(crate) fn fill_from(&mut self, other: &mut Self) {
-        for slot in 0..other.filled.len() {
-            if self.is_full() {
-                return;
-            }
-            if !std::mem::take(&mut other.filled[slot]) {
-                continue;
-            }
-            other.used -= 1;
+    /// Moves the oldest unrolls of `other`, at most `count`, into the first free slots of this buffer.
+    pub(crate) fn move_from(&mut self, other: &mut Self, count: usize) {
+        let count = count.min(other.len()).min(self.filled.len() - self.len());
+        for slot in other.arrivals.drain(..count) {
+            other.filled[slot] = false;
             let free = self.first_free();
             self.unrolls.copy(free, &other.unrolls, slot);
-            self.headers[free] = std::mem::take(&mut other.headers[slot]);
-            self.filled[free] = true;
-            self.used += 1;
+            self.occupy(free, std::mem::take(&mut other.headers[slot]));
         }
+    }
+
+    fn occupy(&mut self, slot: usize, header: UnrollHeader) {
+        self.headers[slot] = header;
+        self.filled[slot] = true;
+        self.arrivals.push(slot);
     }
 }

@@ -14,6 +14,13 @@ pub struct Config {
     pub order: BatchOrder,
 }
 
+impl Config {
+    /// Number of batches of memory into which unrolls are copied for a trainer that takes what is there.
+    pub(crate) fn spare(&self) -> usize {
+        usize::from(self.order == BatchOrder::Arrival)
+    }
+}
+
 /// The order of the unrolls in a batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BatchOrder {

@@ -3,7 +3,9 @@
 //!
 //! # Layout
 //! - [`Batcher`] connects service and trainer: the service's async tasks [`insert`](Batcher::insert) unrolls; the
-//!   trainer's thread takes [`Batch`]es and returns them with [`trained`](Batcher::trained).
+//!   trainer's thread takes [`Batch`]es and returns them with [`trained`](Batcher::trained). On-policy learning takes full
+//!   batches ([`next_batch_within`](Batcher::next_batch_within)), off-policy learning what is there
+//!   ([`next_available_within`](Batcher::next_available_within)).
 //! - [`Unrolls`] are arrays of unrolls: those of a batch, of a table, of a sample.
 //! - [`Ledger`] has the account of every actor (its next sequence number) and the sums.
 //! - [`Accounting`] has the sums, [`TaskAccounting`] those of one task. [`LedgerSnapshot`] is the ledger in a
@@ -27,8 +29,8 @@
 //!    ([`BatchOrder::Environment`]), an unroll is invalid if its environment has no slot or a full one.
 //! 4. An unroll in flight ends in one way: its batch is trained on, or it is dropped. A change of phase drops the
 //!    unrolls that wait in the batcher as superseded. Unrolls that became too old while they waited are dropped as
-//!    stale when the trainer asks for their batch; the trainer gets the batch when its slots are filled again. The
-//!    unrolls of a batch that is dropped without training are lost at restart.
+//!    stale when the trainer asks for them; a full batch is given when its slots are filled again. The unrolls of a batch
+//!    that is dropped without training are lost at restart.
 //! 5. Nothing is recorded while an unroll waits for a slot, so the waiting future can be dropped. The rules are applied
 //!    again when a slot is free, because another copy may have been inserted in the meantime.
 //! 6. Restoring a [`LedgerSnapshot`] counts its unrolls in flight as lost at restart and keeps the accounts. So an
@@ -43,7 +45,9 @@
 //! - `produced = trained + dropped + in flight` at any time. *In flight* is counted in the buffers and not computed
 //!   from the other sums. The same holds for the accounting of every task. An unroll belongs to the task that its
 //!   header names; an unroll that is invalid or of another epoch counts for no task.
-//! - Memory is one batch for the trainer and [`Config::ahead`] more, for any number of actors.
+//! - Memory is one batch for the trainer and [`Config::ahead`] more, for any number of actors. One more is for what is
+//!   available: it is copied there, so the slots are free at once. The system commits it when it is first used.
+//! - The unrolls that are given as available are the oldest, in the order in which they arrived.
 //! - No unroll is in two batches, or twice in one batch.
 
 mod accounting;

@@ -7,7 +7,7 @@ mod common;
 use std::collections::{HashMap, HashSet};
 
 use comic_replay::{Batch, Batcher, Ledger, LedgerSnapshot, Outcome, Phase, Reason, TaskAccounting};
-use common::{Actor, CONFIG, PHASE, TASKS, batch_now, insert_now, layout, task_of, with_tasks};
+use common::{Actor, CONFIG, PHASE, TASKS, available_now, batch_now, insert_now, layout, task_of, with_tasks};
 use proptest::prelude::*;
 
 const ACTORS: u64 = 3;
@@ -19,6 +19,7 @@ enum Event {
     SendInvalid { actor: u64 },
     SendUnknown,
     Take,
+    TakeAvailable { at_most: usize },
     Train,
     Discard { reason: Reason },
     DropBatch,
@@ -39,6 +40,7 @@ fn event() -> impl Strategy<Value = Event> {
         1 => (0..ACTORS).prop_map(|actor| Event::SendInvalid { actor }),
         1 => Just(Event::SendUnknown),
         4 => Just(Event::Take),
+        2 => (0..8_usize).prop_map(|at_most| Event::TakeAvailable { at_most }),
         4 => Just(Event::Train),
         1 => reason.prop_map(|reason| Event::Discard { reason }),
         1 => Just(Event::DropBatch),
@@ -118,6 +120,13 @@ impl World {
         self.sequences.get(&self.actors[actor as usize].incarnation).copied().unwrap_or(0)
     }
 
+    fn take(&mut self, batch: Option<Batch>) {
+        let headers = batch.iter().flat_map(Batch::headers);
+        let mut ages = headers.map(|header| self.phase.version - header.version);
+        assert!(ages.all(|age| age <= CONFIG.max_staleness), "an unroll of the batch is stale");
+        self.taken.extend(batch);
+    }
+
     fn train(&mut self) {
         let Some(batch) = self.taken.pop() else { return };
         for header in batch.headers() {
@@ -161,12 +170,11 @@ impl World {
                 assert_eq!(stranger.send(&self.batcher, 0), Some(Outcome::NotJoined));
                 self.known.refused += 1;
             }
-            Event::Take => {
-                let batch = batch_now(&self.batcher);
-                let headers = batch.iter().flat_map(Batch::headers);
-                let mut ages = headers.map(|header| self.phase.version - header.version);
-                assert!(ages.all(|age| age <= CONFIG.max_staleness), "an unroll of the batch is stale");
-                self.taken.extend(batch);
+            Event::Take => self.take(batch_now(&self.batcher)),
+            Event::TakeAvailable { at_most } => {
+                let batch = available_now(&self.batcher, at_most);
+                assert!(batch.iter().all(|batch| (1..=at_most).contains(&batch.unrolls)));
+                self.take(batch);
             }
             Event::Train => self.train(),
             Event::Discard { reason } => {
@@ -206,7 +214,8 @@ impl World {
         assert_eq!(accounting.produced, self.known.cursors.values().sum::<u64>(), "sum of the sequence numbers");
         assert_eq!(accounting.trained, self.known.trained.len() as u64);
         assert_eq!(accounting.unattributed, self.known.refused);
-        assert!(accounting.in_flight <= 3 * CONFIG.unrolls as u64);
+        // One batch for the trainer, two that are assembled, and one of what was available.
+        assert!(accounting.in_flight <= 4 * CONFIG.unrolls as u64);
         assert_eq!(self.batcher.snapshot().accounting, accounting);
         self.check_tasks();
     }

@@ -4,27 +4,11 @@
 
 mod common;
 
+use comic_proto::Invalid;
 use comic_proto::v1::UnrollHeader;
-use comic_proto::{Field, Invalid};
 use comic_replay::{Batch, BatchOrder, Batcher, Config, Ledger, Outcome, Phase};
-use common::{Actor, CONFIG, PHASE, SLOTS, batch_now, batcher, insert_now, layout, mark, payload};
+use common::{Actor, CONFIG, PHASE, SLOTS, assert_holds, batch_now, batcher, insert_now, layout, payload};
 use proptest::prelude::*;
-
-fn assert_holds(batch: &Batch, expected: &[UnrollHeader]) {
-    assert_eq!(batch.unrolls, expected.len());
-    for (slot, header) in expected.iter().enumerate() {
-        assert_eq!(batch.headers()[slot].sequence, header.sequence);
-        for field in Field::ALL.into_iter().filter(|field| *field != Field::Clip) {
-            let (rows, width) = (batch.layout.rows(field), batch.layout.width(field));
-            for t in 0..rows {
-                let start = (slot * rows + t) * width;
-                assert_eq!(batch.f32(field)[start..start + width], vec![mark(header, field, t); width], "{field}[{t}]");
-            }
-            assert_eq!(batch.f32(field).len(), expected.len() * rows * width);
-        }
-        assert_eq!(batch.clip()[slot * 3..(slot + 1) * 3], [header.sequence as u32; 3]);
-    }
-}
 
 #[test]
 fn fields_are_contiguous_and_in_order_of_arrival_also_in_reused_buffers() {

@@ -125,3 +125,30 @@ pub(crate) fn batch_now(batcher: &Batcher) -> Option<Batch> {
         Next::Elapsed | Next::Closed => None,
     }
 }
+
+/// At most `at_most` of the unrolls that wait, if there are any.
+pub(crate) fn available_now(batcher: &Batcher, at_most: usize) -> Option<Batch> {
+    match batcher.next_available_within(std::time::Duration::ZERO, at_most) {
+        Next::Batch(batch) => Some(batch),
+        Next::Elapsed | Next::Closed => None,
+    }
+}
+
+/// Checks that a batch has exactly these unrolls, in this order and field by field.
+pub(crate) fn assert_holds(batch: &Batch, expected: &[UnrollHeader]) {
+    assert_eq!((batch.unrolls, batch.headers().len()), (expected.len(), expected.len()));
+    assert_eq!(batch.as_unrolls().len(), expected.len());
+    for (slot, header) in expected.iter().enumerate() {
+        assert_eq!(batch.headers()[slot].sequence, header.sequence);
+        for field in Field::ALL.into_iter().filter(|field| *field != Field::Clip) {
+            let (rows, width) = (batch.layout.rows(field), batch.layout.width(field));
+            for t in 0..rows {
+                let start = (slot * rows + t) * width;
+                assert_eq!(batch.f32(field)[start..start + width], vec![mark(header, field, t); width], "{field}[{t}]");
+            }
+            assert_eq!(batch.f32(field).len(), expected.len() * rows * width);
+        }
+        assert_eq!(batch.clip()[slot * 3..(slot + 1) * 3], [header.sequence as u32; 3]);
+    }
+    assert_eq!(batch.clip().len(), 3 * expected.len());
+}
