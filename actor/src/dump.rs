@@ -1,4 +1,4 @@
-//! Writes episodes whose simulation diverged to disk, and replays them.
+//! Writes episodes whose simulation diverged to disk, and reproduces them.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -93,9 +93,9 @@ pub struct Dump {
     pub end: Moment,
 }
 
-/// The result of replaying a dump.
+/// The result of reproducing a dump's episode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Replay {
+pub struct Reproduction {
     /// Steps of the dump.
     pub steps: usize,
     /// The step that diverged, counted from 1.
@@ -104,7 +104,7 @@ pub struct Replay {
     pub exact: bool,
 }
 
-impl fmt::Display for Replay {
+impl fmt::Display for Reproduction {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.diverged {
             Some(step) => write!(f, "diverged in step {step} of {}", self.steps)?,
@@ -129,14 +129,14 @@ impl Dump {
             .map_err(|error| Error::Usage(format!("{} is no dump of a diverged episode: {error}", path.display())))
     }
 
-    /// Replays it, with these clips if the experiment's own are not available.
+    /// Plays the episode again, with these clips if the experiment's own are not available.
     ///
     /// A tracking episode begins at its clip's start, so the states are the same bit for bit. The random draws of other
     /// tasks are not known: their episodes begin in the dump's first state, in a newly drawn arena.
     ///
     /// # Errors
     /// An experiment, clip or state that this release does not have.
-    pub fn replay(&self, clips: &[String]) -> Result<Replay, Error> {
+    pub fn reproduce(&self, clips: &[String]) -> Result<Reproduction, Error> {
         let experiment = Experiment::from_toml("the dump's experiment", &self.experiment)?.with_clips(clips);
         let task = comic_tasks::build(&experiment, &Catalogue::open(&experiment.clips)?)?;
         let mut environment = task.environment(self.seed)?;
@@ -144,18 +144,18 @@ impl Dump {
         if Moment::of(environment.simulation()) != self.first {
             self.place(environment.simulation_mut())?;
         }
-        let mut replay = Replay { steps: self.actions.len(), diverged: None, exact: true };
+        let mut reproduction = Reproduction { steps: self.actions.len(), diverged: None, exact: true };
         let unseen = self.actions.len().saturating_sub(self.last.len());
         for (step, Numbers(action)) in self.actions.iter().enumerate() {
             let recorded = step.checked_sub(unseen).and_then(|place| self.last.get(place));
-            replay.exact &= recorded.is_none_or(|moment| Moment::of(environment.simulation()) == *moment);
+            reproduction.exact &= recorded.is_none_or(|moment| Moment::of(environment.simulation()) == *moment);
             let action: Vec<f32> = action.iter().map(|value| *value as f32).collect();
             if environment.step(&action).outcome == Outcome::Diverged {
-                replay.diverged = Some(step + 1);
+                reproduction.diverged = Some(step + 1);
                 break;
             }
         }
-        Ok(replay)
+        Ok(reproduction)
     }
 
     fn place(&self, simulation: &mut Simulation) -> Result<(), Error> {
@@ -173,7 +173,7 @@ impl Dump {
     }
 }
 
-/// `comic-actor replay`.
+/// `comic-actor reproduce`.
 #[derive(clap::Args, Clone, Debug)]
 pub struct Command {
     /// A file that `--dump-diverged` wrote.
@@ -185,13 +185,13 @@ pub struct Command {
 }
 
 impl Command {
-    /// Replays the dump and prints the result.
+    /// Reproduces the dump's episode and prints the result.
     ///
     /// # Errors
-    /// As [`Dump::read`] and [`Dump::replay`].
+    /// As [`Dump::read`] and [`Dump::reproduce`].
     pub fn run(&self) -> Result<(), Error> {
-        let replay = Dump::read(&self.dump)?.replay(&self.clips)?;
-        let line = format!("{replay}\n");
+        let reproduction = Dump::read(&self.dump)?.reproduce(&self.clips)?;
+        let line = format!("{reproduction}\n");
         std::io::stdout().write_all(line.as_bytes()).map_err(Error::file("standard output"))
     }
 }

@@ -8,7 +8,7 @@
 //! - [`round`] lets a worker wait until the learner has answered for its last unrolls.
 //! - [`session`] is the connection to the learner. It joins, fetches assets, receives parameters, sends each unroll until
 //!   it is acknowledged, and reconnects after every loss.
-//! - [`dump`] writes episodes whose simulation diverged, and replays them.
+//! - [`dump`] writes episodes whose simulation diverged, and reproduces them.
 //! - [`liveness`] is the file for a container's health check.
 //! - [`run`] is the actor process made of these parts.
 //! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads the learner's checkpoints.

@@ -54,8 +54,8 @@ enum Command {
     View(View),
     /// Lists, checks, imports, merges and fetches motion capture.
     Clips(Clips),
-    /// Replays a diverged episode that --dump-diverged wrote.
-    Replay(dump::Command),
+    /// Plays a diverged episode again that --dump-diverged wrote.
+    Reproduce(dump::Command),
     /// Exits with 0 if an actor steps environments and with 1 if not, for a container's health check.
     Health(Health),
     /// Write shell completions and man pages.
@@ -87,7 +87,7 @@ struct Act {
     #[arg(long, value_name = "SECONDS", env = "COMIC_GIVE_UP_AFTER")]
     #[arg(value_parser = clap::value_parser!(u32).range(1..))]
     give_up_after: Option<u32>,
-    /// Write episodes whose simulation diverged into this directory, at most 16; see `comic-actor replay`.
+    /// Write episodes whose simulation diverged into this directory, at most 16; see `comic-actor reproduce`.
     #[arg(long, value_name = "DIR")]
     dump_diverged: Option<PathBuf>,
     /// Write this file while environments are stepped; see `comic-actor health`.
@@ -126,7 +126,7 @@ fn command(arguments: Arguments) -> anyhow::Result<()> {
         Some(Command::Render(render)) => render.run().context("cannot film"),
         Some(Command::View(view)) => view.run().context("cannot show"),
         Some(Command::Clips(clips)) => clips.run().map_err(anyhow::Error::from),
-        Some(Command::Replay(replay)) => replay.run().context("cannot replay"),
+        Some(Command::Reproduce(reproduce)) => reproduce.run().context("cannot reproduce the episode"),
         Some(Command::Health(health)) => health.run(),
         Some(Command::Manual(manual)) => manual.write(Arguments::command()).context("cannot write the manual"),
         None => {

@@ -21,7 +21,7 @@ fn wild(step: usize) -> [f32; 56] {
 }
 
 #[test]
-fn a_dump_of_tracking_is_replayed_bit_for_bit() {
+fn a_dump_of_tracking_is_reproduced_bit_for_bit() {
     let directory = tempfile::tempdir().unwrap();
     let mut environment = watched(directory.path(), "quickstart");
     environment.reset();
@@ -37,7 +37,7 @@ fn a_dump_of_tracking_is_replayed_bit_for_bit() {
     let [path] = dumped(directory.path()).try_into().unwrap();
     let dump = Dump::read(&path).unwrap();
     assert_eq!((dump.actions.len(), dump.last.len(), dump.clip_name.as_str()), (13, LAST, "CMU_007_01"));
-    assert_eq!(dump.replay(&[]).unwrap(), Replay { steps: 13, diverged: Some(13), exact: true });
+    assert_eq!(dump.reproduce(&[]).unwrap(), Reproduction { steps: 13, diverged: Some(13), exact: true });
 }
 
 #[test]
@@ -47,7 +47,10 @@ fn a_dump_of_another_task_begins_in_its_first_state() {
     environment.reset();
     environment.step(&[f32::INFINITY; 56]);
     let [path] = dumped(directory.path()).try_into().unwrap();
-    assert_eq!(Dump::read(&path).unwrap().replay(&[]).unwrap(), Replay { steps: 1, diverged: Some(1), exact: true });
+    assert_eq!(
+        Dump::read(&path).unwrap().reproduce(&[]).unwrap(),
+        Reproduction { steps: 1, diverged: Some(1), exact: true }
+    );
 }
 
 #[test]
@@ -61,7 +64,7 @@ fn states_of_a_diverged_episode_are_restored_from_disk() {
     let dump = Dump::read(&path).unwrap();
     assert!(dump.last[0].qvel.0.iter().all(|value| *value == 1e11));
     assert_eq!(dump.end, Moment::of(environment.environment.simulation()));
-    assert!(!dump.replay(&[]).unwrap().exact, "no action explains the velocity");
+    assert!(!dump.reproduce(&[]).unwrap().exact, "no action explains the velocity");
 }
 
 #[test]
