@@ -8,7 +8,7 @@
 //! - [`algorithm`] is what the trainer needs of a learning algorithm. [`vmpo`] is V-MPO, and [`svg0`] SVG(0): experience, losses
 //!   and gradient step. [`algorithms`] makes the one that the experiment names. [`adam`] is their optimiser, and [`tensors`] reads and writes its state.
 //! - [`checkpoint`] is the run's checkpoint directory. No other module touches it.
-//! - [`observe`] is what people and Prometheus see of a run: metrics, telemetry and probes.
+//! - [`observe`] is what people and Prometheus see of a run: metrics, evaluations and probes.
 //! - `memory_limit` is how much memory the process may use. [`threads`] says how libtorch's threads share the machine.
 //! - [`commands`] are the commands besides serving and training. [`options`] is the whole command line, and [`document`] its
 //!   arguments for the experiment.

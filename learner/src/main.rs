@@ -77,7 +77,7 @@ fn run_command(command: &Command, options: &Options) -> Result<()> {
         Command::Status(status) => status.run(),
         Command::Health(_) => Ok(()),
         Command::Certs(certs) => certs.run(),
-        Command::Metrics => comic_learner::observe::telemetry::print_reference(),
+        Command::Metrics => comic_learner::observe::prometheus::print_reference(),
         Command::Manual(manual) => manual
             .write(Options::command())
             .map_err(|source| Error::System { what: "cannot write the manual".into(), source }),

@@ -111,7 +111,7 @@ struct Epoch {
     ended: comic_learner::error::Result<Ending>,
     /// The parameters that actors would act with.
     published: Arc<Published>,
-    telemetry: String,
+    prometheus: String,
 }
 
 /// One epoch of the learner, fed with the recording from the end of its accounting up to `unrolls`, altered.
@@ -196,7 +196,7 @@ fn live_evaluated(
     let ended = Trainer::new(setup).unwrap().run();
     batcher.close();
     feeder.join().unwrap();
-    Epoch { ended, published: publisher.newest().unwrap(), telemetry: service.probed().metrics_page() }
+    Epoch { ended, published: publisher.newest().unwrap(), prometheus: service.probed().metrics_page() }
 }
 
 /// The last checkpoint after so many updates of a preset. The feeder gives exactly the unrolls that they need, so that the
@@ -311,7 +311,7 @@ fn after_too_many_skipped_steps_the_last_good_state_is_restored() {
     tch::set_num_threads(1);
     let run = tempfile::tempdir().unwrap();
     // Three batches as they were recorded, then nothing but poison.
-    let Epoch { ended, published, telemetry } = live(&delicate(3 + 4), run.path(), u64::MAX, |sequence, unroll| {
+    let Epoch { ended, published, prometheus } = live(&delicate(3 + 4), run.path(), u64::MAX, |sequence, unroll| {
         if sequence >= 3 * BATCH {
             poison(sequence, unroll);
         }
@@ -325,17 +325,17 @@ fn after_too_many_skipped_steps_the_last_good_state_is_restored() {
     // Three updates, and the one that restored: none of the skipped ones published anything.
     assert_eq!(published.version, 1 + 3 + 1);
     assert!(published.frames() == frames_of(&published, &initial));
-    assert!(telemetry.contains("comic_updates_skipped_total 4\n") && telemetry.contains("comic_restores_total 1\n"));
+    assert!(prometheus.contains("comic_updates_skipped_total 4\n") && prometheus.contains("comic_restores_total 1\n"));
 }
 
 #[test]
 fn if_the_last_good_state_does_not_help_training_ends_and_names_the_remedies() {
     let _alone = ONE_AT_A_TIME.lock();
     let run = tempfile::tempdir().unwrap();
-    let Epoch { ended, telemetry, .. } = live(&delicate(100), run.path(), u64::MAX, poison);
+    let Epoch { ended, prometheus, .. } = live(&delicate(100), run.path(), u64::MAX, poison);
     let said = format!("{:#}", ended.unwrap_err());
     assert!(said.contains("optimiser.learning_rate") && said.contains("update 7"), "{said}");
-    assert!(telemetry.contains("comic_restores_total 1\n"), "{telemetry}");
+    assert!(prometheus.contains("comic_restores_total 1\n"), "{prometheus}");
 }
 
 #[test]

@@ -178,7 +178,7 @@ impl StandIn {
                         self.publish();
                     }
                     self.batcher.trained(batch);
-                    self.service.trainer().telemetry.count_update(began.elapsed(), ages);
+                    self.service.trainer().prometheus.count_update(began.elapsed(), ages);
                 }
                 Next::Elapsed => {}
                 Next::Closed => return,

@@ -15,7 +15,7 @@ use tonic::Status;
 use tonic::body::Body;
 use tower::{Layer, Service};
 
-use crate::observe::telemetry::Telemetry;
+use crate::observe::prometheus::Prometheus;
 use crate::security::Tokens;
 
 /// The one call that needs no token, so that the health checks of containers need no secret.
@@ -26,31 +26,31 @@ const PUBLIC: &str = "/grpc.health.v1.Health/Check";
 pub(super) struct AdmissionLayer {
     tokens: Option<Arc<Tokens>>,
     places: Arc<Semaphore>,
-    telemetry: Arc<Telemetry>,
+    prometheus: Arc<Prometheus>,
 }
 
 impl AdmissionLayer {
-    pub(super) fn new(tokens: Option<Arc<Tokens>>, max_requests: usize, telemetry: Arc<Telemetry>) -> Self {
+    pub(super) fn new(tokens: Option<Arc<Tokens>>, max_requests: usize, prometheus: Arc<Prometheus>) -> Self {
         let places = Arc::new(Semaphore::new(max_requests.min(Semaphore::MAX_PERMITS)));
-        Self { tokens, places, telemetry }
+        Self { tokens, places, prometheus }
     }
 
     fn admit<B>(&self, request: &Request<B>) -> Result<Admitted, Status> {
         let shown = request.headers().get(AUTHORIZATION).map(http::HeaderValue::as_bytes);
         let public = request.uri().path() == PUBLIC;
         if !public && self.tokens.as_ref().is_some_and(|tokens| !tokens.accept(shown)) {
-            self.telemetry.requests_refused.of("unauthenticated").inc();
+            self.prometheus.requests_refused.of("unauthenticated").inc();
             let what = if shown.is_none() { "a token, but none was sent" } else { "another token" };
             return Err(Status::unauthenticated(format!(
                 "this learner requires {what}: see --token-file and COMIC_TOKEN"
             )));
         }
         let Ok(place) = self.places.clone().try_acquire_owned() else {
-            self.telemetry.requests_refused.of("overloaded").inc();
+            self.prometheus.requests_refused.of("overloaded").inc();
             return Err(Status::resource_exhausted("too many calls are in flight: try again later"));
         };
-        self.telemetry.requests.inc();
-        Ok(Admitted { requests: self.telemetry.requests.clone(), _place: place })
+        self.prometheus.requests.inc();
+        Ok(Admitted { requests: self.prometheus.requests.clone(), _place: place })
     }
 }
 

@@ -32,7 +32,7 @@ use crate::log_limiter::LogLimiter;
 use crate::observe::evaluation::Evaluation;
 use crate::observe::heartbeat::Heartbeat;
 use crate::observe::probes::Probed;
-use crate::observe::telemetry::Telemetry;
+use crate::observe::prometheus::Prometheus;
 use crate::publish::Publisher;
 use crate::security::{ConnectionLimits, Security, Tls, Tokens};
 
@@ -120,7 +120,7 @@ pub(super) struct Gate {
     pub(super) message_limit: usize,
     /// Bytes that a stream may have unread.
     pub(super) window: u32,
-    pub(super) telemetry: Arc<Telemetry>,
+    pub(super) prometheus: Arc<Prometheus>,
 }
 
 impl Service {
@@ -133,9 +133,9 @@ impl Service {
         let message_limit = setup.message_limit()?;
         let common = Common::new(&setup);
         let Setup { run, id, security, limits, experiment, spec, assets, quarantine, .. } = setup;
-        let Common { publisher, roster, room, shutdown, telemetry, .. } = common.clone();
+        let Common { publisher, roster, room, shutdown, prometheus, .. } = common.clone();
         let terms = JoinTerms::new(id, &experiment, &spec, assets.iter().map(description).collect())?;
-        let quarantine = Quarantine::start(&quarantine, &telemetry)?;
+        let quarantine = Quarantine::start(&quarantine, &prometheus)?;
         let quarantines = quarantine.is_some();
         let (evaluations, checkpoint) = (Evaluations::default(), NewestCheckpoint::default());
         let status = Arc::new(common.status(run, &experiment));
@@ -145,14 +145,14 @@ impl Service {
             message_limit,
             window: limits.max_unread_bytes.unwrap_or_else(|| window(common.batcher.layout())),
             limits,
-            telemetry: telemetry.clone(),
+            prometheus: prometheus.clone(),
         };
         let calls = Calls {
             join: common.join(terms),
             assets: Assets::new(assets, checkpoint.clone(), shutdown.clone()),
             evaluations: evaluations.clone(),
             status: status.clone(),
-            telemetry: telemetry.clone(),
+            prometheus: prometheus.clone(),
         };
         let intake = common.intake(&spec, quarantine);
         let ingest = gate.ingest_limits(quarantines);
@@ -162,7 +162,7 @@ impl Service {
             unrolls: Arc::new(Unrolls { intake, message_limit, room, shutdown: shutdown.clone() }),
             parameters: Arc::new(Parameters { publisher, roster, shutdown: shutdown.clone() }),
             shutdown,
-            trainer: TrainerHandle { run: id, telemetry, evaluations, checkpoint, status, ingest },
+            trainer: TrainerHandle { run: id, prometheus, evaluations, checkpoint, status, ingest },
         })
     }
 
@@ -202,27 +202,27 @@ struct Common {
     assignments: Option<Arc<Assignments>>,
     room: Room,
     shutdown: Shutdown,
-    telemetry: Arc<Telemetry>,
+    prometheus: Arc<Prometheus>,
 }
 
 impl Common {
     fn new(setup: &Setup) -> Self {
         let Setup { limits, experiment, batcher, publisher, .. } = setup;
-        let telemetry = Arc::<Telemetry>::default();
+        let prometheus = Arc::<Prometheus>::default();
         let lockstep = experiment.unroll.lockstep;
         Self {
             batcher: batcher.clone(),
             publisher: publisher.clone(),
             roster: Arc::new(Roster::new(limits.max_actors)),
             assignments: lockstep.then(|| Arc::new(Assignments::new(experiment.unroll.batch))),
-            room: Room::new(limits.max_ingest_bytes, telemetry.unrolls_late.clone()),
+            room: Room::new(limits.max_ingest_bytes, prometheus.unrolls_late.clone()),
             shutdown: Shutdown::new(publisher.clone()),
-            telemetry,
+            prometheus,
         }
     }
 
     fn status(&self, run: PathBuf, experiment: &Experiment) -> StatusBoard {
-        let Self { batcher, publisher, roster, room, shutdown, telemetry, .. } = self.clone();
+        let Self { batcher, publisher, roster, room, shutdown, prometheus, .. } = self.clone();
         StatusBoard {
             run,
             experiment: experiment.name.clone(),
@@ -233,22 +233,22 @@ impl Common {
             publisher,
             roster,
             room,
-            telemetry,
+            prometheus,
             shutdown,
             heartbeat: Heartbeat::default(),
         }
     }
 
     fn join(&self, terms: JoinTerms) -> Join {
-        let Self { batcher, publisher, roster, assignments, shutdown, telemetry, .. } = self.clone();
-        Join { terms, batcher, roster, assignments, shutdown, telemetry, epoch: publisher.epoch() }
+        let Self { batcher, publisher, roster, assignments, shutdown, prometheus, .. } = self.clone();
+        Join { terms, batcher, roster, assignments, shutdown, prometheus, epoch: publisher.epoch() }
     }
 
     fn intake(&self, spec: &TaskSpec, quarantine: Option<Quarantine>) -> Intake {
-        let Self { batcher, publisher, roster, assignments, shutdown, telemetry, .. } = self.clone();
+        let Self { batcher, publisher, roster, assignments, shutdown, prometheus, .. } = self.clone();
         let clips = spec.tasks.iter().map(|task| task.clips).collect();
         let log_limiter = LogLimiter::default();
-        Intake { batcher, publisher, clips, roster, assignments, quarantine, shutdown, telemetry, log_limiter }
+        Intake { batcher, publisher, clips, roster, assignments, quarantine, shutdown, prometheus, log_limiter }
     }
 }
 
@@ -271,7 +271,7 @@ impl Gate {
 pub struct TrainerHandle {
     run: u64,
     /// Counts what the trainer does.
-    pub telemetry: Arc<Telemetry>,
+    pub prometheus: Arc<Prometheus>,
     evaluations: Evaluations,
     checkpoint: NewestCheckpoint,
     status: Arc<StatusBoard>,

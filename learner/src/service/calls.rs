@@ -16,7 +16,7 @@ use super::evaluations::Evaluations;
 use super::join::Join;
 use super::status::StatusBoard;
 use crate::observe::evaluation::Evaluation;
-use crate::observe::telemetry::Telemetry;
+use crate::observe::prometheus::Prometheus;
 
 /// tonic's service. A server has one, which all its connections share.
 #[derive(Debug)]
@@ -25,7 +25,7 @@ pub(super) struct Calls {
     pub(super) assets: Assets,
     pub(super) evaluations: Evaluations,
     pub(super) status: Arc<StatusBoard>,
-    pub(super) telemetry: Arc<Telemetry>,
+    pub(super) prometheus: Arc<Prometheus>,
 }
 
 #[tonic::async_trait]
@@ -62,7 +62,7 @@ impl Learner for Calls {
         if !self.evaluations.add(evaluation) {
             return Err(Status::resource_exhausted("too many evaluations wait for the trainer: report this one later"));
         }
-        self.telemetry.evaluations.inc();
+        self.prometheus.evaluations.inc();
         Ok(Response::new(EvaluationAck {}))
     }
 

@@ -18,7 +18,7 @@ use tokio::time::Sleep;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
 use crate::log_limiter::LogLimiter;
-use crate::observe::telemetry::Telemetry;
+use crate::observe::prometheus::Prometheus;
 use crate::security::{ConnectionLimits, Tls};
 
 /// The time limit of the TLS handshake, and of the HTTP/2 preface. Each takes a few round trips.
@@ -38,7 +38,7 @@ pub(super) struct Acceptor {
     total: usize,
     open: Arc<Mutex<OpenConnections>>,
     log_limiter: Arc<LogLimiter<IpAddr>>,
-    telemetry: Arc<Telemetry>,
+    prometheus: Arc<Prometheus>,
 }
 
 /// Numbers of open connections.
@@ -49,14 +49,14 @@ struct OpenConnections {
 }
 
 impl Acceptor {
-    pub(super) fn new(tls: Option<Arc<Tls>>, limits: &ConnectionLimits, telemetry: Arc<Telemetry>) -> Self {
+    pub(super) fn new(tls: Option<Arc<Tls>>, limits: &ConnectionLimits, prometheus: Arc<Prometheus>) -> Self {
         Self {
             tls,
             per_address: limits.max_connections_per_address,
             total: limits.max_connections(),
             open: Arc::default(),
             log_limiter: Arc::default(),
-            telemetry,
+            prometheus,
         }
     }
 
@@ -99,11 +99,11 @@ impl Acceptor {
         } else {
             open.total += 1;
             open.by_address.insert(address, taken + 1);
-            self.telemetry.connections.inc();
+            self.prometheus.connections.inc();
             return Some(Place { address, acceptor: self.clone() });
         };
         drop(open);
-        self.telemetry.connections_refused.of(reason).inc();
+        self.prometheus.connections_refused.of(reason).inc();
         if let Some(unreported) = self.log_limiter.due(address) {
             let (per_address, total) = (self.per_address, self.total);
             tracing::warn!(%address, unreported, per_address, total, "connection refused: too many");
@@ -125,7 +125,7 @@ impl Acceptor {
                     Ok(Err((error, stream))) => (error, Some(stream)),
                     Err(_) => (io::ErrorKind::TimedOut.into(), None),
                 };
-                self.telemetry.connections_refused.of("tls").inc();
+                self.prometheus.connections_refused.of("tls").inc();
                 if let Some(unreported) = self.log_limiter.due(place.address) {
                     tracing::warn!(address = %place.address, unreported, "the TLS handshake failed: {error}");
                 }
@@ -157,7 +157,7 @@ struct Place {
 
 impl Drop for Place {
     fn drop(&mut self) {
-        self.acceptor.telemetry.connections.dec();
+        self.acceptor.prometheus.connections.dec();
         let mut open = self.acceptor.open.lock();
         open.total -= 1;
         if let Some(connections) = open.by_address.get_mut(&self.address) {

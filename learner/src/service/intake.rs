@@ -14,7 +14,7 @@ use super::quarantine::Quarantine;
 use super::roster::{Roster, superseded};
 use super::shutdown::Shutdown;
 use crate::log_limiter::LogLimiter;
-use crate::observe::telemetry::Telemetry;
+use crate::observe::prometheus::Prometheus;
 use crate::publish::Publisher;
 
 /// Validates unrolls and puts them into batches.
@@ -29,7 +29,7 @@ pub(super) struct Intake {
     pub(super) assignments: Option<Arc<Assignments>>,
     pub(super) quarantine: Option<Quarantine>,
     pub(super) shutdown: Shutdown,
-    pub(super) telemetry: Arc<Telemetry>,
+    pub(super) prometheus: Arc<Prometheus>,
     /// By actor.
     pub(super) log_limiter: LogLimiter<u64>,
 }
@@ -56,7 +56,7 @@ impl Intake {
             self.batcher.refuse_unattributed();
             return Ok(Some(self.ack(0, Verdict::Invalid, Invalid::Header.to_string())));
         };
-        self.telemetry.unroll_bytes.observe(payload.len() as f64);
+        self.prometheus.unroll_bytes.observe(payload.len() as f64);
         self.check_sender(&header)?;
         match self.check(&header, &payload) {
             Ok(()) => {

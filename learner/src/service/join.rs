@@ -14,7 +14,7 @@ use super::assignments::{Assignment, Assignments, Denied};
 use super::roster::{Joined, Roster, superseded};
 use super::shutdown::Shutdown;
 use crate::error::{Error, Result};
-use crate::observe::telemetry::Telemetry;
+use crate::observe::prometheus::Prometheus;
 
 /// Bytes of an actor's name, as many as a host's name can have.
 const NAME_LIMIT: usize = 253;
@@ -63,7 +63,7 @@ pub(super) struct Join {
     /// Only in lockstep.
     pub(super) assignments: Option<Arc<Assignments>>,
     pub(super) shutdown: Shutdown,
-    pub(super) telemetry: Arc<Telemetry>,
+    pub(super) prometheus: Arc<Prometheus>,
     /// The learner epoch.
     pub(super) epoch: u64,
 }
@@ -76,7 +76,7 @@ impl Join {
     pub(super) fn answer(&self, request: &JoinRequest, peer: Option<SocketAddr>) -> Result<JoinReply, Status> {
         let answer = self.check(request).and_then(|()| self.accept(request));
         let result = answer.as_ref().map_or_else(|Refusal(result, _)| *result, |_| "joined");
-        self.telemetry.joins.of(result).inc();
+        self.prometheus.joins.of(result).inc();
         if let Ok(JoinReply { actor, .. }) = &answer {
             let incarnation = format_args!("{:016x}", request.incarnation);
             tracing::info!(actor, incarnation, peer = ?peer, "actor joined");

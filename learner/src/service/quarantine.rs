@@ -17,7 +17,7 @@ use serde_json::json;
 
 use crate::error::{Error, Result};
 use crate::log_limiter::LogLimiter;
-use crate::observe::telemetry::Telemetry;
+use crate::observe::prometheus::Prometheus;
 
 /// Unrolls that may wait for the disk; others are discarded.
 const QUEUE: usize = 8;
@@ -49,7 +49,7 @@ pub(crate) struct Quarantine {
     /// `None` only during the drop.
     queue: Option<SyncSender<Refused>>,
     thread: Option<JoinHandle<()>>,
-    telemetry: Arc<Telemetry>,
+    prometheus: Arc<Prometheus>,
 }
 
 impl Quarantine {
@@ -60,7 +60,7 @@ impl Quarantine {
     ///
     /// # Errors
     /// When the directory cannot be made or read, or the system gives no thread.
-    pub(crate) fn start(options: &QuarantineArguments, telemetry: &Arc<Telemetry>) -> Result<Option<Self>> {
+    pub(crate) fn start(options: &QuarantineArguments, prometheus: &Arc<Prometheus>) -> Result<Option<Self>> {
         let Some(directory) = options.quarantine.clone() else { return Ok(None) };
         fs::create_dir_all(&directory).map_err(Error::file("make", &directory))?;
         let taken = taken(&directory).map_err(Error::file("list", &directory))?;
@@ -69,11 +69,11 @@ impl Quarantine {
         let thread = std::thread::Builder::new()
             .name("quarantine".into())
             .spawn({
-                let telemetry = telemetry.clone();
-                move || store.keep_all(&refused, &telemetry)
+                let prometheus = prometheus.clone();
+                move || store.keep_all(&refused, &prometheus)
             })
             .map_err(Error::system("cannot start the quarantine's thread"))?;
-        Ok(Some(Self { queue: Some(queue), thread: Some(thread), telemetry: telemetry.clone() }))
+        Ok(Some(Self { queue: Some(queue), thread: Some(thread), prometheus: prometheus.clone() }))
     }
 
     /// Queues an unroll for the disk, or counts it as discarded. Never waits.
@@ -83,7 +83,7 @@ impl Quarantine {
         payload.copy_to(0, &mut bytes);
         let refused = Refused { header: header.clone(), payload: bytes, reason: reason.to_string() };
         if self.queue.as_ref().is_none_or(|queue| queue.try_send(refused).is_err()) {
-            self.telemetry.quarantined.of("busy").inc();
+            self.prometheus.quarantined.of("busy").inc();
         }
     }
 }
@@ -107,7 +107,7 @@ struct Store {
 
 impl Store {
     /// Writes the unrolls of the queue until it is closed.
-    fn keep_all(&mut self, queue: &Receiver<Refused>, telemetry: &Telemetry) {
+    fn keep_all(&mut self, queue: &Receiver<Refused>, prometheus: &Prometheus) {
         let log_limiter = LogLimiter::default();
         while let Ok(refused) = queue.recv() {
             let result = match self.keep(&refused) {
@@ -120,7 +120,7 @@ impl Store {
                     "failed"
                 }
             };
-            telemetry.quarantined.of(result).inc();
+            prometheus.quarantined.of(result).inc();
         }
     }
 
@@ -187,17 +187,17 @@ mod tests {
 
     /// Offers unrolls of 1000 bytes one by one, and returns how many were kept.
     fn kept(directory: &Path, bytes: u64, sequences: std::ops::Range<u64>) -> u64 {
-        let telemetry = Arc::<Telemetry>::default();
+        let prometheus = Arc::<Prometheus>::default();
         for sequence in sequences {
             // One quarantine for each, so that the thread is never busy.
-            let quarantine = Quarantine::start(&options(directory, bytes), &telemetry).unwrap().unwrap();
+            let quarantine = Quarantine::start(&options(directory, bytes), &prometheus).unwrap().unwrap();
             quarantine.offer(
                 &header(sequence),
                 &bytes::Bytes::from(vec![sequence as u8; 1000]).into(),
                 &Invalid::Header,
             );
         }
-        telemetry.quarantined.of("kept").get()
+        prometheus.quarantined.of("kept").get()
     }
 
     #[test]
@@ -233,13 +233,13 @@ mod tests {
 
     #[test]
     fn an_unroll_is_discarded_and_counted_while_the_disk_is_busy() {
-        let telemetry = Arc::<Telemetry>::default();
+        let prometheus = Arc::<Prometheus>::default();
         // No thread takes an unroll from the queue.
         let (queue, _waiting) = sync_channel(QUEUE);
-        let quarantine = Quarantine { queue: Some(queue), thread: None, telemetry: telemetry.clone() };
+        let quarantine = Quarantine { queue: Some(queue), thread: None, prometheus: prometheus.clone() };
         for sequence in 0..QUEUE as u64 + 3 {
             quarantine.offer(&header(sequence), &Pieces::default(), &Invalid::Header);
         }
-        assert_eq!(telemetry.quarantined.of("busy").get(), 3);
+        assert_eq!(prometheus.quarantined.of("busy").get(), 3);
     }
 }

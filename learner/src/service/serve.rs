@@ -37,8 +37,8 @@ pub async fn serve(listener: TcpListener, service: Service, shutdown: impl Futur
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
         .build_v1()
         .map_err(|error| Error::Defect(format!("the protocol's descriptors are damaged: {error}")))?;
-    let admission = AdmissionLayer::new(gate.tokens.clone(), gate.limits.max_requests, gate.telemetry.clone());
-    let acceptor = Acceptor::new(gate.tls.clone(), &gate.limits, gate.telemetry.clone());
+    let admission = AdmissionLayer::new(gate.tokens.clone(), gate.limits.max_requests, gate.prometheus.clone());
+    let acceptor = Acceptor::new(gate.tls.clone(), &gate.limits, gate.prometheus.clone());
     let mut closing = service.shutdown.closing();
     let server = server(gate.window)
         .layer(admission)

@@ -13,7 +13,7 @@ use super::roster::{Census, Roster};
 use super::shutdown::Shutdown;
 use crate::observe::heartbeat::Heartbeat;
 use crate::observe::probes::Probed;
-use crate::observe::telemetry::{Sample, Telemetry};
+use crate::observe::prometheus::{Prometheus, Sample};
 use crate::publish::Publisher;
 
 /// What an operator can ask.
@@ -31,7 +31,7 @@ pub(super) struct StatusBoard {
     pub(super) publisher: Publisher,
     pub(super) roster: Arc<Roster>,
     pub(super) room: Room,
-    pub(super) telemetry: Arc<Telemetry>,
+    pub(super) prometheus: Arc<Prometheus>,
     pub(super) shutdown: Shutdown,
     pub(super) heartbeat: Heartbeat,
 }
@@ -46,7 +46,7 @@ impl StatusBoard {
     pub(super) fn status(&self) -> v1::Status {
         let accounting = self.batcher.accounting();
         let Census { alive, slow, lost, waiting } = self.roster.census(Instant::now());
-        let ages = self.telemetry.ages();
+        let ages = self.prometheus.ages();
         v1::Status {
             learner_epoch: self.publisher.epoch(),
             accounting: Some(v1::Accounting {
@@ -74,7 +74,7 @@ impl StatusBoard {
 impl Probed for StatusBoard {
     fn metrics_page(&self) -> String {
         let Census { alive, slow, lost, waiting } = self.roster.census(Instant::now());
-        self.telemetry.page(&Sample {
+        self.prometheus.page(&Sample {
             accounting: self.batcher.accounting_by_task(),
             capacity: self.capacity,
             waiting,

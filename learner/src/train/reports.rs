@@ -13,17 +13,17 @@ use crate::algorithm::loss_report::{LossValues, Losses};
 use crate::checkpoint::Evaluated;
 use crate::checkpoint::progress::Progress;
 use crate::error::Result;
-use crate::observe::metrics::{Metrics, Position};
-use crate::observe::telemetry::Telemetry;
+use crate::observe::metrics_file::{MetricsFile, Position};
+use crate::observe::prometheus::Prometheus;
 use crate::service::TrainerHandle;
 
 /// Counters, metric lines, and evaluations that came in.
 #[derive(Debug)]
 pub(super) struct Reports {
-    metrics: Metrics,
+    metrics: MetricsFile,
     /// Shows the newest metrics, and collects the evaluations that actors report.
     service: TrainerHandle,
-    telemetry: Arc<Telemetry>,
+    prometheus: Arc<Prometheus>,
     /// Seconds between two lines.
     interval: f64,
     tasks: Vec<String>,
@@ -40,8 +40,8 @@ impl Reports {
     /// When their file cannot be opened.
     pub(super) fn open(run: &Path, spec: &TaskSpec, learner: &Learner, service: TrainerHandle) -> Result<Self> {
         Ok(Self {
-            metrics: Metrics::open(run, spec)?,
-            telemetry: service.telemetry.clone(),
+            metrics: MetricsFile::open(run, spec)?,
+            prometheus: service.prometheus.clone(),
             service,
             interval: learner.metrics_seconds,
             tasks: spec.tasks.iter().map(|task| task.name.clone()).collect(),
@@ -60,14 +60,14 @@ impl Reports {
         let mut environment_steps = 0;
         for (rows, task) in self.metrics.count_rows(batch).into_iter().zip(&self.tasks) {
             environment_steps += rows.environment_steps;
-            self.telemetry.count_rows(task, rows);
+            self.prometheus.count_rows(task, rows);
         }
         for UnrollHeader { actor, incarnation, sequence, .. } in batch.headers() {
             tracing::trace!(actor, incarnation = format_args!("{incarnation:016x}"), sequence, "trained on");
         }
         let episodes = batch.headers().iter().flat_map(|header| &header.episodes);
         let diverged = episodes.filter(|episode| episode.end() == EpisodeEnd::Diverged).count();
-        self.telemetry.episodes_diverged.inc_by(diverged as u64);
+        self.prometheus.episodes_diverged.inc_by(diverged as u64);
         environment_steps
     }
 
@@ -80,23 +80,23 @@ impl Reports {
 
     /// Counts the duration of an update on unrolls of these ages, in versions.
     pub(super) fn count_duration(&self, duration: Duration, ages: Vec<u64>) {
-        self.telemetry.count_update(duration, ages);
+        self.prometheus.count_update(duration, ages);
     }
 
     /// Counts the programs that the device has compiled so far.
     pub(super) fn count_compilations(&self, compilations: u64) {
-        self.telemetry.count_compilations(compilations);
+        self.prometheus.count_compilations(compilations);
     }
 
     /// Counts gradient steps that were skipped.
     pub(super) fn count_skipped(&mut self, skipped: u64) {
         self.metrics.count_skipped(skipped);
-        self.telemetry.updates_skipped.inc_by(skipped);
+        self.prometheus.updates_skipped.inc_by(skipped);
     }
 
     /// Counts a return to the last good state.
     pub(super) fn count_restore(&self) {
-        self.telemetry.restores.inc();
+        self.prometheus.restores.inc();
     }
 
     /// Keeps losses to be read later.

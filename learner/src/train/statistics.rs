@@ -194,6 +194,7 @@ mod tests {
     use comic_proto::{UnrollBuffer, UnrollLayout, UnrollShape};
 
     use super::*;
+    use crate::observe::metrics_file::{MetricsFile, Position, Rows};
 
     /// Two tasks of one clip each.
     fn spec() -> TaskSpec {
@@ -263,11 +264,10 @@ mod tests {
     #[test]
     fn the_metrics_count_every_tasks_steps_and_padding() {
         let (spec, run) = (spec(), tempfile::tempdir().unwrap());
-        let mut metrics = crate::observe::metrics::Metrics::open(run.path(), &spec).unwrap();
-        let rows = |environment_steps, padding| crate::observe::metrics::Rows { rows: 3, environment_steps, padding };
+        let mut metrics = MetricsFile::open(run.path(), &spec).unwrap();
+        let rows = |environment_steps, padding| Rows { rows: 3, environment_steps, padding };
         assert_eq!(metrics.count_rows(&batch(&spec)), [rows(3, 0), rows(1, 1)]);
-        let position =
-            crate::observe::metrics::Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
+        let position = Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
         let mut accounting = comic_replay::AccountingByTask::default();
         accounting.tasks.insert("get-up".into(), comic_replay::TaskAccounting { trained: 7, ..Default::default() });
         let line = metrics.write(position, accounting, serde_json::Map::new());

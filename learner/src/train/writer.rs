@@ -99,7 +99,7 @@ fn run_writer(
                         offer(service, &path, &snapshot);
                     }
                 });
-                service.telemetry.checkpoints.of(if last.is_ok() { "written" } else { "failed" }).inc();
+                service.prometheus.checkpoints.of(if last.is_ok() { "written" } else { "failed" }).inc();
                 if let Err(error) = &last {
                     let error = comic_proto::chain(error);
                     tracing::error!(checkpoint = %name, "checkpoint not written: {error}");

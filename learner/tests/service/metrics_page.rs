@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use crate::support::World;
 use comic_learner::observe::probes;
-use comic_learner::observe::telemetry::Telemetry;
+use comic_learner::observe::prometheus::Prometheus;
 use comic_proto::v1::Verdict;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
@@ -95,7 +95,7 @@ fn repository(path: &str) -> String {
 
 #[test]
 fn the_reference_agrees_with_the_code() {
-    let reference = Telemetry::default().reference();
+    let reference = Prometheus::default().reference();
     assert!(
         repository("docs/metrics.md") == reference,
         "docs/metrics.md is not up to date: run `comic-learner metrics > docs/metrics.md`"
@@ -105,7 +105,7 @@ fn the_reference_agrees_with_the_code() {
 #[test]
 fn the_dashboard_shows_metrics_that_exist() {
     let dashboard: serde_json::Value = serde_json::from_str(&repository("deploy/grafana/comic.json")).unwrap();
-    let known: BTreeSet<String> = Telemetry::default().names().into_iter().collect();
+    let known: BTreeSet<String> = Prometheus::default().names().into_iter().collect();
     let panels = dashboard["panels"].as_array().unwrap();
     let targets = panels.iter().flat_map(|panel| panel["targets"].as_array().into_iter().flatten());
     let expressions: Vec<&str> = targets.map(|target| target["expr"].as_str().unwrap()).collect();

@@ -113,7 +113,7 @@ fn per(value: f64, count: u64) -> Value {
 
 /// Collects and writes metrics.
 #[derive(Debug)]
-pub struct Metrics {
+pub struct MetricsFile {
     spec: TaskSpec,
     run: PathBuf,
     file: Whole,
@@ -141,7 +141,7 @@ pub struct Position {
     pub epoch: u64,
 }
 
-impl Metrics {
+impl MetricsFile {
     /// Appends to `RUN/metrics.jsonl`.
     ///
     /// # Errors
@@ -331,7 +331,7 @@ mod tests {
         std::os::unix::fs::symlink("/dev/full", directory.path().join("metrics.jsonl")).unwrap();
         std::os::unix::fs::symlink("/dev/full", directory.path().join("evaluations.jsonl")).unwrap();
         let spec = TaskSpec::new(&Experiment::default(), vec!["walk".into()]).unwrap();
-        let mut metrics = Metrics::open(directory.path(), &spec).unwrap();
+        let mut metrics = MetricsFile::open(directory.path(), &spec).unwrap();
         let position = Position { seconds: 1.0, environment_steps: 2, updates: 3, version: 4, epoch: 5 };
         for _ in 0..2 {
             let line = metrics.write(position, AccountingByTask::default(), Map::new());

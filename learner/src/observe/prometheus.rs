@@ -16,7 +16,7 @@ use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 
 use crate::error::{Error, Result};
 use crate::observe::catalogue::{Catalogue, Description, Labelled, TASKS};
-use crate::observe::metrics::Rows;
+use crate::observe::metrics_file::Rows;
 
 /// How many versions old the unrolls of the newest update were.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -28,7 +28,7 @@ pub(crate) struct Ages {
 
 /// The metrics of one learner process.
 #[derive(Debug)]
-pub struct Telemetry {
+pub struct Prometheus {
     catalogue: Catalogue,
     ages: Mutex<Ages>,
     pub(crate) updates: Counter,
@@ -121,7 +121,7 @@ impl Sampled {
     }
 }
 
-/// The values that [`Telemetry::page`] gets from other modules.
+/// The values that [`Prometheus::page`] gets from other modules.
 #[derive(Debug)]
 pub(crate) struct Sample {
     pub(crate) accounting: AccountingByTask,
@@ -134,7 +134,7 @@ pub(crate) struct Sample {
     pub(crate) silence: Duration,
 }
 
-impl Default for Telemetry {
+impl Default for Prometheus {
     fn default() -> Self {
         let mut catalogue = Catalogue::default();
         let all = &mut catalogue;
@@ -220,7 +220,7 @@ impl Default for Telemetry {
     }
 }
 
-impl Telemetry {
+impl Prometheus {
     /// Counts an update that took `duration` on unrolls of these ages.
     pub fn count_update(&self, duration: Duration, mut ages: Vec<u64>) {
         self.updates.inc();
@@ -340,12 +340,12 @@ fn resident_bytes() -> u64 {
     kilobytes.unwrap_or_default() * 1024
 }
 
-/// Prints [`Telemetry::reference`].
+/// Prints [`Prometheus::reference`].
 ///
 /// # Errors
 /// When stdout refuses.
 pub fn print_reference() -> Result<()> {
-    let page = Telemetry::default().reference();
+    let page = Prometheus::default().reference();
     let written = std::io::Write::write_all(&mut std::io::stdout(), page.as_bytes());
     written.map_err(Error::system("cannot write to stdout"))
 }
