@@ -188,9 +188,9 @@ impl Batcher {
         self.next_within(timeout, &self.inner.filled, |state| self.take_next(state))
     }
 
-    /// The unrolls that wait now, at least one and at most `at_most`, the oldest first, as soon as there is one within this
-    /// time. They need not fill a batch, and are in the first slots of the batch that is returned. The trainer should return
-    /// it before it asks for more: memory for one such batch is certain. Blocks the calling thread.
+    /// The unrolls that wait now, at least one and at most `at_most`, the oldest first, as soon as there is one within
+    /// this time. They need not fill a batch, and are in the first slots of the batch that is returned. The trainer
+    /// should return it before it asks for more: memory for one such batch is certain. Blocks the calling thread.
     ///
     /// Lockstep ([`BatchOrder::Environment`]) takes full batches and must not use this.
     pub fn next_available_within(&self, timeout: Duration, at_most: usize) -> Next {
@@ -305,8 +305,8 @@ impl Batcher {
         removed.into_iter().for_each(|task| state.ledger.end(Some(task), Some(reason)));
     }
 
-    /// Gives the slots of `removed` unrolls to other inserts. Reservations of waiting inserts stay. The remaining unrolls of
-    /// the open batch fill the next one, so those of the next batch are always older.
+    /// Gives the slots of `removed` unrolls to other inserts. Reservations of waiting inserts stay. The remaining
+    /// unrolls of the open batch fill the next one, so those of the next batch are always older.
     fn reuse_slots(&self, state: &mut State, removed: usize) {
         if let (Some(next), Some(open)) = (&mut state.next, &mut state.open) {
             next.move_from(open, usize::MAX);

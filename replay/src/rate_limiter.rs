@@ -6,8 +6,8 @@ use thiserror::Error;
 
 use crate::table::Counts;
 
-/// The unit of all quantities: multiples of 2⁻³². They are integers, so nothing is rounded while a run goes on, and the proof
-/// below holds as it stands.
+/// The unit of all quantities: multiples of 2⁻³². They are integers, so nothing is rounded while a run goes on, and the
+/// proof below holds as it stands.
 const UNIT: f64 = (1_u64 << 32) as f64;
 /// Samples per insert that units can express with an error below one part in a million.
 const RATIOS: RangeInclusive<f64> = 0.001..=1e6;
@@ -16,18 +16,21 @@ const UNLIMITED: f64 = 1e30;
 
 /// A rate limiter keeps the ratio of sampled to inserted items of a table. It is Reverb's `SampleToInsertRatio`.
 ///
-/// Inserting is free until `min_size` items were inserted; sampling begins then. From there on the *error* of the ratio,
+/// Inserting is free until `min_size` items were inserted; sampling begins then. From there on the *error* of the
+/// ratio,
 ///
 /// > (inserted − min_size) · samples_per_insert − sampled,
 ///
-/// stays in [−error_buffer, error_buffer]: an insert that would raise it above is not allowed, nor is a sample that would
-/// lower it below. Items are counted, not calls. The limiter decides and counts; it holds no items, threads or clocks.
+/// stays in [−error_buffer, error_buffer]: an insert that would raise it above is not allowed, nor is a sample that
+/// would lower it below. Items are counted, not calls. The limiter decides and counts; it holds no items, threads or
+/// clocks.
 ///
 /// # One side can always move
 /// Suppose that neither an insert nor a sample of n items is allowed. Then inserted ≥ min_size, the error is above
-/// error_buffer − samples_per_insert, and it is below n − error_buffer. So 2 · error_buffer < samples_per_insert + n. This is
-/// impossible, since error_buffer is at least samples_per_insert and at least n. The counts do not matter, so it holds for
-/// any counts from a checkpoint too. As min_size is at least n, the table also holds the n different items of a sample.
+/// error_buffer − samples_per_insert, and it is below n − error_buffer. So 2 · error_buffer < samples_per_insert + n.
+/// This is impossible, since error_buffer is at least samples_per_insert and at least n. The counts do not matter, so
+/// it holds for any counts from a checkpoint too. As min_size is at least n, the table also holds the n different items
+/// of a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RateLimiter {
     /// In units.
@@ -58,8 +61,8 @@ pub enum RateError {
     },
     /// Neither side could move.
     #[error(
-        "an error buffer of {error_buffer} items could stop both inserts and samples: increase it to at least {least}, the \
-         larger one of samples per insert and the items of a sample"
+        "an error buffer of {error_buffer} items could stop both inserts and samples: increase it to at least {least}, \
+         the larger one of samples per insert and the items of a sample"
     )]
     ErrorBuffer {
         /// The greatest error of the ratio, items.
@@ -70,9 +73,9 @@ pub enum RateError {
 }
 
 impl RateLimiter {
-    /// A limiter for `samples_per_insert` sampled items per inserted item. Sampling begins with `min_size` items, which should
-    /// be at most the table's `max_size`. `error_buffer` is the greatest error of the ratio, in items. At most `sample_size`
-    /// items are sampled at once.
+    /// A limiter for `samples_per_insert` sampled items per inserted item. Sampling begins with `min_size` items, which
+    /// should be at most the table's `max_size`. `error_buffer` is the greatest error of the ratio, in items. At most
+    /// `sample_size` items are sampled at once.
     ///
     /// # Errors
     /// [`RateError`], if it would not limit, or could stop both inserts and samples.

@@ -10,6 +10,10 @@ use thiserror::Error;
 
 use crate::unrolls::Unrolls;
 
+pub use saved::ReadTableError;
+
+mod saved;
+
 /// The sizes of a table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TableConfig {
@@ -55,8 +59,8 @@ pub struct Counts {
     pub sampled: u64,
 }
 
-/// A table in the sense of Reverb. Its items are unrolls. The sampler is uniform, without repeats inside one sample. The
-/// remover is first in, first out: at `max_size` items, each insert evicts the oldest one.
+/// A table in the sense of Reverb. Its items are unrolls. The sampler is uniform, without repeats inside one sample.
+/// The remover is first in, first out: at `max_size` items, each insert evicts the oldest one.
 ///
 /// Its memory is allocated and committed when it is made, and never grows.
 #[derive(Debug)]
@@ -145,8 +149,8 @@ impl Table {
         }
     }
 
-    /// Copies as many items as the sample has into it: each item of the table is equally likely, and none comes twice. It is
-    /// `false`, and the sample unchanged, if the table holds fewer.
+    /// Copies as many items as the sample has into it: each item of the table is equally likely, and none comes twice.
+    /// It is `false`, and the sample unchanged, if the table holds fewer.
     ///
     /// # Panics
     /// If the sample has another layout.

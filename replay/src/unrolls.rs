@@ -12,8 +12,8 @@ const PAGE: usize = 4096;
 
 /// N unrolls of one layout: one contiguous array `[N, rows, width]` for each field.
 ///
-/// Its memory is allocated once. A part of the slots may be in use ([`set_len`](Self::set_len)); then the arrays are those
-/// of the slots in use.
+/// Its memory is allocated once. A part of the slots may be in use ([`set_len`](Self::set_len)); then the arrays are
+/// those of the slots in use.
 #[derive(Clone, Debug)]
 pub struct Unrolls {
     layout: Arc<UnrollLayout>,
@@ -137,8 +137,8 @@ impl Unrolls {
         }
     }
 
-    /// Copies a payload, which must have the size of the layout, to a slot: each field once, from the received pieces to
-    /// its place.
+    /// Copies a payload, which must have the size of the layout, to a slot: each field once, from the received pieces
+    /// to its place.
     pub(crate) fn put(&mut self, slot: usize, payload: &Pieces) {
         for field in Field::ALL {
             let start = self.layout.range(field).start;

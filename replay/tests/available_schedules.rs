@@ -1,5 +1,5 @@
-//! Whatever the order of inserts, cancellations, partial batches and drops: unrolls leave in the order in which they came, all
-//! are accounted for, and no slot is lost.
+//! Whatever the order of inserts, cancellations, partial batches and drops: unrolls leave in the order in which they
+//! came, all are accounted for, and no slot is lost.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 

@@ -24,8 +24,8 @@ impl Sizes {
         (counts.inserted as f64 - self.min_size as f64) * self.samples_per_insert - counts.sampled as f64
     }
 
-    /// Reverb's `RateLimiter::CanInsert` for one item, with `SampleToInsertRatio`'s `max_diff`. No item was deleted before
-    /// the table has its minimum size.
+    /// Reverb's `RateLimiter::CanInsert` for one item, with `SampleToInsertRatio`'s `max_diff`. No item was deleted
+    /// before the table has its minimum size.
     fn reverb_inserts(self, counts: Counts) -> bool {
         let max_diff = self.min_size as f64 * self.samples_per_insert + self.error_buffer;
         let diff = (counts.inserted + 1) as f64 * self.samples_per_insert - counts.sampled as f64;

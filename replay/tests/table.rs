@@ -8,6 +8,7 @@ use std::collections::VecDeque;
 
 use comic_replay::{Counts, Sample, Table, TableConfig, TableError};
 use common::items::{held, insert, items, sample, table, whole_layout};
+use common::memory_of_process;
 use proptest::prelude::*;
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
@@ -79,15 +80,12 @@ fn a_table_that_memory_cannot_hold_is_refused() {
     assert!(Table::new(whole_layout(), nothing).is_err());
 }
 
-/// The system gives memory when it is first written. It must do so at the start and not hours later, when there may be none.
+/// The system gives memory when it is first written. It must do so at the start and not hours later, when there may be
+/// none.
 #[cfg(target_os = "linux")]
 #[test]
 fn memory_is_committed_when_the_table_is_made_and_does_not_grow() {
-    let resident = || {
-        let status = std::fs::read_to_string("/proc/self/status").unwrap();
-        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
-        1024 * line.trim().trim_end_matches(" kB").parse::<u64>().unwrap()
-    };
+    let resident = || memory_of_process("VmRSS:");
     let max_size = (64 << 20) / whole_layout().size();
     let needed = Table::memory(&whole_layout(), max_size);
     let before = resident();

@@ -36,6 +36,8 @@ enum Target {
     Checkpoint,
     /// Motion capture: HDF5, ASF and AMC
     Clips,
+    /// Saved tables of a replay
+    Table,
 }
 
 /// Coverage counters for libFuzzer: what `-fsanitize=fuzzer-no-link` does in clang.

@@ -152,3 +152,11 @@ pub(crate) fn assert_holds(batch: &Batch, expected: &[UnrollHeader]) {
     }
     assert_eq!(batch.clip().len(), 3 * expected.len());
 }
+
+/// The memory of this process, bytes: `VmRSS:`, what is resident, or `VmHWM:`, the most that ever was.
+#[cfg(target_os = "linux")]
+pub(crate) fn memory_of_process(what: &str) -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix(what)).unwrap();
+    1024 * line.trim().trim_end_matches(" kB").parse::<u64>().unwrap()
+}
