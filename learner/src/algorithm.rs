@@ -10,7 +10,7 @@
 //! - [`mod@masked_mean`]: the mean over rows with a transition. `stores` names the parameters of networks.
 //! - [`error`]: what an algorithm refuses.
 //!
-//! - [`experience`]: where the unrolls of gradient steps come from: the newest batch, or a replay.
+//! - [`experience`]: where the unrolls of gradient steps come from: the newest batch, or a [`replay`].
 //! - `descent`: gradients, their norms, and a step of Adam that is taken as a whole or not at all.
 //!
 //! # A third algorithm
@@ -24,6 +24,7 @@ pub mod experience;
 pub mod loss_report;
 pub mod masked_mean;
 pub mod minibatch;
+pub mod replay;
 pub mod shape;
 pub(crate) mod stores;
 

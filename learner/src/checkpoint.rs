@@ -9,6 +9,7 @@
 //! # Layout
 //! - [`Store`] is the directory: writing, finding the newest, repairing. [`Name`] is what a checkpoint is called.
 //! - [`Snapshot`] is a checkpoint in memory; [`read`] and [`find`] read one. `progress` is its part `progress.json`.
+//! - `saved_replay` is the file of an off-policy algorithm's replay.
 //! - `best` compares evaluations. `steps` is what is done to the disk, one step after another; `crash` tests a crash between
 //!   any two of them.
 
@@ -17,6 +18,7 @@ mod best;
 mod crash;
 mod name;
 pub(crate) mod progress;
+pub(crate) mod saved_replay;
 pub(crate) mod snapshot;
 mod steps;
 mod store;

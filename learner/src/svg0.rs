@@ -3,12 +3,10 @@
 //!
 //! # Layout
 //! - [`mod@retrace`]: the targets of the action value.
-//! - `experience`: the replay.
 //! - [`Svg0Learner`]: online and target networks and Adam; one gradient step at a time.
 //!
 //! Everything is float32 and of static shape: masks instead of selections.
 
-mod experience;
 mod learner;
 mod retrace;
 
@@ -18,8 +16,8 @@ use comic_proto::UnrollLayout;
 
 use crate::algorithm::error::Error;
 use crate::algorithm::experience::Experience;
+use crate::algorithm::replay::Replay;
 use crate::algorithm::{self, Algorithm, Parts};
-use crate::svg0::experience::Replay;
 
 pub use learner::Svg0Learner;
 pub use retrace::{Trace, retrace};
@@ -34,6 +32,8 @@ impl algorithm::Builder for Builder {
     }
 
     fn experience(&self, parts: Parts<'_>, layout: &Arc<UnrollLayout>) -> crate::error::Result<Box<dyn Experience>> {
-        Ok(Box::new(Replay::new(parts.experiment, layout, parts.spec.tasks.len(), parts.device)?))
+        let Parts { experiment, spec, device, .. } = parts;
+        let (minibatch, period) = (experiment.svg0.minibatch_sequences, experiment.svg0.publish_period);
+        Ok(Box::new(Replay::new(experiment, layout, spec.tasks.len(), minibatch, period, device)?))
     }
 }

@@ -199,12 +199,16 @@ fn live_evaluated(
     Epoch { ended, published: publisher.newest().unwrap(), prometheus: service.probed().metrics_page() }
 }
 
-/// The last checkpoint after so many updates of a preset. The feeder gives exactly the unrolls that they need, so that the
-/// accounting is the same in every run.
+/// The last checkpoint after so many updates of a preset.
 fn trained(preset: &str, run: &Path, updates: u64) -> Snapshot {
-    let experiment = experiment(preset, updates);
+    trained_on(&experiment(preset, updates), run, updates)
+}
+
+/// The same of an experiment. The feeder gives exactly the unrolls that the updates need, so that the accounting is the same in
+/// every run.
+fn trained_on(experiment: &Experiment, run: &Path, updates: u64) -> Snapshot {
     let unrolls = (updates + 1) * experiment.unroll.batch as u64;
-    assert_eq!(live(&experiment, run, unrolls, |_, _| {}).ended.unwrap(), Ending::Budget);
+    assert_eq!(live(experiment, run, unrolls, |_, _| {}).ended.unwrap(), Ending::Budget);
     last_checkpoint(run)
 }
 
@@ -243,6 +247,59 @@ fn a_resumed_run_ends_bit_for_bit_where_an_unbroken_one_ends() {
         }
         assert_eq!(expected.len(), resumed.len());
     }
+}
+
+/// SVG(0) with a replay of twenty unrolls, which is full after three batches. In lockstep, so that whole batches enter.
+fn off_policy(updates: u64, saves: bool) -> Experiment {
+    let mut overrides: Vec<String> = [
+        "algorithm=svg0",
+        "svg0.encoder=[8]",
+        "svg0.core=6",
+        "svg0.policy=5",
+        "svg0.action_value=[8]",
+        "svg0.burn_in=1",
+        "svg0.minibatch_sequences=4",
+        "svg0.target_period=3",
+        "svg0.publish_period=3",
+        "network.normaliser_steps=100",
+        "replay.max_size=100",
+        "replay.min_size=60",
+        "replay.samples_per_insert=2",
+        "unroll.lockstep=true",
+        "unroll.ahead=0",
+        "budget.minutes=0",
+    ]
+    .map(String::from)
+    .to_vec();
+    overrides.push(format!("replay.save={saves}"));
+    overrides.push(format!("unroll.length={LENGTH}"));
+    overrides.push(format!("unroll.batch={BATCH}"));
+    overrides.push(format!("budget.updates={updates}"));
+    resolve("go-to-target", &overrides).unwrap()
+}
+
+#[test]
+fn a_resumed_run_with_a_saved_replay_ends_bit_for_bit_where_an_unbroken_one_ends() {
+    let _alone = ONE_AT_A_TIME.lock();
+    tch::set_num_threads(1);
+    let [unbroken, broken, forgetful] = [(); 3].map(|()| tempfile::tempdir().unwrap());
+    let expected = trained_on(&off_policy(UPDATES, true), unbroken.path(), UPDATES);
+    let ended = |run: &Path, saves: bool| {
+        trained_on(&off_policy(UPDATES - 2, saves), run, UPDATES - 2);
+        trained_on(&off_policy(UPDATES, saves), run, UPDATES)
+    };
+    let resumed = ended(broken.path(), true);
+    for ((name, expected), (_, resumed)) in comparable(&expected).iter().zip(&comparable(&resumed)) {
+        assert!(expected == resumed, "{name} differs after a resume");
+    }
+    // One copy, that of the last checkpoint.
+    let copies = std::fs::read_dir(broken.path().join("checkpoints")).unwrap();
+    let copies: Vec<_> = copies.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    let copies: Vec<_> = copies.iter().filter(|name| name.starts_with("replay-")).collect();
+    assert_eq!(copies, [&format!("replay-{UPDATES:010}")]);
+    // Without it, learning begins again with an empty replay.
+    let lost = ended(forgetful.path(), false);
+    assert_ne!(lost.part("policy.safetensors").unwrap(), expected.part("policy.safetensors").unwrap());
 }
 
 #[test]

@@ -55,6 +55,8 @@ struct State {
     /// The batch that is filled while `next` is full.
     open: Option<Buffer>,
     free: Vec<Buffer>,
+    /// How long inserts have waited for a slot, all together.
+    waited: Duration,
     closed: bool,
 }
 
@@ -88,7 +90,7 @@ impl Batcher {
         let mut free: Vec<_> =
             (0..=config.ahead + config.spare()).map(|_| Buffer::new(Arc::clone(&layout), config.unrolls)).collect();
         let open = free.pop();
-        let state = Mutex::new(State { ledger, phase, next: None, open, free, closed: false });
+        let state = Mutex::new(State { ledger, phase, next: None, open, free, waited: Duration::ZERO, closed: false });
         let slots = Semaphore::new(config.unrolls);
         let (filled, arrived) = (Condvar::new(), Condvar::new());
         Self { inner: Arc::new(Inner { layout, config, state, slots, filled, arrived }) }
@@ -116,8 +118,10 @@ impl Batcher {
         if let Some(outcome) = self.refuse(&mut self.lock(), header, &payload) {
             return outcome;
         }
+        let began = Instant::now();
         let Ok(slot) = self.inner.slots.acquire().await else { return Outcome::Closed };
         let mut state = self.lock();
+        state.waited += began.elapsed();
         if let Some(outcome) = self.refuse(&mut state, header, &payload) {
             return outcome;
         }
@@ -217,6 +221,11 @@ impl Batcher {
     pub fn accounting_by_task(&self) -> AccountingByTask {
         let state = self.lock();
         state.ledger.accounting(state.waiting())
+    }
+
+    /// How long unrolls have waited for a slot since the beginning, all together.
+    pub fn waited(&self) -> Duration {
+        self.lock().waited
     }
 
     /// The ledger for a checkpoint.

@@ -19,6 +19,8 @@ pub(crate) struct Progress {
     pub(crate) epoch: u64,
     /// Batches trained on.
     pub(crate) updates: u64,
+    /// Gradient steps, those that were skipped included.
+    pub(crate) gradient_steps: u64,
     /// Environment steps trained on.
     pub(crate) environment_steps: u64,
     /// Wall-clock seconds since the first unroll, without the time between two starts of the learner.

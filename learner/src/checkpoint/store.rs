@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use crate::checkpoint::best::{Best, Evaluated, Judgement};
 use crate::checkpoint::name::{Name, entries, numbered};
+use crate::checkpoint::saved_replay::SavedReplay;
 use crate::checkpoint::snapshot::{MANIFEST, Snapshot, checksum, read};
 use crate::checkpoint::steps::{Step, carry_out, hidden, making, put, replace};
 use crate::error::{Error, Result};
@@ -144,6 +145,9 @@ impl Store {
                 tracing::warn!("{}", comic_proto::chain(&left));
             }
             return Err(error);
+        }
+        if let Name::Updates(updates) = name {
+            SavedReplay::within(&self.directory).keep_only(updates)?;
         }
         Ok(path)
     }

@@ -9,8 +9,10 @@ use comic_experiment::{TaskPart, TaskSpec};
 use comic_proto::Field;
 use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
 use comic_replay::{AccountingByTask, Batch};
+use serde::Serialize;
 use serde_json::{Map, Value, json};
 
+use crate::algorithm::replay::ReplayReport;
 use crate::error::{Error, Result};
 use crate::observe::evaluation::Evaluation;
 use crate::observe::evaluation_writer::EvaluationWriter;
@@ -126,8 +128,17 @@ pub struct MetricsFile {
     accounting: AccountingByTask,
 }
 
+/// Seconds since the process started in which one side waited for the other.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Waited {
+    /// The trainer for unrolls.
+    pub learner: f64,
+    /// Unrolls for a place in a batch, each for itself.
+    pub unrolls: f64,
+}
+
 /// How far the run is, for the beginning of a line.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Position {
     /// Wall-clock seconds since the first unroll, those of earlier learner epochs included.
     pub seconds: f64,
@@ -135,10 +146,14 @@ pub struct Position {
     pub environment_steps: u64,
     /// Batches trained on, over the whole run.
     pub updates: u64,
+    /// Gradient steps, over the whole run.
+    pub gradient_steps: u64,
     /// Newest published version.
     pub version: u64,
     /// The learner epoch.
     pub epoch: u64,
+    /// How long each side has waited.
+    pub waited: Waited,
 }
 
 impl MetricsFile {
@@ -243,8 +258,17 @@ impl MetricsFile {
 
     /// Writes the line, starts a new window, and returns the line for the status. If the disk refuses, the error is logged,
     /// and training continues.
-    pub fn write(&mut self, position: Position, accounting: AccountingByTask, losses: Map<String, Value>) -> String {
-        let line = self.line(position, &accounting, losses);
+    pub fn write(
+        &mut self,
+        position: Position,
+        accounting: AccountingByTask,
+        losses: Map<String, Value>,
+        replay: Option<ReplayReport>,
+    ) -> String {
+        let mut line = self.line(position, &accounting, losses);
+        if let Some(replay) = replay {
+            line["replay"] = json!(replay);
+        }
         self.window = Window::default();
         self.since = Instant::now();
         self.accounting = accounting;
@@ -270,6 +294,7 @@ impl MetricsFile {
             "learner_epoch": position.epoch,
             "environment_steps": position.environment_steps,
             "updates": position.updates,
+            "gradient_steps": position.gradient_steps,
             "version": position.version,
             "updates_skipped": window.updates_skipped,
             "steps_per_second": environment_steps as f64 / seconds,
@@ -278,6 +303,7 @@ impl MetricsFile {
             "reward_terms": terms,
             "losses": losses,
             "accounting": accounting.all,
+            "waited": position.waited,
         });
         for (name, value) in window.episodes.entries() {
             line[name] = value;
@@ -332,9 +358,9 @@ mod tests {
         std::os::unix::fs::symlink("/dev/full", directory.path().join("evaluations.jsonl")).unwrap();
         let spec = TaskSpec::new(&Experiment::default(), vec!["walk".into()]).unwrap();
         let mut metrics = MetricsFile::open(directory.path(), &spec).unwrap();
-        let position = Position { seconds: 1.0, environment_steps: 2, updates: 3, version: 4, epoch: 5 };
+        let position = Position { updates: 3, ..Position::default() };
         for _ in 0..2 {
-            let line = metrics.write(position, AccountingByTask::default(), Map::new());
+            let line = metrics.write(position, AccountingByTask::default(), Map::new(), None);
             assert!(line.contains("\"updates\":3"), "{line}");
         }
         metrics.keep_evaluation(&Evaluation { epoch: 5, updates: 3, json: "{}".into(), ..Evaluation::default() });

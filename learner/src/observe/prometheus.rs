@@ -14,9 +14,10 @@ use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 
+use crate::algorithm::replay::ReplayReport;
 use crate::error::{Error, Result};
 use crate::observe::catalogue::{Catalogue, Description, Labelled, TASKS};
-use crate::observe::metrics_file::Rows;
+use crate::observe::metrics_file::{Rows, Waited};
 
 /// How many versions old the unrolls of the newest update were.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -34,6 +35,9 @@ pub struct Prometheus {
     pub(crate) updates: Counter,
     pub(crate) updates_skipped: Counter,
     pub(crate) restores: Counter,
+    pub(crate) gradient_steps: Counter,
+    waited: Labelled<Gauge>,
+    replay: ReplayGauges,
     compilations: Counter,
     pub(crate) update_seconds: Histogram,
     pub(crate) unroll_age: Histogram,
@@ -73,6 +77,16 @@ struct Sampled {
     silence: Gauge,
     memory: Gauge,
     tasks: SampledTasks,
+}
+
+/// The state of a replay.
+#[derive(Debug)]
+struct ReplayGauges {
+    size: Gauge,
+    inserted: Gauge,
+    sampled: Gauge,
+    evicted: Gauge,
+    age: Gauge,
 }
 
 /// The accounting of each task.
@@ -139,7 +153,7 @@ impl Default for Prometheus {
         let mut catalogue = Catalogue::default();
         let all = &mut catalogue;
         Self {
-            updates: all.counter("comic_updates", "Batches that V-MPO trained on"),
+            updates: all.counter("comic_updates", "Batches that were trained on, or inserted into a replay"),
             updates_skipped: all.counter(
                 "comic_updates_skipped",
                 "Gradient steps that changed nothing, because a loss or gradient was not finite",
@@ -148,6 +162,20 @@ impl Default for Prometheus {
                 "comic_restores",
                 "Returns to the last good state, after learner.restore_after skipped gradient steps in a row",
             ),
+            gradient_steps: all.counter("comic_gradient_steps", "Gradient steps, those that were skipped included"),
+            waited: all.labelled(
+                "gauge",
+                ("comic_waited_seconds", "side"),
+                &["learner", "unrolls"],
+                "Seconds since the start in which the trainer waited for unrolls, and unrolls for a place in a batch, each for itself",
+            ),
+            replay: ReplayGauges {
+                size: all.gauge("comic_replay_size", "Unrolls in the replay's table; 0 without a replay, as the next four"),
+                inserted: all.gauge("comic_replay_inserted", "Unrolls inserted into the table"),
+                sampled: all.gauge("comic_replay_sampled", "Unrolls sampled from the table; one counts each time"),
+                evicted: all.gauge("comic_replay_evicted", "Unrolls that left the table because it was full, the oldest first"),
+                age: all.gauge("comic_replay_sample_age", "Mean number of unrolls inserted after one that is sampled"),
+            },
             compilations: all.counter(
                 "comic_compilations",
                 "Programs that XLA compiled. It stops growing when every shape was seen, and is 0 on other devices",
@@ -241,6 +269,26 @@ impl Prometheus {
             self.task_rows.of(task).inc_by(counted.rows);
             self.task_padding.of(task).inc_by(counted.padding);
         }
+    }
+
+    /// Shows the state of the replay.
+    pub(crate) fn set_replay(&self, report: &ReplayReport) {
+        let ReplayGauges { size, inserted, sampled, evicted, age } = &self.replay;
+        for (gauge, value) in [
+            (size, report.size),
+            (inserted, report.inserted),
+            (sampled, report.sampled),
+            (evicted, report.evicted),
+            (age, report.sample_age.unwrap_or_default() as u64),
+        ] {
+            gauge.set(value as i64);
+        }
+    }
+
+    /// Shows how long each side has waited.
+    pub(crate) fn set_waited(&self, waited: Waited) {
+        self.waited.of("learner").set(waited.learner as i64);
+        self.waited.of("unrolls").set(waited.unrolls as i64);
     }
 
     /// Sets the number of compiled programs.

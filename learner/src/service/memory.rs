@@ -40,6 +40,8 @@ pub struct Sizes {
     pub batch: usize,
     /// Bytes of an unroll.
     pub unroll: usize,
+    /// Bytes of an off-policy algorithm's replay.
+    pub replay: u64,
     /// The limits on what peers send.
     pub ingest: IngestLimits,
     /// Bytes of the parameters that actors get.
@@ -51,8 +53,10 @@ pub struct Sizes {
 /// The most that each buffer holds, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Bounds {
-    /// Batches: those assembled ahead, and the trainer's.
+    /// Batches: those assembled ahead, the trainer's, and the one that off-policy learning takes from.
     pub batches: u64,
+    /// The replay of an off-policy algorithm, with the sample that is learned from; allocated and committed at the start.
+    pub replay: u64,
     /// Bytes that were sent and not read yet: a window for each connection.
     pub windows: u64,
     /// Messages that were read, in part or as a whole, and are not in a batch yet, with the memory that a peer can make their
@@ -74,10 +78,11 @@ impl Bounds {
     /// The bounds that follow from these sizes.
     pub fn new(sizes: &Sizes) -> Self {
         let product = |factors: &[usize]| factors.iter().fold(1u64, |all, factor| all.saturating_mul(*factor as u64));
-        let Sizes { ahead, batch, unroll, ingest, parameters, snapshot } = *sizes;
+        let Sizes { ahead, batch, unroll, replay, ingest, parameters, snapshot } = *sizes;
         let IngestLimits { connections, window, room, requests, message, quarantined } = ingest;
         Self {
-            batches: product(&[ahead + 1, batch, unroll]),
+            batches: product(&[ahead + 2, batch, unroll]),
+            replay,
             windows: product(&[connections, window]),
             messages: product(&[room, BUFFER_RATIO]),
             frames: product(&[requests, 2 * FRAME_SIZE as usize]),
@@ -88,10 +93,11 @@ impl Bounds {
         }
     }
 
-    fn parts(&self) -> [(&'static str, u64); 8] {
-        let Self { batches, windows, messages, frames, parameters, answers, quarantine, snapshots } = *self;
+    fn parts(&self) -> [(&'static str, u64); 9] {
+        let Self { batches, replay, windows, messages, frames, parameters, answers, quarantine, snapshots } = *self;
         [
             ("batches", batches),
+            ("replay", replay),
             ("connection windows", windows),
             ("messages", messages),
             ("frames", frames),
@@ -128,6 +134,7 @@ mod tests {
         ahead: 1,
         batch: 128,
         unroll: 200_000,
+        replay: 5 << 20,
         ingest: IngestLimits {
             connections: 100,
             window: 1 << 19,
@@ -144,7 +151,8 @@ mod tests {
     fn each_bound_follows_from_its_sizes_and_the_sum_adds_them() {
         let bounds = Bounds::new(&SIZES);
         let expected = Bounds {
-            batches: 2 * 128 * 200_000,
+            batches: 3 * 128 * 200_000,
+            replay: 5 << 20,
             windows: 50 * 1024 * 1024,
             messages: 4 * 64 * 1024 * 1024,
             frames: 300 * 512 * 1024,
@@ -154,10 +162,10 @@ mod tests {
             snapshots: 3 * 40_000_000,
         };
         assert_eq!(bounds, expected);
-        assert_eq!(bounds.sum(), 51_200_000 + 465 * 1_048_576 + 35_000_000 + 201_523_200 + 120_000_000);
+        assert_eq!(bounds.sum(), 76_800_000 + 470 * 1_048_576 + 35_000_000 + 201_523_200 + 120_000_000);
         assert_eq!(
             bounds.to_string(),
-            "at most 854 MiB: batches 49, connection windows 50, messages 256, frames 150, parameters 34, answers 193, quarantine 9, checkpoints 115"
+            "at most 884 MiB: batches 74, replay 5, connection windows 50, messages 256, frames 150, parameters 34, answers 193, quarantine 9, checkpoints 115"
         );
     }
 

@@ -10,10 +10,11 @@ use comic_replay::{AccountingByTask, Batch};
 use serde_json::{Map, Value, json};
 
 use crate::algorithm::loss_report::{LossValues, Losses};
+use crate::algorithm::replay::ReplayReport;
 use crate::checkpoint::Evaluated;
 use crate::checkpoint::progress::Progress;
 use crate::error::Result;
-use crate::observe::metrics_file::{MetricsFile, Position};
+use crate::observe::metrics_file::{MetricsFile, Position, Waited};
 use crate::observe::prometheus::Prometheus;
 use crate::service::TrainerHandle;
 
@@ -31,6 +32,9 @@ pub(super) struct Reports {
     losses: Map<String, Value>,
     /// The last update's losses, if reading them at once would mean to wait for the device.
     deferred: Option<Losses>,
+    /// The newest state of the replay, if there is one.
+    replay: Option<ReplayReport>,
+    waited: Waited,
 }
 
 impl Reports {
@@ -47,6 +51,8 @@ impl Reports {
             tasks: spec.tasks.iter().map(|task| task.name.clone()).collect(),
             losses: Map::new(),
             deferred: None,
+            replay: None,
+            waited: Waited::default(),
         })
     }
 
@@ -71,9 +77,10 @@ impl Reports {
         environment_steps
     }
 
-    /// Counts an update on a batch whose parameters were `version`; the duration is counted by
+    /// Counts an update of so many gradient steps on a batch whose parameters were `version`; the duration is counted by
     /// [`count_duration`](Self::count_duration).
-    pub(super) fn count_update(&mut self, batch: &Batch, version: u64) {
+    pub(super) fn count_update(&mut self, batch: &Batch, version: u64, steps: u64) {
+        self.prometheus.gradient_steps.inc_by(steps);
         self.metrics.count_update();
         self.metrics.count_episodes(batch.headers(), version);
     }
@@ -86,6 +93,18 @@ impl Reports {
     /// Counts the programs that the device has compiled so far.
     pub(super) fn count_compilations(&self, compilations: u64) {
         self.prometheus.count_compilations(compilations);
+    }
+
+    /// Shows the state of the replay.
+    pub(super) fn set_replay(&mut self, replay: ReplayReport) {
+        self.prometheus.set_replay(&replay);
+        self.replay = Some(replay);
+    }
+
+    /// Shows how long trainer and unrolls have waited since the process started.
+    pub(super) fn set_waited(&mut self, waited: Waited) {
+        self.prometheus.set_waited(waited);
+        self.waited = waited;
     }
 
     /// Counts gradient steps that were skipped.
@@ -154,10 +173,12 @@ impl Reports {
             seconds: progress.seconds,
             environment_steps: progress.environment_steps,
             updates: progress.updates,
+            gradient_steps: progress.gradient_steps,
             version: progress.version,
             epoch: progress.epoch,
+            waited: self.waited,
         };
-        let line = self.metrics.write(position, accounting, self.losses.clone());
+        let line = self.metrics.write(position, accounting, self.losses.clone(), self.replay);
         tracing::info!(target: "metrics", "{line}");
         self.service.set_metrics(line);
     }

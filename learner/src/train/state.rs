@@ -40,6 +40,7 @@ impl State {
             run: Some(run),
             epoch,
             updates: 0,
+            gradient_steps: 0,
             environment_steps: 0,
             seconds: 0.0,
             version: 0,

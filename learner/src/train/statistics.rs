@@ -267,10 +267,10 @@ mod tests {
         let mut metrics = MetricsFile::open(run.path(), &spec).unwrap();
         let rows = |environment_steps, padding| Rows { rows: 3, environment_steps, padding };
         assert_eq!(metrics.count_rows(&batch(&spec)), [rows(3, 0), rows(1, 1)]);
-        let position = Position { seconds: 1.0, environment_steps: 4, updates: 1, version: 1, epoch: 1 };
+        let position = Position { environment_steps: 4, updates: 1, ..Position::default() };
         let mut accounting = comic_replay::AccountingByTask::default();
         accounting.tasks.insert("get-up".into(), comic_replay::TaskAccounting { trained: 7, ..Default::default() });
-        let line = metrics.write(position, accounting, serde_json::Map::new());
+        let line = metrics.write(position, accounting, serde_json::Map::new(), None);
         let line: serde_json::Value = serde_json::from_str(&line).unwrap();
         assert_eq!(line["tasks"]["get-up"]["accounting"]["trained"], 7);
         assert_eq!(line["tasks"]["tracking"]["environment_steps"], 3);

@@ -8,10 +8,13 @@ use comic_replay::{Batch, Batcher, Next, Reason};
 use crate::algorithm::Parts;
 use crate::algorithm::experience::Experience;
 use crate::algorithm::loss_report::{LossValues, Losses};
+use crate::algorithm::replay::Replay;
 use crate::algorithms;
+use crate::checkpoint::saved_replay::SavedReplay;
 use crate::checkpoint::{Name, Snapshot, incompatible};
 use crate::device::Backend;
 use crate::error::{Error, Result};
+use crate::observe::metrics_file::Waited;
 use crate::service::TrainerHandle;
 use crate::service::memory::{Bounds, Sizes};
 use crate::train::budget::BudgetClock;
@@ -34,6 +37,10 @@ pub struct Trainer {
     batcher: Batcher,
     state: State,
     experience: Box<dyn Experience>,
+    /// Where the replay is saved, if the experiment wants that.
+    saved_replay: Option<SavedReplay>,
+    /// How long the trainer has waited for unrolls.
+    waited: Duration,
     skipped_steps: SkippedSteps,
     budget: BudgetClock,
     versions: Versions,
@@ -58,9 +65,16 @@ impl Trainer {
         }
         let mut reports = Reports::open(&run, &spec, &experiment.learner, service.clone())?;
         reports.begin(&state.progress, batcher.accounting_by_task());
-        let experience = algorithms::experience(parts, batcher.layout())?;
+        let mut experience = algorithms::experience(parts, batcher.layout())?;
+        let saved_replay = experiment.replay.save.then(|| SavedReplay::of(&run));
+        if let Some(replay) = experience.replay() {
+            let resumed = resume.as_ref().map(|_| state.progress.updates);
+            begin_replay(replay, saved_replay.as_ref(), resumed).map_err(|error| incompatible(&run, error))?;
+        }
         let mut trainer = Self {
             experience,
+            saved_replay,
+            waited: Duration::ZERO,
             skipped_steps: SkippedSteps::new(experiment.learner.restore_after),
             budget: BudgetClock::new(experiment.budget.clone(), state.progress.seconds),
             versions: Versions::new(batcher.clone(), publisher, experiment.unroll.lockstep),
@@ -96,6 +110,7 @@ impl Trainer {
         };
         self.take_evaluations()?;
         self.state.progress.seconds = self.budget.seconds();
+        self.show_replay();
         self.reports.write(&self.state.progress, self.batcher.accounting_by_task());
         self.write_last_checkpoint()?;
         self.checkpoints.finish()?;
@@ -129,7 +144,8 @@ impl Trainer {
         let restored = self.report_when_ready(losses, publishes || self.checkpoints.is_due())?;
         let version = self.state.progress.version;
         self.state.progress.updates += 1;
-        self.reports.count_update(&batch, version);
+        self.state.progress.gradient_steps += steps;
+        self.reports.count_update(&batch, version, steps);
         let ages = batch.headers().iter().map(|header| version.saturating_sub(header.version)).collect();
         // Before the batch's memory is free: actors that wait for it then continue with these parameters.
         if restored || publishes {
@@ -185,7 +201,9 @@ impl Trainer {
 
     fn next_batch(&mut self) -> Result<Next> {
         self.service.beat();
-        let next = self.batcher.next_batch_within(PATIENCE);
+        let began = Instant::now();
+        let next = self.experience.next(&self.batcher, PATIENCE);
+        self.waited += began.elapsed();
         self.write_metrics_when_due()?;
         if matches!(next, Next::Batch(_)) {
             self.budget.start();
@@ -289,8 +307,18 @@ impl Trainer {
             self.take_evaluations()?;
         }
         self.state.progress.seconds = self.budget.seconds();
+        self.show_replay();
         self.reports.write_news(&self.state.progress, self.batcher.accounting_by_task());
         Ok(())
+    }
+
+    /// Tells the reports of the replay, and how long each side has waited.
+    fn show_replay(&mut self) {
+        if let Some(replay) = self.experience.replay() {
+            self.reports.set_replay(replay.report());
+        }
+        let [learner, unrolls] = [self.waited, self.batcher.waited()].map(|waited| waited.as_secs_f64());
+        self.reports.set_waited(Waited { learner, unrolls });
     }
 
     fn take_evaluations(&mut self) -> Result<()> {
@@ -316,8 +344,20 @@ impl Trainer {
     }
 
     fn write_checkpoint(&mut self, name: Name) -> Result<()> {
+        self.save_replay(name);
         let snapshot = self.snapshot()?;
         self.checkpoints.write(name, snapshot)
+    }
+
+    /// Saves the replay for a checkpoint, if the experiment wants that. Training waits meanwhile. If the disk refuses, the
+    /// checkpoint has none.
+    fn save_replay(&mut self, name: Name) {
+        if let (Name::Updates(updates), Some(saved), Some(replay)) =
+            (name, &self.saved_replay, self.experience.replay())
+            && let Err(error) = saved.write(updates, |writer| replay.write_to(writer))
+        {
+            tracing::error!(checkpoint = %name, "the replay is not saved: {}", comic_proto::chain(&error));
+        }
     }
 
     fn snapshot(&mut self) -> Result<Snapshot> {
@@ -326,8 +366,9 @@ impl Trainer {
     }
 
     /// How much memory the learner's buffers can take, now that every size is known.
-    fn memory(&self) -> Bounds {
+    fn memory(&mut self) -> Bounds {
         Bounds::new(&Sizes {
+            replay: self.experience.replay().map_or(0, |replay| replay.memory()),
             ahead: self.experiment.unroll.ahead,
             batch: self.experiment.unroll.batch,
             unroll: self.batcher.layout().size(),
@@ -335,5 +376,24 @@ impl Trainer {
             parameters: self.state.target.len(),
             snapshot: self.checkpoints.good().parts.values().map(Vec::len).sum(),
         })
+    }
+}
+
+/// Begins with the replay that was saved with the checkpoint after `resumed` updates, or with an empty one.
+fn begin_replay(replay: &mut Replay, saved: Option<&SavedReplay>, resumed: Option<u64>) -> Result<()> {
+    let found = match (saved, resumed) {
+        (Some(saved), Some(updates)) => saved.open(updates)?,
+        _ => None,
+    };
+    if let Some((path, mut file)) = found {
+        let remedy = "remove it to begin with an empty replay";
+        replay.read_from(&mut file).map_err(Error::within(format!("{}: {remedy}", path.display())))?;
+    } else if resumed.is_some() {
+        tracing::warn!("the replay begins empty: no replay was saved with this checkpoint (replay.save)");
+    }
+    match saved {
+        // While one is replaced, there are two.
+        Some(saved) => saved.check_room(2 * replay.memory()),
+        None => Ok(()),
     }
 }

@@ -1,7 +1,9 @@
 //! The newest batch, on which V-MPO learns.
 
+use std::time::Duration;
+
 use comic_experiment::Experiment;
-use comic_replay::Batch;
+use comic_replay::{Batch, Batcher, Next};
 use rand::Rng;
 use rand::seq::SliceRandom as _;
 use rand_pcg::Pcg64;
@@ -22,6 +24,10 @@ pub(super) struct Newest {
 }
 
 impl Experience for Newest {
+    fn next(&mut self, batcher: &Batcher, patience: Duration) -> Next {
+        batcher.next_batch_within(patience)
+    }
+
     fn take(&mut self, batch: &Batch, random: &mut Pcg64) -> Result<usize> {
         let tensors = tracing::debug_span!("to_device").in_scope(|| to_device(batch, self.tasks, self.device))?;
         let steps = draw(&self.experiment, random);
