@@ -7,7 +7,7 @@ use clap::{CommandFactory as _, Parser as _};
 use comic_learner::commands;
 use comic_learner::error::{Error, Result};
 use comic_learner::options::{Command, LogFormat, Options};
-use comic_learner::train::setup::Ending;
+use comic_learner::train::parts::Ending;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
 

@@ -24,7 +24,7 @@ use crate::security::Security;
 use crate::service::process::{allow_descriptors, runtime};
 use crate::service::{Service, serve};
 use crate::threads;
-use crate::train::setup::{Ending, Setup};
+use crate::train::parts::{Ending, TrainerParts};
 use crate::train::trainer::Trainer;
 
 /// File descriptors besides those of connections to actors.
@@ -69,10 +69,10 @@ async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<En
     let _lock = Store::open(&options.run, experiment.learner.checkpoints_kept)?.lock()?;
     // After the lock, so that only the learner that has the run takes the device. It may block: nothing else runs yet.
     let backend = Backend::open(&experiment.learner)?;
-    let (setup, service) = prepare::prepare(options, experiment, backend, security)?;
-    let (batcher, publisher, epoch) = (setup.batcher.clone(), setup.publisher.clone(), setup.epoch);
+    let (parts, service) = prepare::prepare(options, experiment, backend, security)?;
+    let (batcher, publisher, epoch) = (parts.batcher.clone(), parts.publisher.clone(), parts.epoch);
     let trained_before = batcher.accounting().trained;
-    let mut training = start_trainer(setup)?;
+    let mut training = start_trainer(parts)?;
     listeners.announce(options, epoch)?;
     let (stop_serving, stopped) = oneshot::channel::<()>();
     let serving = tokio::spawn(serve(listeners.actors, service.clone(), async {
@@ -224,12 +224,12 @@ fn local_address(listener: &TcpListener) -> Result<SocketAddr> {
 /// The end of the trainer's thread.
 type Training = oneshot::Receiver<Result<Ending>>;
 
-fn start_trainer(setup: Setup) -> Result<Training> {
+fn start_trainer(parts: TrainerParts) -> Result<Training> {
     let (ended, training) = oneshot::channel();
     std::thread::Builder::new()
         .name("trainer".into())
         .spawn(move || {
-            let ending = catch_unwind(AssertUnwindSafe(|| Trainer::new(setup)?.run()));
+            let ending = catch_unwind(AssertUnwindSafe(|| Trainer::new(parts)?.run()));
             let _ = ended.send(ending.unwrap_or(Err(Error::Panicked("the trainer"))));
         })
         .map_err(Error::system("cannot start the trainer's thread"))?;

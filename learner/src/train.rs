@@ -1,8 +1,8 @@
 //! Training: one OS thread that owns the device. Batches in, gradient steps, parameters out.
 //!
 //! # Layout
-//! - [`trainer`] is the loop; the other modules own its parts and know nothing of it.
-//! - [`setup`] is what it begins with, and how it ends.
+//! - [`trainer`] is the loop; the other modules do one job each and know nothing of it.
+//! - [`parts`] is what a trainer is made of, and how training ends.
 //! - `state` is what changes and is saved: the algorithm, [`statistics`] of the observations, and the progress.
 //! - `versions` publishes parameters; `reports` counts and writes metrics; `budget` is the clock.
 //! - `skipped_steps` counts gradient steps that were skipped, and decides how to recover.
@@ -10,8 +10,8 @@
 
 mod budget;
 mod checkpoints;
+pub mod parts;
 mod reports;
-pub mod setup;
 mod skipped_steps;
 mod state;
 pub mod statistics;

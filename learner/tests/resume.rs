@@ -16,7 +16,7 @@ use comic_learner::publish::{Published, Publisher};
 use comic_learner::security::{ConnectionLimits, Security};
 use comic_learner::service::quarantine::QuarantineArguments;
 use comic_learner::service::{self, Service};
-use comic_learner::train::setup::{Ending, Setup};
+use comic_learner::train::parts::{Ending, TrainerParts};
 use comic_learner::train::trainer::Trainer;
 use comic_proto::v1::UnrollHeader;
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
@@ -180,7 +180,7 @@ fn live_evaluated(
             }
         }
     });
-    let setup = Setup {
+    let parts = TrainerParts {
         experiment,
         spec,
         pose,
@@ -193,7 +193,7 @@ fn live_evaluated(
         publisher: publisher.clone(),
         service: service.trainer(),
     };
-    let ended = Trainer::new(setup).unwrap().run();
+    let ended = Trainer::new(parts).unwrap().run();
     batcher.close();
     feeder.join().unwrap();
     Epoch { ended, published: publisher.newest().unwrap(), prometheus: service.probed().metrics_page() }

@@ -16,15 +16,15 @@ use crate::options::Options;
 use crate::publish::Publisher;
 use crate::security::Security;
 use crate::service::{self, Service};
-use crate::train::setup::Setup;
+use crate::train::parts::TrainerParts;
 
-/// The trainer's setup and the service. Begins the learner epoch.
+/// The trainer's parts and the service. Begins the learner epoch.
 pub(super) fn prepare(
     options: &Options,
     mut experiment: Experiment,
     backend: Backend,
     security: Security,
-) -> Result<(Setup, Service)> {
+) -> Result<(TrainerParts, Service)> {
     let store = Store::open(&options.run, experiment.learner.checkpoints_kept)?;
     let newest = store.newest()?;
     if let Some((_, snapshot)) = &newest {
@@ -76,9 +76,20 @@ pub(super) fn prepare(
     let run = options.run.clone();
     let handle = service.trainer();
     let low_level = low_level.map(|low_level| low_level.bytes);
-    let setup =
-        Setup { experiment, spec, pose, low_level, backend, run, epoch, resume, batcher, publisher, service: handle };
-    Ok((setup, service))
+    let parts = TrainerParts {
+        experiment,
+        spec,
+        pose,
+        low_level,
+        backend,
+        run,
+        epoch,
+        resume,
+        batcher,
+        publisher,
+        service: handle,
+    };
+    Ok((parts, service))
 }
 
 /// The newest checkpoint, if there is one and the run may resume from it.

@@ -65,12 +65,12 @@ impl Quarantine {
         fs::create_dir_all(&directory).map_err(Error::file("make", &directory))?;
         let taken = taken(&directory).map_err(Error::file("list", &directory))?;
         let (queue, refused) = sync_channel(QUEUE);
-        let mut store = Store { room: options.quarantine_bytes.saturating_sub(taken), directory };
+        let mut place = Directory { room: options.quarantine_bytes.saturating_sub(taken), directory };
         let thread = std::thread::Builder::new()
             .name("quarantine".into())
             .spawn({
                 let prometheus = prometheus.clone();
-                move || store.keep_all(&refused, &prometheus)
+                move || place.keep_all(&refused, &prometheus)
             })
             .map_err(Error::system("cannot start the quarantine's thread"))?;
         Ok(Some(Self { queue: Some(queue), thread: Some(thread), prometheus: prometheus.clone() }))
@@ -100,12 +100,12 @@ impl Drop for Quarantine {
 
 /// The directory, and the bytes that it may still take.
 #[derive(Debug)]
-struct Store {
+struct Directory {
     directory: PathBuf,
     room: u64,
 }
 
-impl Store {
+impl Directory {
     /// Writes the unrolls of the queue until it is closed.
     fn keep_all(&mut self, queue: &Receiver<Refused>, prometheus: &Prometheus) {
         let log_limiter = LogLimiter::default();

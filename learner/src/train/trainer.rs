@@ -19,8 +19,8 @@ use crate::service::TrainerHandle;
 use crate::service::memory::{Bounds, Sizes};
 use crate::train::budget::BudgetClock;
 use crate::train::checkpoints::Checkpoints;
+use crate::train::parts::{Ending, TrainerParts};
 use crate::train::reports::Reports;
-use crate::train::setup::{Ending, Setup};
 use crate::train::skipped_steps::{Recovery, SkippedSteps, remedies};
 use crate::train::state::State;
 use crate::train::versions::Versions;
@@ -54,9 +54,20 @@ impl Trainer {
     ///
     /// # Errors
     /// A checkpoint that does not fit the experiment; a disk that refuses.
-    pub fn new(setup: Setup) -> Result<Self> {
-        let Setup { experiment, spec, pose, low_level, backend, run, epoch, resume, batcher, publisher, service } =
-            setup;
+    pub fn new(parts: TrainerParts) -> Result<Self> {
+        let TrainerParts {
+            experiment,
+            spec,
+            pose,
+            low_level,
+            backend,
+            run,
+            epoch,
+            resume,
+            batcher,
+            publisher,
+            service,
+        } = parts;
         backend.train_here()?;
         let parts = Parts { experiment: &experiment, spec: &spec, pose: &pose, device: backend.device() };
         let mut state = State::new(parts, low_level, service.id(), epoch)?;

@@ -1,4 +1,4 @@
-//! What training begins with, and how it ends.
+//! What a trainer is made of, and how training ends.
 
 use std::path::PathBuf;
 
@@ -11,9 +11,9 @@ use crate::device::Backend;
 use crate::publish::Publisher;
 use crate::service::TrainerHandle;
 
-/// The parts of a trainer.
+/// What a trainer is made of.
 #[derive(Debug)]
-pub struct Setup {
+pub struct TrainerParts {
     /// The resolved experiment.
     pub experiment: Experiment,
     /// The task's sizes and names.
