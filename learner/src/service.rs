@@ -4,7 +4,7 @@
 //! - `assembly` makes the parts of a [`Service`] from its [`Setup`], and a [`TrainerHandle`] of those that the trainer needs.
 //!   [`serve()`] runs the server until its end, `shutdown` is the state of that end, [`http2`] the protocol's settings, and
 //!   [`process`] the threads and file descriptors.
-//! - Every connection passes `connections`, and every call `admission`: they alone check TLS, tokens and limits.
+//! - Every connection passes `connections`, and every call `authorisation`: they alone check TLS, tokens and limits.
 //! - `calls` is the service that tonic decodes. `join` accepts actors, `assets` sends files, `offer` is the checkpoint that
 //!   evaluators fetch, `evaluations` keeps reports for the trainer, and `status` shows the learner's state.
 //! - `framing` is the two calls that carry bytes past tonic's codec; `intake` validates unrolls and puts them into batches,
@@ -15,10 +15,10 @@
 //! Every stream is pulled: the learner reads an actor's next unroll when the one before it has its place in a batch. HTTP/2's
 //! flow control thus carries the back pressure of the batches to the actors, and there is no queue in between.
 
-mod admission;
 mod assembly;
 mod assets;
 mod assignments;
+mod authorisation;
 mod calls;
 mod connections;
 pub mod evaluations;

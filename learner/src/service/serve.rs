@@ -10,8 +10,8 @@ use tokio::net::TcpListener;
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 
-use super::admission::AdmissionLayer;
 use super::assembly::Service;
+use super::authorisation::AuthorisationLayer;
 use super::calls::Calls;
 use super::connections::Acceptor;
 use super::framing::router::Router;
@@ -37,11 +37,11 @@ pub async fn serve(listener: TcpListener, service: Service, shutdown: impl Futur
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
         .build_v1()
         .map_err(|error| Error::Defect(format!("the protocol's descriptors are damaged: {error}")))?;
-    let admission = AdmissionLayer::new(gate.tokens.clone(), gate.limits.max_requests, gate.prometheus.clone());
+    let authorisation = AuthorisationLayer::new(gate.tokens.clone(), gate.limits.max_requests, gate.prometheus.clone());
     let acceptor = Acceptor::new(gate.tls.clone(), &gate.limits, gate.prometheus.clone());
     let mut closing = service.shutdown.closing();
     let server = server(gate.window)
-        .layer(admission)
+        .layer(authorisation)
         .add_service(Router::new(calls, service.unrolls.clone(), service.parameters.clone()))
         .add_service(health)
         .add_service(reflection)

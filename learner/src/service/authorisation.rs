@@ -1,4 +1,4 @@
-//! Checks every call before it is answered: its token, and the limit of calls in flight.
+//! Decides whether a call is answered: it needs a token, and a place among the calls in flight.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -21,21 +21,21 @@ use crate::security::Tokens;
 /// The one call that needs no token, so that the health checks of containers need no secret.
 const PUBLIC: &str = "/grpc.health.v1.Health/Check";
 
-/// The tower layer that admits calls, for all connections together.
+/// The tower layer that authorises calls, for all connections together.
 #[derive(Clone, Debug)]
-pub(super) struct AdmissionLayer {
+pub(super) struct AuthorisationLayer {
     tokens: Option<Arc<Tokens>>,
     places: Arc<Semaphore>,
     prometheus: Arc<Prometheus>,
 }
 
-impl AdmissionLayer {
+impl AuthorisationLayer {
     pub(super) fn new(tokens: Option<Arc<Tokens>>, max_requests: usize, prometheus: Arc<Prometheus>) -> Self {
         let places = Arc::new(Semaphore::new(max_requests.min(Semaphore::MAX_PERMITS)));
         Self { tokens, places, prometheus }
     }
 
-    fn admit<B>(&self, request: &Request<B>) -> Result<Admitted, Status> {
+    fn authorise<B>(&self, request: &Request<B>) -> Result<Authorised, Status> {
         let shown = request.headers().get(AUTHORIZATION).map(http::HeaderValue::as_bytes);
         let public = request.uri().path() == PUBLIC;
         if !public && self.tokens.as_ref().is_some_and(|tokens| !tokens.accept(shown)) {
@@ -50,39 +50,39 @@ impl AdmissionLayer {
             return Err(Status::resource_exhausted("too many calls are in flight: try again later"));
         };
         self.prometheus.requests.inc();
-        Ok(Admitted { requests: self.prometheus.requests.clone(), _place: place })
+        Ok(Authorised { requests: self.prometheus.requests.clone(), _place: place })
     }
 }
 
 /// A call's place among those in flight.
 #[derive(Debug)]
-struct Admitted {
+struct Authorised {
     requests: Gauge,
     _place: OwnedSemaphorePermit,
 }
 
-impl Drop for Admitted {
+impl Drop for Authorised {
     fn drop(&mut self) {
         self.requests.dec();
     }
 }
 
-impl<S> Layer<S> for AdmissionLayer {
-    type Service = AdmissionService<S>;
+impl<S> Layer<S> for AuthorisationLayer {
+    type Service = AuthorisationService<S>;
 
-    fn layer(&self, inner: S) -> AdmissionService<S> {
-        AdmissionService { layer: self.clone(), inner }
+    fn layer(&self, inner: S) -> AuthorisationService<S> {
+        AuthorisationService { layer: self.clone(), inner }
     }
 }
 
-/// A service behind an [`AdmissionLayer`].
+/// A service behind an [`AuthorisationLayer`].
 #[derive(Clone, Debug)]
-pub(super) struct AdmissionService<S> {
-    layer: AdmissionLayer,
+pub(super) struct AuthorisationService<S> {
+    layer: AuthorisationLayer,
     inner: S,
 }
 
-impl<S, B> Service<Request<B>> for AdmissionService<S>
+impl<S, B> Service<Request<B>> for AuthorisationService<S>
 where
     S: Service<Request<B>, Response = Response<Body>>,
     S::Future: Send + 'static,
@@ -96,11 +96,11 @@ where
     }
 
     fn call(&mut self, request: Request<B>) -> Self::Future {
-        match self.layer.admit(&request) {
+        match self.layer.authorise(&request) {
             Err(refused) => Box::pin(async move { Ok(refused.into_http()) }),
-            Ok(admitted) => {
+            Ok(authorised) => {
                 let answer = self.inner.call(request);
-                Box::pin(async move { Ok(answer.await?.map(|body| Body::new(Held { body, _admitted: admitted }))) })
+                Box::pin(async move { Ok(answer.await?.map(|body| Body::new(Held { body, _authorised: authorised }))) })
             }
         }
     }
@@ -109,7 +109,7 @@ where
 /// The body of an answer. Its call keeps its place among the calls in flight until the body ends.
 struct Held {
     body: Body,
-    _admitted: Admitted,
+    _authorised: Authorised,
 }
 
 impl http_body::Body for Held {
