@@ -5,8 +5,11 @@ mod vmpo;
 
 use serde::{Deserialize, Serialize};
 
-use crate::document::Experiment;
 use crate::fault::{Fault, ensure};
+use crate::network::Network;
+use crate::replay::Replay;
+use crate::settings::Unroll;
+use crate::tasks::{TaskName, Tracking};
 
 pub use svg0::Svg0;
 pub use vmpo::Vmpo;
@@ -47,15 +50,6 @@ macro_rules! algorithm_names {
                 }
             }
         }
-
-        impl Experiment {
-            /// The section of its algorithm.
-            fn algorithm_parameters(&self) -> &dyn AlgorithmParameters {
-                match self.algorithm {
-                    $(AlgorithmName::$algorithm => &self.$section,)*
-                }
-            }
-        }
     };
 }
 
@@ -74,21 +68,33 @@ impl std::fmt::Display for AlgorithmName {
     }
 }
 
+/// What an algorithm may need to know of the rest of the document.
+pub(crate) struct Rest<'a> {
+    /// Every task.
+    pub(crate) tasks: Vec<TaskName>,
+    /// Whether a frozen low level acts.
+    pub(crate) transfers: bool,
+    pub(crate) tracking: &'a Tracking,
+    pub(crate) network: &'a Network,
+    pub(crate) replay: &'a Replay,
+    pub(crate) unroll: &'a Unroll,
+}
+
 /// What an algorithm's section tells about the algorithm.
-trait AlgorithmParameters {
+pub(crate) trait AlgorithmParameters {
     /// # Errors
-    /// The first field with a value that is meaningless, or is so beside other fields of the experiment.
-    fn check(&self, experiment: &Experiment) -> Result<(), Fault>;
+    /// The first field with a value that is meaningless, or is so beside the rest of the document.
+    fn check(&self, rest: &Rest<'_>) -> Result<(), Fault>;
 
     /// Fields and sections that the algorithm does not read, by dotted name. The sections of other algorithms are among
     /// them anyway.
-    fn unread(&self, experiment: &Experiment) -> Vec<&'static str>;
+    fn unread(&self, rest: &Rest<'_>) -> Vec<&'static str>;
 
     /// Whether its policy has a reference encoder and a low level, unless a frozen low level acts.
     fn has_low_level(&self) -> bool;
 
     /// Size of the policy's recurrent state. A frozen low level's state is not part of it.
-    fn state_size(&self, experiment: &Experiment) -> usize;
+    fn state_size(&self, rest: &Rest<'_>) -> usize;
 
     /// Whether it learns from the simulator's derivative of the rewards with respect to the actions.
     fn reads_action_gradient(&self) -> bool {
@@ -96,74 +102,8 @@ trait AlgorithmParameters {
     }
 }
 
-/// Fields that mean nothing to the experiment's algorithm, and faults of its own section.
-pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
-    let unread = experiment.unread();
-    // TOML can write every document whose numbers were checked.
-    let changed = experiment.differences(&Experiment::default()).unwrap_or_default();
-    if let Some(set) = changed.into_iter().find(|set| unread.iter().any(|name| is_within(&set.field, name))) {
-        let remedy = format!("algorithm = \"{}\" does not read it; leave it at {}", experiment.algorithm, set.theirs);
-        return Err(Fault { field: set.field, value: set.ours, remedy });
-    }
-    experiment.algorithm_parameters().check(experiment)
-}
-
-/// Whether `field` is `outer`, or a field of the section `outer`.
-fn is_within(field: &str, outer: &str) -> bool {
-    field.strip_prefix(outer).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
-}
-
-impl Experiment {
-    /// Fields and sections that the experiment's algorithm does not read, by dotted name.
-    pub(crate) fn unread(&self) -> Vec<&'static str> {
-        let others = AlgorithmName::ALL.into_iter().filter(|name| *name != self.algorithm);
-        others.map(AlgorithmName::name).chain(self.algorithm_parameters().unread(self)).collect()
-    }
-
-    /// Whether the policy has an encoder and a low level of its own, which it learns.
-    pub fn learns_low_level(&self) -> bool {
-        !self.transfer.is_on() && self.algorithm_parameters().has_low_level()
-    }
-
-    /// Size of the policy's recurrent state. A frozen low level's state is not part of it.
-    pub fn state_size(&self) -> usize {
-        self.algorithm_parameters().state_size(self)
-    }
-
-    /// Whether actors compute the simulator's derivative of the rewards with respect to the actions.
-    pub fn reads_action_gradient(&self) -> bool {
-        self.algorithm_parameters().reads_action_gradient()
-    }
-}
-
 /// Hidden sizes of one or more layers.
 fn layers(field: &str, sizes: &[usize]) -> Result<(), Fault> {
     let holds = !sizes.is_empty() && sizes.iter().all(|size| (1..=16384).contains(size)) && sizes.len() <= 64;
     ensure(field, sizes, holds, "must be one or more layers of 1 to 16384 units")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_document_writes_an_algorithm_by_the_name_of_its_section() {
-        let document = Experiment::default().to_table().unwrap();
-        for algorithm in AlgorithmName::ALL {
-            assert_eq!(toml::Value::try_from(algorithm).unwrap().as_str(), Some(algorithm.name()));
-            assert!(document[algorithm.name()].is_table());
-        }
-    }
-
-    #[test]
-    fn every_name_of_an_unread_field_is_one() {
-        let document = toml::Value::Table(Experiment::default().to_table().unwrap());
-        for algorithm in AlgorithmName::ALL {
-            let experiment = Experiment { algorithm, ..Experiment::default() };
-            for name in experiment.unread() {
-                let found = name.split('.').try_fold(&document, |place, part| place.get(part));
-                assert!(found.is_some(), "{algorithm}: {name}");
-            }
-        }
-    }
 }

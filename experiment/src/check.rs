@@ -1,6 +1,5 @@
 //! Finds values that parse but mean nothing. Every rule refuses NaN.
 
-use crate::algorithms;
 use crate::clips::{ClipSource, SUBSETS};
 use crate::document::Experiment;
 use crate::fault::{AT_LEAST_ONE, Fault, NOT_NEGATIVE, POSITIVE, ensure, not_negative, positive};
@@ -30,7 +29,7 @@ pub(crate) fn check(experiment: &Experiment) -> Result<(), Fault> {
     unroll(&experiment.unroll)?;
     actor(&experiment.actor)?;
     together(experiment)?;
-    algorithms::check(experiment)?;
+    algorithm(experiment)?;
     learner(&experiment.learner)?;
     budget(&experiment.budget)
 }
@@ -183,6 +182,23 @@ fn together(experiment: &Experiment) -> Result<(), Fault> {
     let holds = !unroll.lockstep || budget.minutes == 0.0;
     let remedy = "must be 0 with unroll.lockstep, which uses no clock; set budget.updates or budget.environment_steps";
     ensure("budget.minutes", budget.minutes, holds, remedy)
+}
+
+/// Fields that mean nothing to the experiment's algorithm, and faults of its own section.
+fn algorithm(experiment: &Experiment) -> Result<(), Fault> {
+    let unread = experiment.unread();
+    // TOML can write every document whose numbers were checked.
+    let changed = experiment.differences(&Experiment::default()).unwrap_or_default();
+    if let Some(set) = changed.into_iter().find(|set| unread.iter().any(|name| is_within(&set.field, name))) {
+        let remedy = format!("algorithm = \"{}\" does not read it; leave it at {}", experiment.algorithm, set.theirs);
+        return Err(Fault { field: set.field, value: set.ours, remedy });
+    }
+    experiment.algorithm_parameters().check(&experiment.rest())
+}
+
+/// Whether `field` is `outer`, or a field of the section `outer`.
+fn is_within(field: &str, outer: &str) -> bool {
+    field.strip_prefix(outer).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
 fn learner(learner: &Learner) -> Result<(), Fault> {

@@ -2,15 +2,15 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::algorithms::{AlgorithmName, Svg0, Vmpo};
+use crate::algorithms::{AlgorithmName, AlgorithmParameters, Rest, Svg0, Vmpo};
 use crate::body::ACTION_SIZE;
 use crate::clips::ClipSource;
-use crate::for_each_task;
 use crate::network::Network;
 use crate::replay::Replay;
 use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll};
 use crate::tasks::{self, TaskName, TaskParameters};
 use crate::transfer::Transfer;
+use crate::{for_each_algorithm, for_each_task};
 
 macro_rules! document {
     ($($(#[$description:meta])* $task:ident, $section:ident, $name:literal;)*) => {
@@ -91,6 +91,21 @@ macro_rules! document {
 
 for_each_task!(document);
 
+macro_rules! parameters {
+    ($($(#[$description:meta])* $algorithm:ident, $section:ident;)*) => {
+        impl Experiment {
+            /// The section of its algorithm.
+            pub(crate) fn algorithm_parameters(&self) -> &dyn AlgorithmParameters {
+                match self.algorithm {
+                    $(AlgorithmName::$algorithm => &self.$section,)*
+                }
+            }
+        }
+    };
+}
+
+for_each_algorithm!(parameters);
+
 /// A complementary task of joint training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -114,6 +129,34 @@ impl Experiment {
         if self.transfer.is_on() { self.network.latent.size } else { ACTION_SIZE }
     }
 
+    /// What the algorithm may need to know of the other sections.
+    pub(crate) fn rest(&self) -> Rest<'_> {
+        Rest {
+            tasks: self.tasks().into_iter().map(|(task, _)| task).collect(),
+            transfers: self.transfer.is_on(),
+            tracking: &self.tracking,
+            network: &self.network,
+            replay: &self.replay,
+            unroll: &self.unroll,
+        }
+    }
+
+    /// Fields and sections that the algorithm does not read, by dotted name.
+    pub(crate) fn unread(&self) -> Vec<&'static str> {
+        let others = AlgorithmName::ALL.into_iter().filter(|name| *name != self.algorithm);
+        others.map(AlgorithmName::name).chain(self.algorithm_parameters().unread(&self.rest())).collect()
+    }
+
+    /// Whether the policy has an encoder and a low level of its own, which it learns.
+    pub fn learns_low_level(&self) -> bool {
+        !self.transfer.is_on() && self.algorithm_parameters().has_low_level()
+    }
+
+    /// Whether actors compute the simulator's derivative of the rewards with respect to the actions.
+    pub fn reads_action_gradient(&self) -> bool {
+        self.algorithm_parameters().reads_action_gradient()
+    }
+
     /// Length of the latent that the policy samples itself.
     pub fn latent_size(&self) -> usize {
         if self.learns_low_level() { self.network.latent.size } else { 0 }
@@ -124,8 +167,39 @@ impl Experiment {
         if self.learns_low_level() { self.network.components() } else { 1 }
     }
 
+    /// Size of the policy's recurrent state. A frozen low level's state is not part of it.
+    pub fn state_size(&self) -> usize {
+        self.algorithm_parameters().state_size(&self.rest())
+    }
+
     /// Size of the recurrent state of a frozen low level; 0 without one.
     pub fn frozen_state_size(&self) -> usize {
         if self.transfer.is_on() { self.network.state_size() } else { 0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_document_writes_an_algorithm_by_the_name_of_its_section() {
+        let document = Experiment::default().to_table().unwrap();
+        for algorithm in AlgorithmName::ALL {
+            assert_eq!(toml::Value::try_from(algorithm).unwrap().as_str(), Some(algorithm.name()));
+            assert!(document[algorithm.name()].is_table());
+        }
+    }
+
+    #[test]
+    fn every_name_of_an_unread_field_is_one() {
+        let document = toml::Value::Table(Experiment::default().to_table().unwrap());
+        for algorithm in AlgorithmName::ALL {
+            let experiment = Experiment { algorithm, ..Experiment::default() };
+            for name in experiment.unread() {
+                let found = name.split('.').try_fold(&document, |place, part| place.get(part));
+                assert!(found.is_some(), "{algorithm}: {name}");
+            }
+        }
     }
 }

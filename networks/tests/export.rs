@@ -245,7 +245,7 @@ fn refused(bytes: Vec<u8>) -> String {
 fn a_wrong_description_is_refused_with_the_name_of_the_field() {
     type Alteration = fn(&mut Value);
     let cases: [(&str, Alteration); 11] = [
-        ("`format`", |spec| spec["format"] = 2.into()),
+        ("`format`", |spec| spec["format"] = 3.into()),
         ("`format`", |spec| *spec = Value::Null),
         ("no part `value`", |spec| spec["part"] = "value".into()),
         ("task `ball-catch` was not learnt", |spec| spec["part"] = "policy:ball-catch".into()),

@@ -2,8 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{AlgorithmParameters, layers};
-use crate::document::Experiment;
+use super::{AlgorithmParameters, Rest, layers};
 use crate::fault::{AT_LEAST_ONE, Fault, NOT_NEGATIVE, ensure, not_negative};
 
 /// SVG(0) (Heess et al., 2015) with Retrace (Munos et al., 2016). (S) is the CoMic supplement; (A) the published agent
@@ -78,7 +77,7 @@ const OF_LOW_LEVELS: [&str; 5] =
     ["network.low_level", "network.mlp", "network.lstm", "network.primitives", "network.latent"];
 
 impl AlgorithmParameters for Svg0 {
-    fn check(&self, experiment: &Experiment) -> Result<(), Fault> {
+    fn check(&self, rest: &Rest<'_>) -> Result<(), Fault> {
         let Self { discount, target_period, publish_period, lambda, action_samples, entropy, kl, .. } = self;
         ensure("svg0.discount", discount, (0.0..1.0).contains(discount), "must be in [0, 1)")?;
         ensure("svg0.target_period", target_period, *target_period > 0, AT_LEAST_ONE)?;
@@ -90,18 +89,18 @@ impl AlgorithmParameters for Svg0 {
         let Self { minibatch_sequences, burn_in, encoder, core, policy, action_value, .. } = self;
         let sequences = *minibatch_sequences;
         ensure("svg0.minibatch_sequences", sequences, (1..=65536).contains(&sequences), "must be 1 to 65536")?;
-        let holds = *burn_in < experiment.unroll.length;
+        let holds = *burn_in < rest.unroll.length;
         ensure("svg0.burn_in", burn_in, holds, "must be less than unroll.length")?;
         layers("svg0.encoder", encoder)?;
         layers("svg0.action_value", action_value)?;
         for (field, units) in [("svg0.core", core), ("svg0.policy", policy)] {
             ensure(field, units, (1..=16384).contains(units), "must be 1 to 16384 units")?;
         }
-        experiment.replay.check(experiment.unroll.length, sequences)
+        rest.replay.check(rest.unroll.length, sequences)
     }
 
-    fn unread(&self, experiment: &Experiment) -> Vec<&'static str> {
-        let of_low_levels = if experiment.transfer.is_on() { &[][..] } else { &OF_LOW_LEVELS[..] };
+    fn unread(&self, rest: &Rest<'_>) -> Vec<&'static str> {
+        let of_low_levels = if rest.transfers { &[][..] } else { &OF_LOW_LEVELS[..] };
         [&UNREAD[..], of_low_levels].concat()
     }
 
@@ -110,7 +109,7 @@ impl AlgorithmParameters for Svg0 {
     }
 
     /// Hidden and cell state of the core's LSTM, then of the policy's.
-    fn state_size(&self, _: &Experiment) -> usize {
+    fn state_size(&self, _: &Rest<'_>) -> usize {
         2 * (self.core + self.policy)
     }
 }

@@ -2,8 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::AlgorithmParameters;
-use crate::document::Experiment;
+use super::{AlgorithmParameters, Rest};
 use crate::fault::{AT_LEAST_ONE, Fault, NOT_NEGATIVE, POSITIVE, ensure, not_negative, positive};
 use crate::tasks::{TaskName, TerminationError};
 
@@ -86,8 +85,8 @@ impl Default for Vmpo {
 }
 
 impl AlgorithmParameters for Vmpo {
-    fn check(&self, experiment: &Experiment) -> Result<(), Fault> {
-        let Experiment { unroll, network, .. } = experiment;
+    fn check(&self, rest: &Rest<'_>) -> Result<(), Fault> {
+        let Rest { unroll, network, tracking, transfers, .. } = rest;
         ensure("vmpo.discount", self.discount, (0.0..1.0).contains(&self.discount), "must be in [0, 1)")?;
         for (field, number) in [
             ("vmpo.epsilon_eta", self.epsilon_eta),
@@ -125,19 +124,19 @@ impl AlgorithmParameters for Vmpo {
         ensure("vmpo.value_burn_in", burn_in, holds, remedy)?;
         let weight = self.action_gradient;
         let remedy = "must be 0 with transfer.low_level";
-        ensure("vmpo.action_gradient", weight, weight == 0.0 || !experiment.transfer.is_on(), remedy)?;
-        let has = |wanted| experiment.tasks().iter().any(|(task, _)| *task == wanted);
-        let linear = experiment.tracking.termination_error == TerminationError::DmControl;
+        ensure("vmpo.action_gradient", weight, weight == 0.0 || !transfers, remedy)?;
+        let has = |wanted| rest.tasks.contains(&wanted);
+        let linear = tracking.termination_error == TerminationError::DmControl;
         let differentiable = if has(TaskName::Tracking) { linear } else { has(TaskName::GetUp) };
         let remedy =
             "must be 0 without tracking and get-up, and with another tracking.termination_error than dm-control";
         ensure("vmpo.action_gradient", weight, weight == 0.0 || differentiable, remedy)?;
-        let holds = self.control_variate == 0.0 || experiment.components() == 1;
+        let holds = self.control_variate == 0.0 || *transfers || network.components() == 1;
         let remedy = "must be 0 with network.low_level = \"mixture\", whose KL has no closed form";
         ensure("vmpo.control_variate", self.control_variate, holds, remedy)
     }
 
-    fn unread(&self, _: &Experiment) -> Vec<&'static str> {
+    fn unread(&self, _: &Rest<'_>) -> Vec<&'static str> {
         vec!["replay"]
     }
 
@@ -145,8 +144,8 @@ impl AlgorithmParameters for Vmpo {
         true
     }
 
-    fn state_size(&self, experiment: &Experiment) -> usize {
-        if experiment.transfer.is_on() { 0 } else { experiment.network.state_size() }
+    fn state_size(&self, rest: &Rest<'_>) -> usize {
+        if rest.transfers { 0 } else { rest.network.state_size() }
     }
 
     fn reads_action_gradient(&self) -> bool {
