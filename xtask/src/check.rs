@@ -45,7 +45,7 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
         python::prepare_tests()
     })?;
     // The whole-system tests start the programs.
-    durations.of("build of the programs", workspace::build)?;
+    durations.of("build", workspace::build_with_tests)?;
     if options.docker {
         durations.of("images", images::build)?;
     }
@@ -74,7 +74,7 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
     let _ = fs::remove_file(&report);
     let ended = durations.of("tests", || run(&mut command));
     if let Ok(report) = fs::read_to_string(report) {
-        durations.split_tests(&report);
+        durations.read_tests(&report);
     }
     eprint!("{durations}");
     if !left_out.is_empty() {

@@ -24,19 +24,15 @@ impl Durations {
         result
     }
 
-    /// Reads the report in JUnit's format that cargo-nextest wrote in the last part. What the part took besides is the
-    /// build of the tests.
-    pub(crate) fn split_tests(&mut self, report: &str) {
-        let lines = |tag: &'static str| report.lines().filter_map(move |line| line.trim_start().strip_prefix(tag));
-        let run = lines("<testsuites").find_map(seconds).unwrap_or_default();
-        if let Some((all, _)) = self.parts.pop() {
-            self.parts.extend([(all - run, "build of the tests"), (run, "run of the tests")]);
-        }
+    /// Reads the report in JUnit's format that cargo-nextest wrote.
+    pub(crate) fn read_tests(&mut self, report: &str) {
         let mut sums = BTreeMap::<&str, f64>::new();
-        for (program, seconds) in
-            lines("<testcase").filter_map(|test| Some((value(test, "classname")?, seconds(test)?)))
-        {
-            *sums.entry(program).or_default() += seconds;
+        for test in report.lines().filter_map(|line| line.trim_start().strip_prefix("<testcase")) {
+            if let (Some(program), Some(Ok(seconds))) =
+                (value(test, "classname"), value(test, "time").map(str::parse::<f64>))
+            {
+                *sums.entry(program).or_default() += seconds;
+            }
         }
         self.tests = sums.into_iter().map(|(program, seconds)| (seconds, program.to_owned())).collect();
         self.tests.sort_by(|a, b| b.0.total_cmp(&a.0));
@@ -56,10 +52,6 @@ impl fmt::Display for Durations {
         }
         Ok(())
     }
-}
-
-fn seconds(tag: &str) -> Option<f64> {
-    value(tag, "time")?.parse().ok()
 }
 
 /// The value of an XML attribute.
@@ -89,10 +81,10 @@ mod tests {
     #[test]
     fn the_programs_with_the_longest_tests_come_first() {
         let mut durations = Durations { parts: vec![(2.0, "set-up"), (20.0, "tests")], tests: Vec::new() };
-        durations.split_tests(REPORT);
+        durations.read_tests(REPORT);
         assert_eq!(
             durations.to_string(),
-            "TOOK      2 s: set-up\nTOOK     13 s: build of the tests\nTOOK      7 s: run of the tests\n\
+            "TOOK      2 s: set-up\nTOOK     20 s: tests\n\
              TOOK      6 s: tests of comic-tests::lockstep\nTOOK      1 s: tests of comic-tests::trace\n"
         );
     }

@@ -57,6 +57,12 @@ pub(crate) fn build() -> Result<()> {
     run(cargo().args(["build", "--release", "--workspace", "--bins"]))
 }
 
+/// Builds every program and every test at once. The tests' dependencies add features to shared crates, so a build of the
+/// programs alone would compile our crates a second time.
+pub(crate) fn build_with_tests() -> Result<()> {
+    run(cargo().args(["build", "--release", "--workspace", "--bins", "--tests"]))
+}
+
 /// The path of a program of this workspace. All of them lie beside this one.
 pub(crate) fn program(name: &str) -> Result<PathBuf> {
     let own = std::env::current_exe().context("cannot find the path of this program")?;
