@@ -71,9 +71,10 @@ mod ledger;
 mod phase;
 mod rate_limiter;
 mod snapshot;
-mod streaming;
+
 mod table;
 mod tasks;
+mod uncached_copy;
 mod unrolls;
 
 pub use accounting::{Accounting, AccountingByTask, Dropped, Reason, TaskAccounting};

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use comic_proto::{Field, PerField, Pieces, UnrollLayout};
 
-use crate::streaming;
+use crate::uncached_copy;
 
 /// A page of memory is at least so many bytes.
 const PAGE: usize = 4096;
@@ -142,7 +142,7 @@ impl Unrolls {
     pub(crate) fn put(&mut self, slot: usize, payload: &Pieces) {
         for field in Field::ALL {
             let start = self.layout.range(field).start;
-            payload.copy_by(start, self.bytes_mut(field, slot), streaming::copy);
+            payload.copy_by(start, self.bytes_mut(field, slot), uncached_copy::copy);
         }
     }
 
