@@ -3,11 +3,13 @@
 //!
 //! # Layout
 //! - [`mod@retrace`]: the targets of the action value.
+//! - [`mod@losses`]: the losses, a pure function of [`Networks`], minibatch and noise.
 //! - [`Svg0Learner`]: online and target networks and Adam; one gradient step at a time.
 //!
 //! Everything is float32 and of static shape: masks instead of selections.
 
 mod learner;
+mod losses;
 mod retrace;
 
 use std::sync::Arc;
@@ -20,6 +22,7 @@ use crate::algorithm::replay::Replay;
 use crate::algorithm::{self, Algorithm, Parts};
 
 pub use learner::Svg0Learner;
+pub use losses::{Networks, Terms, losses, noise};
 pub use retrace::{Trace, retrace};
 
 /// Makes what SVG(0) needs.

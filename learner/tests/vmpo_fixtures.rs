@@ -6,85 +6,24 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
-use std::path::{Path, PathBuf};
+mod fixture;
 
 use comic_experiment::Prior;
 use comic_learner::vmpo::{Evidence, KlLimits, Multipliers, policy_improvement, returns};
 use comic_networks::{ActionDistribution, DiagonalGaussian};
-use npyz::npz::NpzArchive;
+use fixture::{Fixture, Folder};
 use tch::{Device, Kind, Tensor};
 
-/// Of the larger of 1 and the largest expected number of the array.
-const TOLERANCE: f64 = 1e-5;
-
-struct Fixture {
-    path: PathBuf,
-    archive: NpzArchive<std::io::BufReader<std::fs::File>>,
-}
-
-impl Fixture {
-    fn open(path: &Path) -> Self {
-        let archive = NpzArchive::open(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-        Self { path: path.to_path_buf(), archive }
-    }
-
-    /// An array as float32, whatever float it was written as; `None` when the file has no such array.
-    fn find(&mut self, name: &str) -> Option<Tensor> {
-        let array =
-            self.archive.by_name(name).unwrap_or_else(|error| panic!("{}: {name}: {error}", self.path.display()))?;
-        let shape: Vec<i64> = array.shape().iter().map(|size| *size as i64).collect();
-        let double = array.dtype().num_bytes() == Some(8);
-        let values: Vec<f64> = if double {
-            array.into_vec::<f64>().unwrap()
-        } else {
-            array.into_vec::<f32>().unwrap().into_iter().map(f64::from).collect()
-        };
-        assert!(values.iter().all(|value| value.is_finite()), "{}: {name} is not finite", self.path.display());
-        Some(Tensor::from_slice(&values).to_kind(Kind::Float).reshape(shape))
-    }
-
-    fn array(&mut self, name: &str) -> Tensor {
-        self.find(name).unwrap_or_else(|| panic!("{} has no array `{name}`", self.path.display()))
-    }
-
-    fn scalar(&mut self, name: &str) -> f64 {
-        self.array(name).double_value(&[])
-    }
-
-    fn compare(&mut self, name: &str, found: &Tensor) {
-        let expected = self.array(name);
-        assert_eq!(found.size(), expected.size(), "{}: shape of {name}", self.path.display());
-        let scale = expected.abs().max().double_value(&[]).max(1.0);
-        let error = (found.detach() - &expected).abs().max().double_value(&[]);
-        assert!(error <= TOLERANCE * scale, "{}: {name} is off by {error:e} at scale {scale}", self.path.display());
-    }
-}
-
-/// Every fixture of one kind. A folder may lack a kind if it has fixtures of another kind.
-fn fixtures(kind: &str) -> Vec<Fixture> {
-    let named = std::env::var_os("COMIC_VMPO_FIXTURES").map(PathBuf::from);
-    let own = named.is_none();
-    let folder = named.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fixtures/vmpo"));
-    let entries = std::fs::read_dir(&folder).unwrap_or_else(|error| panic!("{}: {error}", folder.display()));
-    let mut files: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
-    files.retain(|path| path.extension().is_some_and(|extension| extension == "npz"));
-    files.sort();
-    let is = |path: &Path, kind: &str| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(kind));
-    let known = files
-        .iter()
-        .any(|path| ["vmpo_", "gaussian_", "returns_", "mixture_", "product_"].iter().any(|kind| is(path, kind)));
-    assert!(known, "{} holds no fixture; tests/python/make_vmpo_fixtures.py makes them", folder.display());
-    files.retain(|path| is(path, kind));
-    assert!(!own || !files.is_empty(), "{} has lost its {kind}*.npz", folder.display());
-    if files.is_empty() {
-        eprintln!("{} holds no {kind}*.npz: that comparison is skipped", folder.display());
-    }
-    files.iter().map(|path| Fixture::open(path)).collect()
-}
+const FOLDER: Folder = Folder {
+    variable: "COMIC_VMPO_FIXTURES",
+    name: "vmpo",
+    script: "make_vmpo_fixtures.py",
+    kinds: &["vmpo_", "gaussian_", "returns_", "mixture_", "product_"],
+};
 
 #[test]
 fn losses_and_gradients_equal_rlax() {
-    for mut fixture in fixtures("vmpo_") {
+    for mut fixture in FOLDER.fixtures("vmpo_") {
         let learnt = ["log_prob", "kl_mean", "kl_std"].map(|name| fixture.array(name).set_requires_grad(true));
         let [log_prob, kl_mean, kl_std] = &learnt;
         let advantage = fixture.array("advantage");
@@ -128,7 +67,7 @@ fn losses_and_gradients_equal_rlax() {
 
 #[test]
 fn gaussians_equal_pytorchs_distributions() {
-    for mut fixture in fixtures("gaussian_") {
+    for mut fixture in FOLDER.fixtures("gaussian_") {
         let policy = DiagonalGaussian { mean: fixture.array("mean"), std: fixture.array("std") };
         let behaviour = DiagonalGaussian { mean: fixture.array("other_mean"), std: fixture.array("other_std") };
         let action = fixture.array("action");
@@ -148,7 +87,7 @@ fn gaussians_equal_pytorchs_distributions() {
 
 #[test]
 fn returns_equal_rlax_on_each_episodes_piece() {
-    for mut fixture in fixtures("returns_") {
+    for mut fixture in FOLDER.fixtures("returns_") {
         let arrays = ["reward", "discount", "valid", "values"].map(|name| fixture.array(name));
         let [reward, discount, valid, values] = &arrays;
         let gamma = fixture.scalar("gamma");
@@ -172,7 +111,7 @@ fn compare_gradients(fixture: &mut Fixture, total: &Tensor, learnt: &[Tensor; 3]
 
 #[test]
 fn mixtures_equal_pytorchs_distributions() {
-    for mut fixture in fixtures("mixture_") {
+    for mut fixture in FOLDER.fixtures("mixture_") {
         let learnt = LEARNT.map(|name| fixture.array(name).set_requires_grad(true));
         let [logits, mean, std] = &learnt;
         let components = DiagonalGaussian { mean: mean.shallow_clone(), std: std.shallow_clone() };
@@ -195,7 +134,7 @@ fn mixtures_equal_pytorchs_distributions() {
 
 #[test]
 fn products_equal_gaussian_distributions_computed_by_hand() {
-    for mut fixture in fixtures("product_") {
+    for mut fixture in FOLDER.fixtures("product_") {
         let learnt = LEARNT.map(|name| fixture.array(name).set_requires_grad(true));
         let [logits, mean, std] = &learnt;
         let primitives = DiagonalGaussian { mean: mean.shallow_clone(), std: std.shallow_clone() };

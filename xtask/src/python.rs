@@ -21,11 +21,12 @@ pub(crate) struct FixtureOptions {
 
 /// The scripts that make fixtures: the script and its requirements in `tests/python`, and the directory in
 /// `tests/fixtures`.
-const FIXTURES: [(&str, &str, &str); 4] = [
+const FIXTURES: [(&str, &str, &str); 5] = [
     ("make_tracking_fixtures.py", "requirements-tracking.txt", "golden"),
     ("make_task_fixtures.py", "requirements-tracking.txt", "golden"),
     ("make_vmpo_fixtures.py", "requirements-vmpo.txt", "vmpo"),
     ("make_distribution_fixtures.py", "requirements-vmpo.txt", "vmpo"),
+    ("make_svg0_fixtures.py", "requirements-vmpo.txt", "svg0"),
 ];
 
 /// Makes the tests' fixtures again.
