@@ -5,10 +5,15 @@ mod svg0_support;
 
 use std::collections::HashMap;
 
+use comic_experiment::Experiment;
 use comic_learner::algorithm::Algorithm as _;
+use comic_learner::svg0::Svg0Learner;
+use comic_networks::{Policy, RecurrentState, Routing, from_safetensors};
 use comic_proto::Field;
-use svg0_support::{GENERATOR, SEQUENCES, Sequences, after_step, experiment, largest_difference, learner};
-use tch::Tensor;
+use svg0_support::{
+    ACTION, GENERATOR, LENGTH, SEQUENCES, Sequences, after_step, experiment, largest_difference, learner, spec,
+};
+use tch::{Device, Kind, Tensor, nn};
 
 #[test]
 fn rows_of_the_burn_in_and_without_a_transition_teach_nothing() {
@@ -95,4 +100,63 @@ fn state_and_minibatches_decide_every_later_parameter() {
     minibatches[3..].iter().for_each(|minibatch| drop(resumed.step(minibatch).unwrap()));
     let [one, other] = [whole.state(), resumed.state()].map(|state| state.into_iter().collect::<HashMap<_, _>>());
     assert_eq!(largest_difference(&one, &other, ""), 0.0);
+}
+
+/// The sequences as an actor with the learner's policy plays them, row by row, from a state that it has after a row before them.
+fn acted(learner: &Svg0Learner, experiment: &Experiment, mut sequences: Sequences) -> Sequences {
+    let mut store = nn::VarStore::new(Device::Cpu);
+    let policy = Policy::of(&store.root(), &spec(), experiment, &[0.0; ACTION]).unwrap();
+    from_safetensors(&mut store, &learner.policy_parameters().unwrap()).unwrap();
+    let none = Tensor::zeros([1, 0], (Kind::Float, Device::Cpu));
+    for sequence in 0..SEQUENCES {
+        let mut state = Tensor::from_slice(sequences.row(Field::State, sequence, 0)).unsqueeze(0);
+        // Row −1 has the observation of row 0.
+        for t in -1..LENGTH as i64 {
+            let row = t.max(0) as usize;
+            if t == 0 {
+                sequences
+                    .row(Field::State, sequence, 0)
+                    .copy_from_slice(&Vec::<f32>::try_from(state.view(-1)).unwrap());
+            }
+            if t >= 0 && sequences.row(Field::First, sequence, row)[0] == 1.0 {
+                state = state.zeros_like();
+            }
+            let [proprioception, task] = [Field::Proprioception, Field::Task]
+                .map(|field| Tensor::from_slice(sequences.row(field, sequence, row)).unsqueeze(0));
+            let observation = policy.normalise(&proprioception, &task, None, &Routing::single());
+            let acting = policy.act(&observation, &none, &none, RecurrentState { state: &state, first: None });
+            let (mean, std, _) = acting.action.to_rows();
+            let action = &mean + &std * Tensor::randn_like(&mean);
+            for (field, values) in [(Field::Mean, mean), (Field::Std, std), (Field::Action, action)] {
+                sequences.row(field, sequence, row).copy_from_slice(&Vec::<f32>::try_from(values.view(-1)).unwrap());
+            }
+            state = acting.state;
+        }
+    }
+    sequences
+}
+
+/// Also that the actor's recurrent steps are the learner's pass, over a burn-in and the beginnings of episodes.
+#[test]
+fn on_policy_nothing_is_cut() {
+    let _guard = GENERATOR.lock().unwrap();
+    let mut experiment = experiment();
+    let sequences = Sequences::new(&experiment, SEQUENCES, 5).end_episode(1, 4, true).end_episode(2, 1, false);
+    for lambda in [1.0, 0.5] {
+        experiment.svg0.lambda = lambda;
+        let mut learner = learner(&experiment);
+        let mut on_policy = tch::no_grad(|| acted(&learner, &experiment, sequences.clone()));
+        let trace = |learner: &mut Svg0Learner, sequences: &Sequences| {
+            f64::from(learner.step(&sequences.tensors()).unwrap().to_values().get("trace").unwrap())
+        };
+        let found = trace(&mut learner, &on_policy);
+        assert!((found - lambda).abs() < 1e-5, "the mean trace is {found}");
+        // One action of one sequence as the likeliest of a policy with half the deviation: four times as likely, or more.
+        let action = on_policy.row(Field::Action, 0, 3).to_vec();
+        on_policy.row(Field::Mean, 0, 3).copy_from_slice(&action);
+        on_policy.row(Field::Std, 0, 3).iter_mut().for_each(|std| *std *= 0.5);
+        let mut learner = svg0_support::learner(&experiment);
+        let found = trace(&mut learner, &on_policy);
+        assert!(found < 0.96 * lambda, "the mean trace is {found}");
+    }
 }
