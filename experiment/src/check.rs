@@ -89,7 +89,8 @@ fn transfer(experiment: &Experiment) -> Result<(), Fault> {
     ensure("transfer.sha256", sha256, holds, "must be empty, or 64 hexadecimal digits")?;
     let in_range = |number: &f64| positive(*number) && *number <= LARGEST_LATENT;
     ensure("transfer.latent_limit", latent_limit, in_range(latent_limit), "must be positive, at most 1000")?;
-    ensure("transfer.mean_scale", mean_scale, in_range(mean_scale), "must be positive, at most 1000")?;
+    let holds = *mean_scale == 0.0 || in_range(mean_scale);
+    ensure("transfer.mean_scale", mean_scale, holds, "must be 0, which chooses it, or positive, at most 1000")?;
     if !transfer.is_on() {
         return Ok(());
     }

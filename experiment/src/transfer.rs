@@ -18,7 +18,8 @@ pub struct Transfer {
     pub sha256: String,
     /// Each entry of z is clamped to ± this limit before the low level reads it (N).
     pub latent_limit: f64,
-    /// The policy's mean is this number times a tanh (N: 3, or 1 with the prior of the state).
+    /// The policy's mean is this number times a tanh. 0 is 3 for latents, and 1 for deviations from the prior of the state (N).
+    /// Without a frozen low level only SVG(0) bounds its mean so, where 0 is 1: a command lies within ±1.
     pub mean_scale: f64,
     /// What an action of the policy means.
     pub prior: TransferPrior,
@@ -41,7 +42,7 @@ impl Default for Transfer {
             low_level: String::new(),
             sha256: String::new(),
             latent_limit: 3.0,
-            mean_scale: 3.0,
+            mean_scale: 0.0,
             prior: TransferPrior::Standard,
         }
     }
@@ -51,5 +52,14 @@ impl Transfer {
     /// Whether the experiment uses a frozen low level.
     pub fn is_on(&self) -> bool {
         !self.low_level.is_empty()
+    }
+
+    /// What the tanh of the policy's mean is multiplied by.
+    pub fn mean_scale(&self) -> f64 {
+        match (self.mean_scale > 0.0, self.is_on(), self.prior) {
+            (true, _, _) => self.mean_scale,
+            (false, true, TransferPrior::Standard) => 3.0,
+            (false, true, TransferPrior::State) | (false, false, _) => 1.0,
+        }
     }
 }

@@ -96,6 +96,14 @@ impl Adam {
         self.groups.get(group).map_or(&[], |group| &group.parameters)
     }
 
+    /// The steps of a group that counted, an int64 scalar on its device.
+    ///
+    /// # Panics
+    /// If there is no such group.
+    pub(crate) fn steps(&self, group: usize) -> &Tensor {
+        &self.groups[group].steps
+    }
+
     /// The learning rate of a group.
     pub fn learning_rate(&self, group: usize) -> f64 {
         self.groups.get(group).map_or(0.0, |group| group.learning_rate.double_value(&[]))

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use comic_experiment::Experiment;
 use comic_learner::algorithm::Algorithm as _;
 use comic_learner::svg0::Svg0Learner;
-use comic_networks::{Policy, RecurrentState, Routing, from_safetensors};
+use comic_networks::{Policy as _, RecurrentState, Routing, Svg0Policy, from_safetensors};
 use comic_proto::Field;
 use svg0_support::{
     ACTION, GENERATOR, LENGTH, SEQUENCES, Sequences, after_step, experiment, largest_difference, learner, spec,
@@ -87,6 +87,49 @@ fn the_target_is_a_copy_bit_for_bit_every_so_many_steps() {
 }
 
 #[test]
+fn a_step_that_is_not_finite_changes_nothing() {
+    let _guard = GENERATOR.lock().unwrap();
+    let mut experiment = experiment();
+    experiment.svg0.target_period = 2;
+    let good = Sequences::new(&experiment, SEQUENCES, 4);
+    let mut bad = good.clone();
+    bad.row(Field::Reward, 1, 4).fill(f32::NAN);
+    let [good, bad] = [good, bad].map(|sequences| sequences.tensors());
+    let mut learner = learner(&experiment);
+    learner.step(&good).unwrap();
+    let state = |learner: &Svg0Learner| {
+        let mut state: HashMap<String, Tensor> = learner.state().into_iter().collect();
+        // It decides the next step's noise.
+        state.remove("gradient_steps").unwrap();
+        state
+    };
+    let before = state(&learner);
+    // It would be the second step, after which the target is renewed.
+    assert_eq!(learner.step(&bad).unwrap().to_values().skipped, 1);
+    for (name, tensor) in state(&learner) {
+        assert_eq!(tensor, before[&name], "{name}");
+    }
+    learner.step(&good).unwrap();
+    let after = state(&learner);
+    assert_eq!(after["target_value.head.weight"], after["value.head.weight"]);
+    assert_ne!(after["value.head.weight"], before["value.head.weight"]);
+}
+
+/// A large error of the critic does not shrink the policy's step.
+#[test]
+fn critic_and_policy_are_clipped_apart() {
+    let _guard = GENERATOR.lock().unwrap();
+    let mut experiment = experiment();
+    experiment.optimiser.max_gradient_norm = 1e-3;
+    let sequences = Sequences::new(&experiment, SEQUENCES, 6);
+    let mut surprising = sequences.clone();
+    surprising.row(Field::Reward, 0, 4).fill(100.0);
+    let [one, other] = [sequences, surprising].map(|sequences| after_step(&experiment, &sequences));
+    assert!(largest_difference(&one, &other, "value.") > 1e-9);
+    assert_eq!(largest_difference(&one, &other, "policy.latent_policy"), 0.0);
+}
+
+#[test]
 fn state_and_minibatches_decide_every_later_parameter() {
     let _guard = GENERATOR.lock().unwrap();
     let experiment = experiment();
@@ -105,7 +148,7 @@ fn state_and_minibatches_decide_every_later_parameter() {
 /// The sequences as an actor with the learner's policy plays them, row by row, from a state that it has after a row before them.
 fn acted(learner: &Svg0Learner, experiment: &Experiment, mut sequences: Sequences) -> Sequences {
     let mut store = nn::VarStore::new(Device::Cpu);
-    let policy = Policy::of(&store.root(), &spec(), experiment, &[0.0; ACTION]).unwrap();
+    let policy = Svg0Policy::new(&store.root(), &spec(), experiment);
     from_safetensors(&mut store, &learner.policy_parameters().unwrap()).unwrap();
     let none = Tensor::zeros([1, 0], (Kind::Float, Device::Cpu));
     for sequence in 0..SEQUENCES {

@@ -1,6 +1,6 @@
 //! Numbers of other code: rlax's Retrace, and whole gradient steps of PyTorch's autograd.
 //!
-//! Reads every `retrace_*.npz` and `step_*.npz` of the folder that COMIC_SVG0_FIXTURES names, by default `tests/fixtures/svg0`.
+//! Reads every `retrace_*.npz`, `step_*.npz` and `resnet_*.npz` of the folder that COMIC_SVG0_FIXTURES names, by default `tests/fixtures/svg0`.
 //! `tests/python/make_svg0_fixtures.py` makes them. They were computed in float64. The error of a loss, or of a row's numbers, may
 //! be 1e-5 of the larger of 1 and the largest number of the array; that of a gradient 1e-5 of the parameter's largest entry.
 
@@ -10,21 +10,24 @@ mod fixture;
 mod svg0_support;
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
-use comic_experiment::{Experiment, TaskPart, TaskSpec, TransferAlgorithm};
+use comic_experiment::{AlgorithmName, Experiment, TaskPart, TaskSpec};
 use comic_learner::algorithm::Algorithm as _;
 use comic_learner::algorithm::shape::MinibatchShape;
 use comic_learner::svg0::{Networks, Svg0Learner, Terms, Trace, losses, noise, retrace};
-use comic_proto::{Field, PerField, UnrollShape};
+use comic_networks::{Policy as _, Routing, Svg0Policy};
+use comic_proto::{Field, UnrollLayout, UnrollShape};
+use comic_replay::Unrolls;
 use fixture::{Fixture, Folder, TOLERANCE};
 use svg0_support::{GENERATOR, Sequences};
-use tch::{Device, Kind, Tensor};
+use tch::{Device, Kind, Tensor, nn};
 
 const FOLDER: Folder = Folder {
     variable: "COMIC_SVG0_FIXTURES",
     name: "svg0",
     script: "make_svg0_fixtures.py",
-    kinds: &["retrace_", "step_"],
+    kinds: &["retrace_", "step_", "resnet_"],
 };
 
 #[test]
@@ -64,8 +67,7 @@ impl Step {
         let width = |array: &Tensor| *array.size().last().unwrap() as usize;
         let [proprioception, task, action, reward] =
             ["proprioception", "task", "action", "reward"].map(|name| fixture.array(name));
-        let part =
-            TaskPart { name: "task".into(), observation: width(&task), clips: 1, max_reward: 1.0, demonstrated: false };
+        let part = TaskPart { name: "task".into(), observation: width(&task), clips: 1, max_reward: 1.0 };
         let spec = TaskSpec {
             proprioception: width(&proprioception),
             task: width(&task),
@@ -78,9 +80,9 @@ impl Step {
         let noise = fixture.array("noise");
         let sizes = |values: Tensor| Vec::<f32>::try_from(values).unwrap().iter().map(|size| *size as usize).collect();
         let mut experiment = Experiment::default();
-        experiment.transfer.algorithm = TransferAlgorithm::Svg0;
+        experiment.algorithm = AlgorithmName::Svg0;
         experiment.transfer.mean_scale = fixture.scalar("mean_scale");
-        experiment.network.min_std = fixture.scalar("min_std");
+        experiment.svg0.min_std = fixture.scalar("min_std");
         experiment.network.normaliser_steps = 1;
         let svg0 = &mut experiment.svg0;
         (svg0.encoder, svg0.action_value) = (sizes(fixture.array("encoder")), sizes(fixture.array("action_value")));
@@ -92,25 +94,28 @@ impl Step {
         let [unrolls, length] = [0, 1].map(|dimension| action.size()[dimension] as usize);
         experiment.unroll.length = length;
         let shape = MinibatchShape { unrolls, tasks: 1, unroll: UnrollShape::new(&spec, &experiment) };
-        let floats = PerField::from_fn(|field| match field {
-            Field::Proprioception
-            | Field::Task
-            | Field::Action
-            | Field::Mean
-            | Field::Std
-            | Field::Reward
-            | Field::Valid
-            | Field::First
-            | Field::State => values(&fixture.array(field.name())),
-            Field::Discount => values(&fixture.array("discount_factor")),
-            _ => Vec::new(),
-        });
-        Self { fixture, spec, experiment, sequences: Sequences { floats, shape }, noise }
+        let mut sequences = Unrolls::new(Arc::new(UnrollLayout::new(shape.unroll)), unrolls);
+        for field in [
+            Field::Proprioception,
+            Field::Task,
+            Field::Action,
+            Field::Mean,
+            Field::Std,
+            Field::Reward,
+            Field::Discount,
+            Field::Valid,
+            Field::First,
+            Field::State,
+        ] {
+            let name = if field == Field::Discount { "discount_factor" } else { field.name() };
+            sequences.f32_mut(field).copy_from_slice(&values(&fixture.array(name)));
+        }
+        Self { fixture, spec, experiment, sequences: Sequences { unrolls: sequences, shape }, noise }
     }
 
     /// Networks with the parameters of the fixture, named there with `prefix`.
     fn networks(&mut self, prefix: &str) -> Networks {
-        let networks = Networks::new(Device::Cpu, &self.spec, &self.experiment).unwrap();
+        let networks = Networks::new(Device::Cpu, &self.spec, &self.experiment);
         for (name, parameter) in networks.entries(prefix) {
             tch::no_grad(|| parameter.shallow_clone().copy_(&self.fixture.array(&name)));
         }
@@ -118,7 +123,7 @@ impl Step {
     }
 
     fn terms(&self, online: &Networks, target: &Networks, noise: &Tensor) -> Terms {
-        losses(online, target, &self.sequences.tensors(), noise, &self.experiment.svg0).unwrap()
+        losses(online, target, &self.sequences.tensors(), noise, &self.experiment.svg0)
     }
 }
 
@@ -218,5 +223,34 @@ fn the_policys_gradient_is_the_slope_of_its_loss() {
             // Rounding gives up to 1e-4, and the third derivative as much.
             assert!((found - expected).abs() < 1e-3 * own, "a slope of {found}, not {expected}");
         }
+    }
+}
+
+/// Parameters and pixels follow from the script's formulas.
+#[test]
+fn features_of_images_equal_pytorch() {
+    for mut fixture in FOLDER.fixtures("resnet_") {
+        let size = fixture.array("features").size();
+        let spec = TaskSpec { image: 64 * 64 * 3, task: 0, ..svg0_support::spec() };
+        let mut experiment = svg0_support::experiment();
+        experiment.network.image_features = size[1] as usize;
+        let store = nn::VarStore::new(Device::Cpu);
+        let policy = Svg0Policy::new(&store.root(), &spec, &experiment);
+        let mut parameters: Vec<_> =
+            store.variables().into_iter().filter(|(name, _)| name.starts_with("image_encoder.")).collect();
+        parameters.sort_by(|one, other| one.0.cmp(&other.0));
+        for (number, (_, parameter)) in parameters.iter().enumerate() {
+            let shape = parameter.size();
+            let fan_in: i64 = shape[1..].iter().product();
+            let indices = Tensor::arange(parameter.numel() as i64, (Kind::Double, Device::Cpu)) + number as f64;
+            let entries = (indices.sin() / (fan_in as f64).sqrt()).to_kind(Kind::Float).reshape(&shape);
+            tch::no_grad(|| parameter.shallow_clone().copy_(&entries));
+        }
+        let bytes: Vec<u8> = (0..size[0] * spec.image as i64).map(|i| ((31 * i * i + 7 * i) % 251) as u8).collect();
+        let image = Tensor::from_slice(&bytes).reshape([size[0], -1]);
+        let [proprioception, task] =
+            [spec.proprioception, 0].map(|width| Tensor::zeros([size[0], width as i64], (Kind::Float, Device::Cpu)));
+        let observation = policy.normalise(&proprioception, &task, Some(&image), &Routing::single());
+        fixture.compare("features", observation.task());
     }
 }

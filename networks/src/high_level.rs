@@ -27,7 +27,7 @@ impl HighLevel {
         let torso = Torso::new(path, (spec.task + spec.proprioception) as i64 + image_features, &network.encoder);
         let start = vec![0.0; spec.action];
         let head = GaussianHead::new(path, torso.output(), &GaussianHeadConfig::of_actions(&start, network));
-        Self { torso, head, mean_scale: transfer.mean_scale }
+        Self { torso, head, mean_scale: transfer.mean_scale() }
     }
 
     /// From `[N, X+P]` to Gaussians `[N, Z]`.

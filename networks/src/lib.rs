@@ -40,6 +40,7 @@ mod normaliser;
 mod parameters;
 mod policy;
 mod prior;
+mod resnet;
 mod routing;
 mod svg0;
 mod value;

@@ -35,9 +35,18 @@ pub struct NormalisedObservation {
 }
 
 impl NormalisedObservation {
+    /// The task observation, with the features of the image at its end, `[.., X+F]`.
+    pub fn task(&self) -> &Tensor {
+        &self.task
+    }
+
     /// The first `steps` of observations `[B, T, ·]`: views `[B, steps, ·]`, no copy.
     pub fn first_steps(&self, steps: i64) -> Self {
-        self.steps(0, steps)
+        Self {
+            proprioception: self.proprioception.narrow(1, 0, steps),
+            task: self.task.narrow(1, 0, steps),
+            routing: self.routing.shallow_clone(),
+        }
     }
 
     /// Observations `[B, T, ·]`; those of one step, `[B, ·]`, become `[B, 1, ·]`.
@@ -46,15 +55,6 @@ impl NormalisedObservation {
         Self {
             proprioception: stepped(&self.proprioception),
             task: stepped(&self.task),
-            routing: self.routing.shallow_clone(),
-        }
-    }
-
-    /// So many steps of observations `[B, T, ·]`, from the step `from` on: views, no copy.
-    pub fn steps(&self, from: i64, steps: i64) -> Self {
-        Self {
-            proprioception: self.proprioception.narrow(1, from, steps),
-            task: self.task.narrow(1, from, steps),
             routing: self.routing.shallow_clone(),
         }
     }

@@ -7,11 +7,11 @@ use tch::{Tensor, nn};
 use crate::action::ActionDistribution;
 use crate::error::Error;
 use crate::gaussian::DiagonalGaussian;
-use crate::image_encoder::ImageEncoder;
 use crate::layers::{GaussianHead, GaussianHeadConfig, Torso, linear, rows};
 use crate::lstm::{LstmStack, RecurrentState};
 use crate::normaliser::{NormalisedObservation, Normaliser, NormaliserStatistics};
 use crate::policy::{self, Acting, Policy, Weights};
+use crate::resnet::ResNet;
 use crate::routing::Routing;
 use crate::weights::{hidden, image_features};
 
@@ -20,7 +20,7 @@ use crate::weights::{hidden, image_features};
 #[derive(Debug)]
 pub struct Svg0Policy {
     normaliser: Normaliser,
-    image_encoder: Option<ImageEncoder>,
+    image_encoder: Option<ResNet>,
     core: Core,
     policy: LatentPolicy,
 }
@@ -30,10 +30,10 @@ impl Svg0Policy {
     pub fn new(store: &nn::Path, spec: &TaskSpec, experiment: &Experiment) -> Self {
         let Experiment { network, svg0, transfer, .. } = experiment;
         let features = network.image_features as i64;
-        let image_encoder = (spec.image > 0).then(|| ImageEncoder::new(&(store / "image_encoder"), features));
+        let image_encoder = (spec.image > 0).then(|| ResNet::new(&(store / "image_encoder"), features));
         Self {
             normaliser: Normaliser::new(&(store / "normaliser"), spec, network.normaliser_steps > 0),
-            core: Core::new(&(store / "core"), spec, image_encoder.as_ref().map_or(0, ImageEncoder::output), svg0),
+            core: Core::new(&(store / "core"), spec, image_encoder.as_ref().map_or(0, ResNet::output), svg0),
             image_encoder,
             policy: LatentPolicy::new(&(store / "latent_policy"), spec, network, svg0, transfer),
         }
@@ -173,8 +173,13 @@ impl LatentPolicy {
     pub(crate) fn new(path: &nn::Path, spec: &TaskSpec, network: &Network, sizes: &Svg0, transfer: &Transfer) -> Self {
         let lstm = LstmStack::new(path, sizes.core as i64, &[sizes.policy]);
         let start = vec![0.0; spec.action];
-        let head = GaussianHead::new(path, lstm.output(), &GaussianHeadConfig::of_actions(&start, network));
-        Self { lstm, head, mean_scale: transfer.mean_scale }
+        let config = GaussianHeadConfig {
+            initial_std: sizes.initial_std,
+            min_std: sizes.min_std,
+            ..GaussianHeadConfig::of_actions(&start, network)
+        };
+        let head = GaussianHead::new(path, lstm.output(), &config);
+        Self { lstm, head, mean_scale: transfer.mean_scale() }
     }
 
     /// The distribution of actions, over `[B·T, Z]`, for features `[B, T, H]`, and the state after the last row, `[B, S]`.

@@ -18,6 +18,8 @@ densities and divergences torch.distributions', targets rlax's):
     target, trace, taken [B n]     Q^ret, c, and Q of the actions taken
     value_loss, policy_loss, entropy_mean, kl_mean
     grad.policy.NAME, grad.value.NAME      of value_loss + policy_loss
+`resnet_*.npz`, the residual network of images, whose parameters and pixels are given by formulas (see `resnet`):
+    features [N, F]
 
 What rlax says is checked here against the definition of Retrace as a sum before it is written.
 """
@@ -380,6 +382,43 @@ def step(random, case):
     return fields | stored | inputs | outputs | {f"grad.{name}": g.numpy() for name, g in zip(learned, gradients)}
 
 
+# ---------------------------------------------------------------------------------------------------------- images
+
+
+def resnet(images=2, features=8, channels=(16, 32, 32), size=64):
+    """IMPALA's residual network. Entry i of parameter number k, in the order of the names, is sin(i + k) / sqrt(fan-in); byte i
+    of the images is (31 i^2 + 7 i) mod 251."""
+    shapes = {"output.weight": (features, channels[-1] * (size // 8) ** 2), "output.bias": (features,)}
+    before = 3
+    for section, width in enumerate(channels):
+        convolutions = {"convolution": before} | {f"blocks.{b}.{l}": width for b in (0, 1) for l in (0, 1)}
+        for name, inputs in convolutions.items():
+            shapes[f"sections.{section}.{name}.weight"] = (width, inputs, 3, 3)
+            shapes[f"sections.{section}.{name}.bias"] = (width,)
+        before = width
+    parameters = {}
+    for number, name in enumerate(sorted(shapes)):
+        shape = shapes[name]
+        fan_in = np.prod(shape[1:]) if len(shape) > 1 else 1.0
+        entries = np.sin(np.arange(np.prod(shape)) + number) / np.sqrt(fan_in)
+        parameters[name] = torch.from_numpy(entries.astype(np.float32).astype(np.float64).reshape(shape))
+
+    index = np.arange(images * size * size * 3, dtype=np.int64)
+    pixels = torch.from_numpy(((31 * index * index + 7 * index) % 251).astype(np.float64))
+    x = pixels.reshape(images, size, size, 3).permute(0, 3, 1, 2) / 255.0 - 0.5
+
+    def convolve(x, name):
+        return functional.conv2d(x, parameters[f"{name}.weight"], parameters[f"{name}.bias"], padding="same")
+
+    for section in range(len(channels)):
+        x = functional.max_pool2d(convolve(x, f"sections.{section}.convolution"), 3, stride=2, padding=1)
+        for block in (0, 1):
+            inner = convolve(functional.relu(x), f"sections.{section}.blocks.{block}.0")
+            x = x + convolve(functional.relu(inner), f"sections.{section}.blocks.{block}.1")
+    x = functional.relu(x).flatten(1)
+    return {"features": functional.relu(functional.linear(x, parameters["output.weight"], parameters["output.bias"])).numpy()}
+
+
 # ------------------------------------------------------------------------------------------------------------ main
 
 
@@ -394,6 +433,7 @@ def main():
     cases = [
         *((f"retrace_{name}", lambda random, case=case: retrace_case(random, *case)) for name, case in RETRACE.items()),
         *((f"step_{name}", lambda random, case=case: step(random, case)) for name, case in STEPS.items()),
+        ("resnet_small", lambda random: resnet()),
     ]
     streams = np.random.SeedSequence(arguments.seed).spawn(len(cases))
     for (name, make), stream in zip(cases, streams):

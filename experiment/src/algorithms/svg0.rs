@@ -32,6 +32,10 @@ pub struct Svg0 {
     pub core: usize,
     /// Units of the policy's LSTM (S).
     pub policy: usize,
+    /// The policy's standard deviation before learning (N).
+    pub initial_std: f64,
+    /// Its smallest standard deviation (N; A: 0.1).
+    pub min_std: f64,
     /// Hidden sizes of the action value (S: one layer of 256).
     pub action_value: Vec<usize>,
     /// Gradient steps from one published version of the parameters to the next (N; A: an actor asks for new ones at least every
@@ -53,6 +57,8 @@ impl Default for Svg0 {
             encoder: vec![256],
             core: 128,
             policy: 128,
+            initial_std: 0.7,
+            min_std: 0.3,
             action_value: vec![256],
             publish_period: 10,
         }
@@ -60,14 +66,16 @@ impl Default for Svg0 {
 }
 
 /// What SVG(0) does not read: it has networks of its own.
-const UNREAD: [&str; 9] = [
+const UNREAD: [&str; 11] = [
     "joint",
     "network.encoder",
     "network.encoder_linear_path",
     "network.value",
     "network.value_lstm",
     "network.clip_embedding",
+    "network.initial_std",
     "network.final_std",
+    "network.min_std",
     "network.initial_pose",
     "optimiser.multiplier_learning_rate",
 ];
@@ -96,6 +104,9 @@ impl AlgorithmParameters for Svg0 {
         for (field, units) in [("svg0.core", core), ("svg0.policy", policy)] {
             ensure(field, units, (1..=16384).contains(units), "must be 1 to 16384 units")?;
         }
+        ensure("svg0.min_std", self.min_std, (1e-6..=1e3).contains(&self.min_std), "must be 1e-6 to 1000")?;
+        let std = self.initial_std;
+        ensure("svg0.initial_std", std, std > self.min_std && std <= 1e3, "must exceed svg0.min_std, at most 1000")?;
         rest.replay.check(rest.unroll.length, sequences)
     }
 

@@ -1,23 +1,22 @@
 //! Online and target networks, stepped together.
 
 use comic_experiment::{Experiment, TaskSpec};
-use comic_networks::{NormaliserStatistics, to_safetensors};
-use comic_proto::UnrollShape;
+use comic_networks::{NormaliserStatistics, Policy as _, to_safetensors};
 use tch::{Device, Kind, Tensor};
 
 use crate::adam::{self, Adam};
-use crate::algorithm::Algorithm;
+use crate::algorithm::descent::{Gradients, descend};
 use crate::algorithm::error::Error;
 use crate::algorithm::loss_report::Losses;
 use crate::algorithm::masked_mean::masked_mean;
 use crate::algorithm::minibatch::MinibatchTensors;
-use crate::algorithm::shape::MinibatchShape;
+use crate::algorithm::{Algorithm, made_on};
 use crate::svg0::losses::{Networks, losses, noise};
 
 /// Online and target networks, and Adam.
 ///
-/// The noise of a gradient step depends on the experiment's seed and on the number of steps so far. So state and minibatches
-/// decide every later parameter.
+/// The noise of a gradient step depends on the experiment's seed and on the number of steps so far, those that were skipped
+/// included. So state and minibatches decide every later parameter.
 #[derive(Debug)]
 pub struct Svg0Learner {
     spec: TaskSpec,
@@ -25,8 +24,11 @@ pub struct Svg0Learner {
     online: Networks,
     target: Networks,
     adam: Adam,
-    group: usize,
-    /// Gradient steps so far.
+    /// What the critic trains: image encoder, core and action value.
+    critic: usize,
+    /// The policy on the core's features.
+    policy: usize,
+    /// Gradient steps so far, those that were skipped included. The device counts those that were taken.
     steps: u64,
 }
 
@@ -37,34 +39,21 @@ impl Svg0Learner {
     /// # Errors
     /// [`Error::Networks`] when the networks cannot be made.
     pub fn new(spec: &TaskSpec, experiment: &Experiment, device: Device) -> Result<Self, Error> {
-        let host = Self::made_on(Device::Cpu, spec, experiment)?;
-        if device == Device::Cpu {
-            return Ok(host);
-        }
-        let mut learner = Self::made_on(device, spec, experiment)?;
-        learner.load_state(&host.state())?;
-        Ok(learner)
+        made_on(device, |device| Ok(Self::make(device, spec, experiment)))
     }
 
-    fn made_on(device: Device, spec: &TaskSpec, experiment: &Experiment) -> Result<Self, Error> {
-        let online = Networks::new(device, spec, experiment)?;
-        let mut target = Networks::new(device, spec, experiment)?;
-        target.copy_from(&online);
+    fn make(device: Device, spec: &TaskSpec, experiment: &Experiment) -> Self {
+        let online = Networks::new(device, spec, experiment);
+        let mut target = Networks::new(device, spec, experiment);
+        target.copy_from(&online, &Tensor::from(true).to_device(device));
         target.freeze();
         let mut adam = Adam::new(&experiment.optimiser);
-        let group = adam.add_group("networks", online.trainable(), experiment.svg0.learning_rate);
-        Ok(Self { spec: spec.clone(), experiment: experiment.clone(), online, target, adam, group, steps: 0 })
-    }
-
-    fn check(&self, minibatch: &MinibatchTensors) -> Result<(), Error> {
-        let found = minibatch.shape();
-        let unroll = UnrollShape { length: found.unroll.length, ..UnrollShape::new(&self.spec, &self.experiment) };
-        let expected = MinibatchShape { unrolls: found.unrolls, tasks: self.spec.tasks.len(), unroll };
-        if found == expected {
-            return Ok(());
-        }
-        let (clips, known) = (minibatch.clips(), self.spec.clips.len());
-        Err(Error::Shape { expected: Box::new(expected), found: Box::new(found), clips, known })
+        let (policy, critic) =
+            online.trainable().into_iter().partition(|(name, _)| name.starts_with("policy.latent_policy."));
+        let rate = experiment.optimiser.learning_rate;
+        let [critic, policy] =
+            [("critic", critic), ("policy", policy)].map(|(name, parameters)| adam.add_group(name, parameters, rate));
+        Self { spec: spec.clone(), experiment: experiment.clone(), online, target, adam, critic, policy, steps: 0 }
     }
 
     fn entries(&self) -> Vec<(String, Tensor)> {
@@ -80,29 +69,26 @@ const STEPS: &str = "gradient_steps";
 
 impl Algorithm for Svg0Learner {
     fn step(&mut self, minibatch: &MinibatchTensors) -> Result<Losses, Error> {
-        self.check(minibatch)?;
-        let noise = noise(self.experiment.seed, self.steps, minibatch, &self.experiment.svg0);
-        let terms = losses(&self.online, &self.target, minibatch, &noise, &self.experiment.svg0)?;
+        minibatch.check(&self.spec, &self.experiment)?;
+        let Experiment { seed, svg0, optimiser, .. } = &self.experiment;
+        let noise = noise(*seed, self.steps, minibatch, svg0);
+        let terms = losses(&self.online, &self.target, minibatch, &noise, svg0);
         let total = terms.total();
-
-        let mut gradients = Tensor::f_run_backward(&[&total], self.adam.parameters(self.group), false, false)?;
-        for (gradient, parameter) in gradients.iter_mut().zip(self.adam.parameters(self.group)) {
-            // A parameter that the loss does not depend on has no gradient tensor.
-            if !gradient.defined() {
-                *gradient = parameter.detach().zeros_like();
-            }
-        }
-        let norm = adam::global_norm(&gradients);
-        let finite = (total.detach() + norm.square()).isfinite().all();
-        let limit = self.experiment.optimiser.max_gradient_norm;
-        if limit > 0.0 {
-            adam::clip_by_global_norm(&mut gradients, &norm, limit);
-        }
-        self.adam.step(self.group, &gradients, &finite);
+        let [critic, policy] = [self.critic, self.policy].map(|group| self.adam.parameters(group));
+        let parameters: Vec<&Tensor> = critic.iter().chain(policy).collect();
+        let mut critic_gradients = Tensor::f_run_backward(&[&total], &parameters, false, false)?;
+        let policy_gradients = critic_gradients.split_off(critic.len());
+        // Each has its own limit: a large error of the critic does not slow down the policy.
+        let critic = Gradients::new(&self.adam, self.critic, critic_gradients);
+        let policy = Gradients::new(&self.adam, self.policy, policy_gradients);
+        let norms = [critic.norm(), policy.norm()];
+        let limit = optimiser.max_gradient_norm;
+        let period = svg0.target_period as i64;
+        let finite = descend(&mut self.adam, &total, &[critic.clipped(limit), policy.clipped(limit)]);
         self.steps += 1;
-        if self.steps.is_multiple_of(self.experiment.svg0.target_period) {
-            self.target.copy_from(&self.online);
-        }
+        // On the device, so that nothing waits for it: the steps that were taken decide.
+        let due = self.adam.steps(self.critic).remainder(period).eq(0).logical_and(&finite);
+        self.target.copy_from(&self.online, &due);
         let named = [
             ("total_loss", &total),
             ("value_loss", &terms.value_loss),
@@ -113,15 +99,12 @@ impl Algorithm for Svg0Learner {
             ("entropy", &terms.entropy),
             ("latent_kl", &terms.latent_kl),
             ("policy_std", &terms.std.mean(Kind::Float)),
-            ("gradient_norm", &norm),
+            ("critic_gradient_norm", &norms[0]),
+            ("policy_gradient_norm", &norms[1]),
             ("valid_share", &terms.valid.mean(Kind::Float)),
         ];
         let none = Tensor::zeros([0], (Kind::Float, total.device()));
         Ok(Losses::pack(named, &none, &finite))
-    }
-
-    fn regress(&mut self, _minibatch: &MinibatchTensors) -> Result<(Losses, Tensor), Error> {
-        Err(Error::Unsupported("SVG(0) has no warm start"))
     }
 
     fn set_normaliser(&mut self, statistics: &NormaliserStatistics) -> Result<(), Error> {
@@ -129,26 +112,31 @@ impl Algorithm for Svg0Learner {
         Ok(self.target.policy.set_normaliser(statistics)?)
     }
 
-    fn publish_period(&self) -> u64 {
-        1
+    /// Where a multiple of the period lies within the update's gradient steps.
+    fn publishes_after(&self, _: u64, steps: u64) -> bool {
+        let period = self.experiment.svg0.publish_period;
+        self.steps / period > self.steps.saturating_sub(steps) / period
     }
 
     fn set_progress(&mut self, used: f64) {
         let share = self.experiment.optimiser.final_learning_rate_share;
-        self.set_learning_rate(self.experiment.svg0.learning_rate * (1.0 - (1.0 - share) * used.clamp(0.0, 1.0)));
-    }
-
-    fn set_learning_rate(&mut self, rate: f64) {
-        self.adam.set_learning_rate(self.group, rate);
-    }
-
-    fn reset_optimiser(&mut self) {
-        self.adam.reset();
+        let rate = self.experiment.optimiser.learning_rate * (1.0 - (1.0 - share) * used.clamp(0.0, 1.0));
+        for group in [self.critic, self.policy] {
+            self.adam.set_learning_rate(group, rate);
+        }
     }
 
     fn is_finite(&self) -> bool {
-        let parameters: Vec<Tensor> = self.adam.parameters(self.group).iter().map(Tensor::detach).collect();
+        let parameters: Vec<Tensor> = self.online.trainable().iter().map(|(_, tensor)| tensor.detach()).collect();
         adam::global_norm(&parameters).double_value(&[]).is_finite()
+    }
+
+    fn parameter_counts(&self) -> Vec<(String, usize)> {
+        self.online.trainable().into_iter().map(|(name, tensor)| (name, tensor.numel())).collect()
+    }
+
+    fn remedies(&self) -> &'static str {
+        "a lower optimiser.learning_rate, a larger svg0.target_period, and an optimiser.max_gradient_norm"
     }
 
     fn policy_parameters(&self) -> Result<Vec<u8>, Error> {

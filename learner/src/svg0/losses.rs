@@ -1,13 +1,10 @@
 //! One forward pass of the online and the target networks, and the losses: a pure function of networks, minibatch and noise.
 
 use comic_experiment::{Experiment, Svg0, TaskSpec};
-use comic_networks::{
-    ActionValue, Core, DiagonalGaussian, LatentPolicy, NormalisedObservation, Policy, RecurrentState,
-};
+use comic_networks::{ActionValue, DiagonalGaussian, NormalisedObservation, Policy as _, RecurrentState, Svg0Policy};
 use comic_proto::Field;
 use tch::{Device, Kind, Tensor, nn};
 
-use crate::algorithm::error::Error;
 use crate::algorithm::masked_mean::masked_mean;
 use crate::algorithm::minibatch::MinibatchTensors;
 use crate::algorithm::stores::{named, trainable};
@@ -18,7 +15,7 @@ use crate::svg0::retrace::{Trace, retrace};
 pub struct Networks {
     pub(super) policy_store: nn::VarStore,
     value_store: nn::VarStore,
-    pub(super) policy: Policy,
+    pub(super) policy: Svg0Policy,
     action_value: ActionValue,
 }
 
@@ -33,14 +30,11 @@ struct Pass {
 
 impl Networks {
     /// New networks on `device`.
-    ///
-    /// # Errors
-    /// [`Error::Networks`] when the networks cannot be made.
-    pub fn new(device: Device, spec: &TaskSpec, experiment: &Experiment) -> Result<Self, Error> {
+    pub fn new(device: Device, spec: &TaskSpec, experiment: &Experiment) -> Self {
         let (policy_store, value_store) = (nn::VarStore::new(device), nn::VarStore::new(device));
-        let policy = Policy::of(&policy_store.root(), spec, experiment, &vec![0.0; spec.action])?;
+        let policy = Svg0Policy::new(&policy_store.root(), spec, experiment);
         let action_value = ActionValue::new(&value_store.root(), spec, &experiment.svg0);
-        Ok(Self { policy_store, value_store, policy, action_value })
+        Self { policy_store, value_store, policy, action_value }
     }
 
     /// Every parameter, by name.
@@ -63,24 +57,18 @@ impl Networks {
         self.value_store.freeze();
     }
 
-    /// Takes the parameters of `other`.
-    pub(super) fn copy_from(&self, other: &Self) {
+    /// Takes the parameters of `other` where `taken`, a boolean scalar on the device, is true.
+    pub(super) fn copy_from(&self, other: &Self, taken: &Tensor) {
         tch::no_grad(|| {
             for ((_, own), (_, other)) in self.entries("").into_iter().zip(other.entries("")) {
-                own.shallow_clone().copy_(&other);
+                own.shallow_clone().copy_(&other.where_self(taken, &own));
             }
         });
     }
 
-    fn parts(&self) -> Result<(&Core, &LatentPolicy), Error> {
-        self.policy.recurrent().ok_or(Error::Unsupported("SVG(0) needs a recurrent policy"))
-    }
-
     /// The networks from row `burn_in` on. The rows before it only build up the recurrent states, without gradient.
-    fn pass(&self, minibatch: &MinibatchTensors, burn_in: i64) -> Result<Pass, Error> {
-        let (core, policy) = self.parts()?;
-        let (proprioception, task) = (&minibatch[Field::Proprioception], &minibatch[Field::Task]);
-        let observation = self.policy.normalise(proprioception, task, minibatch.image(), minibatch.routing());
+    fn pass(&self, minibatch: &MinibatchTensors, burn_in: i64) -> Pass {
+        let (core, policy) = (self.policy.core(), self.policy.latent_policy());
         let (first, state) = (&minibatch[Field::First], &minibatch[Field::State]);
         let own = core.state_size();
         let mut states = [state.narrow(1, 0, own), state.narrow(1, own, policy.state_size())];
@@ -88,20 +76,26 @@ impl Networks {
             states = tch::no_grad(|| {
                 let first = first.narrow(1, 0, burn_in);
                 let recurrent = RecurrentState { state: &states[0], first: Some(&first) };
-                let (features, core_state) = core.forward(&observation.steps(0, burn_in), recurrent);
+                let (features, core_state) = core.forward(&self.observation(minibatch, 0, burn_in), recurrent);
                 let recurrent = RecurrentState { state: &states[1], first: Some(&first) };
                 [core_state, policy.forward(&features, recurrent).1]
             });
         }
         let rows = first.size()[1] - burn_in;
         let first = first.narrow(1, burn_in, rows);
-        let observation: NormalisedObservation = observation.steps(burn_in, rows);
         let recurrent = RecurrentState { state: &states[0], first: Some(&first) };
-        let (features, _) = core.forward(&observation, recurrent);
+        let (features, _) = core.forward(&self.observation(minibatch, burn_in, rows), recurrent);
         // The critic alone trains the core.
         let recurrent = RecurrentState { state: &states[1], first: Some(&first) };
         let (policy, _) = policy.forward(&features.detach(), recurrent);
-        Ok(Pass { features, policy })
+        Pass { features, policy }
+    }
+
+    /// The normalised observations of `rows` rows from `start` on, images encoded.
+    fn observation(&self, minibatch: &MinibatchTensors, start: i64, rows: i64) -> NormalisedObservation {
+        let of = |tensor: &Tensor| tensor.narrow(1, start, rows);
+        let [proprioception, task] = [Field::Proprioception, Field::Task].map(|field| of(&minibatch[field]));
+        self.policy.normalise(&proprioception, &task, minibatch.image().map(of).as_ref(), minibatch.routing())
     }
 
     /// The mean over J samples of Q, `[N]`, for features `[N, H]` and actions μ + σ ε^j with noise `[J, N, Z]`.
@@ -155,16 +149,13 @@ pub fn noise(seed: u64, step: u64, minibatch: &MinibatchTensors, config: &Svg0) 
 }
 
 /// The losses of `minibatch` with the standard-normal numbers of [`noise`].
-///
-/// # Errors
-/// [`Error::Unsupported`] when the networks are not SVG(0)'s.
 pub fn losses(
     online: &Networks,
     target: &Networks,
     minibatch: &MinibatchTensors,
     noise: &Tensor,
     config: &Svg0,
-) -> Result<Terms, Error> {
+) -> Terms {
     let Svg0 { discount, lambda, entropy, kl, burn_in, .. } = *config;
     let burn_in = burn_in as i64;
     let [unrolls, length] = [minibatch.shape().unrolls, minibatch.shape().unroll.length].map(|size| size as i64);
@@ -177,10 +168,10 @@ pub fn losses(
     // From [B·(n+1), ·] to [B·n, ·]: without the observation after the last step.
     let without_last = |tensor: &Tensor| tensor.unflatten(0, [unrolls, rows]).narrow(1, 0, steps).flatten(0, 1);
 
-    let pass = online.pass(minibatch, burn_in)?;
+    let pass = online.pass(minibatch, burn_in);
     let divergence = pass.policy.kl_to_standard_normal();
     let (targets, trace, target_features) = tch::no_grad(|| {
-        let pass = target.pass(minibatch, burn_in)?;
+        let pass = target.pass(minibatch, burn_in);
         let features = pass.features.flatten(0, 1);
         let value = target.expected_action_value(&features, &pass.policy, &noise.select(0, 0));
         let value = (value - divergence.detach() * kl).reshape([unrolls, rows]);
@@ -196,8 +187,8 @@ pub fn losses(
             coefficient: &coefficient,
             valid: &valid,
         });
-        Ok::<_, Error>((targets.flatten(0, 1), coefficient.flatten(0, 1), features))
-    })?;
+        (targets.flatten(0, 1), coefficient.flatten(0, 1), features)
+    });
 
     let mask = valid.flatten(0, 1);
     let action_value = online.action_value.forward(&without_last(&pass.features.flatten(0, 1)), &action);
@@ -209,7 +200,7 @@ pub fn losses(
     let (gain, spread) = (masked_mean(&gain, &mask), masked_mean(&policy.entropy(), &mask));
     let divergence = masked_mean(&without_last(&divergence.unsqueeze(1)).squeeze_dim(1), &mask);
     let policy_loss = &divergence * kl - &gain - &spread * entropy;
-    Ok(Terms {
+    Terms {
         value_loss,
         policy_loss,
         entropy: spread,
@@ -219,5 +210,5 @@ pub fn losses(
         trace,
         std: policy.std,
         valid: mask,
-    })
+    }
 }
