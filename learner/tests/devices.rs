@@ -7,13 +7,12 @@ mod vmpo_support;
 
 use std::sync::OnceLock;
 
-use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
-use comic_learner::algorithm::Algorithm as _;
+use comic_experiment::{AlgorithmName, DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
+use comic_learner::algorithm::Algorithm;
 use comic_learner::algorithm::loss_report::{LossValues, Losses};
 use comic_learner::device::Backend;
-use comic_learner::vmpo::VmpoLearner;
 use tch::Device;
-use vmpo_support::{Unrolls, every_low_level, joint_spec, learner_on, spec, state};
+use vmpo_support::{GENERATOR, Unrolls, algorithm_on, every_low_level, experiment, joint_spec, spec, state};
 
 const COUNT: usize = 12;
 const BATCHES: u64 = 30;
@@ -29,7 +28,7 @@ fn backend() -> &'static Backend {
     })
 }
 
-/// Every low level with one task, and two tasks over the first of them and over the recurrent one.
+/// V-MPO for every low level with one task, and two tasks over the first of them and over the recurrent one; and SVG(0).
 fn experiments() -> Vec<(String, Experiment, TaskSpec)> {
     let of = |mut experiment: Experiment, spec: TaskSpec| {
         // Adam as it is used, so that thirty steps do not run away.
@@ -37,25 +36,40 @@ fn experiments() -> Vec<(String, Experiment, TaskSpec)> {
         experiment.optimiser.learning_rate = 1e-3;
         experiment.optimiser.multiplier_learning_rate = 1e-3;
         experiment.optimiser.max_gradient_norm = 0.5;
+        experiment.optimiser.final_learning_rate_share = 0.3;
         experiment.network.normaliser_steps = 1;
         if experiment.network.low_level == LowLevelName::Lstm && spec.tasks.len() == 1 {
             experiment.network.value_lstm = vec![6];
             experiment.vmpo.value_burn_in = 2;
         }
-        (format!("{} with {} tasks", experiment.network.low_level, spec.tasks.len()), experiment, spec)
+        let (algorithm, low_level) = (experiment.algorithm, experiment.network.low_level);
+        (format!("{algorithm}, {low_level} with {} tasks", spec.tasks.len()), experiment, spec)
     };
     let alone = every_low_level().into_iter().map(|experiment| of(experiment, spec()));
     let joint = every_low_level().into_iter().take(2).map(|experiment| of(experiment, joint_spec()));
-    alone.chain(joint).collect()
+    alone.chain(joint).chain([of(svg0(), spec())]).collect()
 }
 
-fn step(learner: &mut VmpoLearner, unrolls: &Unrolls) -> LossValues {
+/// Small networks of SVG(0), whose targets are copied in every second step.
+fn svg0() -> Experiment {
+    let mut experiment = Experiment { algorithm: AlgorithmName::Svg0, ..experiment() };
+    let svg0 = &mut experiment.svg0;
+    (svg0.encoder, svg0.action_value) = (vec![8], vec![16]);
+    (svg0.core, svg0.policy, svg0.burn_in, svg0.action_samples) = (6, 5, 2, 4);
+    svg0.target_period = 2;
+    experiment
+}
+
+fn step(learner: &mut dyn Algorithm, device: Device, unrolls: &Unrolls) -> LossValues {
     // In another order, as for one of several gradient steps on a batch.
     let order: Vec<usize> = (0..COUNT).rev().collect();
-    let minibatch = unrolls.minibatch_on(learner.device()).select(&order);
+    let minibatch = unrolls.minibatch_on(device).select(&order);
+    // A step of SVG(0) seeds the generator.
+    let guard = GENERATOR.lock().unwrap();
     let losses = [learner.step(&minibatch).unwrap()];
+    drop(guard);
     drop(minibatch);
-    if learner.device() != Device::Cpu {
+    if device != Device::Cpu {
         backend().end_step().unwrap();
     }
     Losses::mean(&losses).unwrap().to_values()
@@ -63,7 +77,7 @@ fn step(learner: &mut VmpoLearner, unrolls: &Unrolls) -> LossValues {
 
 /// The largest difference between the tensors of two learners whose names begin with `prefix`, relative to the largest number
 /// of the same tensor or to `floor`.
-fn distance(left: &VmpoLearner, right: &VmpoLearner, prefix: &str, floor: f64) -> (f64, String) {
+fn distance(left: &dyn Algorithm, right: &dyn Algorithm, prefix: &str, floor: f64) -> (f64, String) {
     let mut worst = (0.0, String::new());
     for ((name, left), (_, right)) in state(left).into_iter().zip(state(right)) {
         let scale = left.iter().fold(floor, |scale: f64, value| scale.max(value.abs()));
@@ -79,13 +93,14 @@ fn distance(left: &VmpoLearner, right: &VmpoLearner, prefix: &str, floor: f64) -
 }
 
 #[test]
-fn the_first_update_and_the_thirtieth_equal_the_cpus_for_every_low_level() {
+fn the_first_update_and_the_thirtieth_equal_the_cpus_for_every_experiment() {
+    let device = backend().device();
     for (name, experiment, spec) in experiments() {
-        let mut host = learner_on(Device::Cpu, &spec, &experiment, 3);
-        let mut there = learner_on(backend().device(), &spec, &experiment, 3);
+        let mut host = algorithm_on(Device::Cpu, &spec, &experiment, 3);
+        let mut there = algorithm_on(device, &spec, &experiment, 3);
         for seed in 0..BATCHES {
             let unrolls = Unrolls::recorded(&experiment, &spec, seed, COUNT);
-            let (expected, found) = (step(&mut host, &unrolls), step(&mut there, &unrolls));
+            let (expected, found) = (step(&mut *host, Device::Cpu, &unrolls), step(&mut *there, device, &unrolls));
             if seed > 0 {
                 continue;
             }
@@ -94,29 +109,30 @@ fn the_first_update_and_the_thirtieth_equal_the_cpus_for_every_low_level() {
                 assert!(difference <= 1e-5 * f64::from(expected.abs()).max(1.0), "{name}: {entry} {expected} {found}");
             }
             // The mean of one gradient is a tenth of that gradient.
-            let (worst, of) = distance(&host, &there, "adam.first.", 1e-6);
+            let (worst, of) = distance(&*host, &*there, "adam.first.", 1e-6);
             assert!(worst <= 1e-5, "{name}: the gradient of {of} differs by {worst:e}");
         }
-        let (worst, of) = distance(&host, &there, "", 1e-3);
+        let (worst, of) = distance(&*host, &*there, "", 1e-3);
         assert!(worst <= 1e-4, "{name}: {of} differs by {worst:e} after {BATCHES} updates");
     }
 }
 
 #[test]
 fn a_state_saved_on_one_device_is_restored_on_the_other() {
+    let device = backend().device();
     for (name, experiment, spec) in experiments() {
         let unrolls = |seed| Unrolls::recorded(&experiment, &spec, seed, COUNT);
-        let mut host = learner_on(Device::Cpu, &spec, &experiment, 4);
-        let mut there = learner_on(backend().device(), &spec, &experiment, 5);
-        step(&mut host, &unrolls(0));
+        let mut host = algorithm_on(Device::Cpu, &spec, &experiment, 4);
+        let mut there = algorithm_on(device, &spec, &experiment, 5);
+        step(&mut *host, Device::Cpu, &unrolls(0));
         there.load_state(&host.state()).unwrap();
-        assert_eq!(state(&host), state(&there), "{name}: taken over");
-        step(&mut there, &unrolls(1));
-        let mut back = learner_on(Device::Cpu, &spec, &experiment, 6);
+        assert_eq!(state(&*host), state(&*there), "{name}: taken over");
+        step(&mut *there, device, &unrolls(1));
+        let mut back = algorithm_on(Device::Cpu, &spec, &experiment, 6);
         back.load_state(&there.state()).unwrap();
-        assert_eq!(state(&back), state(&there), "{name}: and back");
-        step(&mut host, &unrolls(1));
-        let (worst, of) = distance(&host, &back, "", 1e-3);
+        assert_eq!(state(&*back), state(&*there), "{name}: and back");
+        step(&mut *host, Device::Cpu, &unrolls(1));
+        let (worst, of) = distance(&*host, &*back, "", 1e-3);
         assert!(worst <= 1e-4, "{name}: {of} differs by {worst:e}");
     }
 }
@@ -124,16 +140,17 @@ fn a_state_saved_on_one_device_is_restored_on_the_other() {
 #[cfg(feature = "xla")]
 #[test]
 fn whatever_the_mix_of_tasks_and_ends_nothing_is_compiled_twice() {
+    let device = backend().device();
     for (name, experiment, spec) in experiments() {
-        let mut learner = learner_on(backend().device(), &spec, &experiment, 7);
+        let mut learner = algorithm_on(device, &spec, &experiment, 7);
         let mut after_warm_up = 0;
         for seed in 0..if spec.tasks.len() > 1 { 200 } else { 20 } {
             if seed == 3 {
                 after_warm_up = backend().compilations().unwrap();
             }
             // A value that a schedule changes must not be a constant of a program.
-            learner.set_learning_rates(1e-3 * (1.0 - f64::from(seed) / 300.0), 1e-3);
-            let losses = step(&mut learner, &Unrolls::recorded(&experiment, &spec, 1000 + seed as u64, COUNT));
+            learner.set_progress(f64::from(seed) / 300.0);
+            let losses = step(&mut *learner, device, &Unrolls::recorded(&experiment, &spec, 1000 + seed as u64, COUNT));
             assert!(losses.is_finite(), "{name}");
         }
         assert_eq!(backend().compilations().unwrap(), after_warm_up, "{name}: compiled after the warm-up");
@@ -147,9 +164,10 @@ fn no_other_thread_runs_backward_passes() {
     std::thread::scope(|scope| {
         let trains = || {
             backend().train_here().unwrap();
-            let mut learner = learner_on(backend().device(), &spec, &experiment, 9);
+            let device = backend().device();
+            let mut learner = algorithm_on(device, &spec, &experiment, 9);
             for seed in 0..10 {
-                step(&mut learner, &Unrolls::recorded(&experiment, &spec, seed, COUNT));
+                step(&mut *learner, device, &Unrolls::recorded(&experiment, &spec, seed, COUNT));
             }
         };
         // Opened by this thread.

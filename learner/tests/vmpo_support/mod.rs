@@ -4,9 +4,10 @@
 use std::sync::Arc;
 
 use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives, TaskPart, TaskSpec};
-use comic_learner::algorithm::Algorithm as _;
 use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::algorithm::shape::MinibatchShape;
+use comic_learner::algorithm::{Algorithm, Parts};
+use comic_learner::algorithms;
 use comic_learner::vmpo::VmpoLearner;
 use comic_networks::{Acting, Policy as _, RecurrentState, Routing};
 use comic_proto::{Field, UnrollLayout, UnrollShape};
@@ -14,6 +15,8 @@ use tch::{Device, Kind, Tensor};
 
 pub(crate) const UNROLLS: usize = 6;
 pub(crate) const LENGTH: usize = 8;
+/// Where the policy's mean starts.
+const POSE: [f32; WIDTHS.action] = [0.1, -0.2, 0.3];
 const WIDTHS: Widths = Widths { proprioception: 5, task: 4, action: 3, latent: 2, reward_terms: 2 };
 
 struct Widths {
@@ -74,22 +77,27 @@ pub(crate) fn every_low_level() -> Vec<Experiment> {
 }
 
 /// The whole process shares libtorch's generator, so tests that seed it take turns.
-static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
+pub(crate) static GENERATOR: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
 pub(crate) fn learner(experiment: &Experiment, seed: i64) -> VmpoLearner {
     learner_of(&spec(), experiment, seed)
 }
 
 pub(crate) fn learner_of(spec: &TaskSpec, experiment: &Experiment, seed: i64) -> VmpoLearner {
-    learner_on(Device::Cpu, spec, experiment, seed)
+    seeded(seed, || VmpoLearner::new(spec, experiment, &POSE, Device::Cpu).unwrap())
 }
 
-pub(crate) fn learner_on(device: Device, spec: &TaskSpec, experiment: &Experiment, seed: i64) -> VmpoLearner {
+/// The learner of the experiment's algorithm.
+pub(crate) fn algorithm_on(device: Device, spec: &TaskSpec, experiment: &Experiment, seed: i64) -> Box<dyn Algorithm> {
+    seeded(seed, || algorithms::learner(Parts { experiment, spec, pose: &POSE, device }).unwrap())
+}
+
+fn seeded<L>(seed: i64, make: impl FnOnce() -> L) -> L {
     let _guard = GENERATOR.lock().unwrap();
     // Tests run in parallel, and the networks are too small for several threads.
     tch::set_num_threads(1);
     tch::manual_seed(seed);
-    VmpoLearner::new(spec, experiment, &[0.1, -0.2, 0.3], device).unwrap()
+    make()
 }
 
 /// Unrolls as they come over the wire; a test may change every field.
@@ -167,16 +175,16 @@ impl Unrolls {
     pub(crate) fn recorded(experiment: &Experiment, spec: &TaskSpec, seed: u64, count: usize) -> Self {
         let mut unrolls = Self::random(seed, count);
         let mut numbers = Numbers::new(seed + 100);
-        let (network, rows) = (&experiment.network, count * LENGTH);
-        let components = network.components();
-        unrolls.previous_latent = numbers.take(rows * network.latent.size);
-        unrolls.latent_noise = numbers.take(rows * network.latent.size);
+        let UnrollShape { latent, components, state, .. } = UnrollShape::new(spec, experiment);
+        let rows = count * LENGTH;
+        unrolls.previous_latent = numbers.take(rows * latent);
+        unrolls.latent_noise = numbers.take(rows * latent);
         unrolls.mean = numbers.take(rows * components * WIDTHS.action);
         unrolls.std = numbers.take(unrolls.mean.len()).iter().map(|value| 0.6 + 0.3 * value).collect();
         if components > 1 {
             unrolls.log_weights = vec![-(components as f32).ln(); rows * components];
         }
-        unrolls.state = numbers.take(count * network.state_size());
+        unrolls.state = numbers.take(count * state);
         unrolls.reward = numbers.take(rows * spec.reward_terms.len());
         unrolls.task_count = spec.tasks.len();
         let alone = (seed % 4 == 3).then_some(seed as usize / 4 % spec.tasks.len());
@@ -344,7 +352,7 @@ pub(crate) fn values(tensor: &Tensor) -> Vec<f32> {
 }
 
 /// The learner's state as numbers, by name.
-pub(crate) fn state(learner: &VmpoLearner) -> Vec<(String, Vec<f64>)> {
+pub(crate) fn state(learner: &dyn Algorithm) -> Vec<(String, Vec<f64>)> {
     learner
         .state()
         .into_iter()
