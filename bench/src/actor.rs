@@ -5,7 +5,6 @@
 //! environment ([`tape`]) keeps.
 
 mod acting;
-mod figure;
 mod memory;
 mod physics;
 mod tape;

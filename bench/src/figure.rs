@@ -14,7 +14,7 @@ use crate::median::median;
 const FEWEST_SEGMENTS: usize = 5;
 
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Figure {
+pub(crate) struct Figure {
     figure: Cow<'static, str>,
     value: f64,
     unit: &'static str,
@@ -25,7 +25,7 @@ pub(super) struct Figure {
 }
 
 impl Figure {
-    pub(super) fn new(
+    pub(crate) fn new(
         figure: &'static str,
         unit: &'static str,
         Medians { value, floor }: Medians,
@@ -35,14 +35,14 @@ impl Figure {
     }
 
     /// Adds the name of the policy's low level, unless it is the MLP.
-    pub(super) fn named_after(mut self, low_level: LowLevelName) -> Self {
+    pub(crate) fn named_after(mut self, low_level: LowLevelName) -> Self {
         if low_level != LowLevelName::Mlp {
             self.figure = format!("{}.{low_level}", self.figure).into();
         }
         self
     }
 
-    pub(super) fn print(&self) -> Result<()> {
+    pub(crate) fn print(&self) -> Result<()> {
         let line = serde_json::to_string(self)?;
         writeln!(std::io::stdout(), "{line}").context("cannot write to standard output")
     }
@@ -50,13 +50,13 @@ impl Figure {
 
 /// The median of the value's segments and that of the floor's.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Medians {
-    pub(super) value: f64,
-    pub(super) floor: f64,
+pub(crate) struct Medians {
+    pub(crate) value: f64,
+    pub(crate) floor: f64,
 }
 
 /// Repeats a pair of segments (value, floor) until the budget is used up. The first pair warms up and is not counted.
-pub(super) fn interleave<E>(budget: Duration, mut pair: impl FnMut() -> Result<(f64, f64), E>) -> Result<Medians, E> {
+pub(crate) fn interleave<E>(budget: Duration, mut pair: impl FnMut() -> Result<(f64, f64), E>) -> Result<Medians, E> {
     pair()?;
     let begin = Instant::now();
     let (mut values, mut floors) = (Vec::new(), Vec::new());

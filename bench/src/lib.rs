@@ -4,7 +4,7 @@
 //! - [`actor`] measures environments, policies, resets and images against the physics alone.
 //! - [`update`] measures the gradient step against its matrix products.
 //! - [`service`] measures the learner's service under thousands of simulated actors.
-//! - `median` is the one statistic that all of them print; `busy` are neighbours that compute.
+//! - `median` is the one statistic that all of them print, and `figure` the line of most; `busy` are neighbours that compute.
 //!
 //! There are two programs, since the shipped ones use different allocators: `comic-bench-learner` uses mimalloc, as
 //! `comic-learner` does, and `comic-bench-actor` uses the system's. `cargo xtask bench` builds and starts them.
@@ -15,6 +15,7 @@ use tracing_subscriber::EnvFilter;
 
 pub mod actor;
 mod busy;
+mod figure;
 mod median;
 pub mod service;
 pub mod update;

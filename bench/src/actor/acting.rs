@@ -17,10 +17,10 @@ use comic_proto::{UnrollLayout, UnrollShape};
 use comic_tasks::raw_physics::RawPhysics;
 use comic_tasks::{Environment, Simulated};
 
-use super::figure::{Figure, interleave};
 use super::tape::Recorded;
 use super::{ENVIRONMENTS, Subject};
 use crate::busy::Busy;
+use crate::figure::{Figure, interleave};
 
 /// Steps/s of one thread, against the physics alone.
 pub(super) fn policy(subject: &Subject) -> Result<Figure> {

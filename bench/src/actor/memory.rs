@@ -8,7 +8,7 @@ use anyhow::{Context as _, Result};
 use comic_clips::Catalogue;
 
 use super::Subject;
-use super::figure::{Figure, Medians};
+use crate::figure::{Figure, Medians};
 
 /// Resets after which the allocator has reserved what it needs.
 const WARM: usize = 1_000;

@@ -10,8 +10,8 @@ use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 
 use super::Subject;
-use super::figure::{Figure, Medians, interleave};
 use super::tape::Recorded;
+use crate::figure::{Figure, Medians, interleave};
 
 /// Control steps of a segment: a fifth of a second of computing. A corridor is replaced after as many.
 const STEPS: usize = 512;

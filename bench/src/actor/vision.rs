@@ -9,8 +9,8 @@ use comic_experiment::{Experiment, TaskName, Vision};
 use comic_tasks::vision::IMAGE_BYTES;
 use comic_tasks::{Environment as _, Simulated};
 
-use super::figure::{Figure, Medians, interleave};
 use super::{ENVIRONMENTS, Subject};
+use crate::figure::{Figure, Medians, interleave};
 
 /// Images of a segment with the fast settings, and with dm_control's.
 const FAST: usize = 64;

@@ -20,7 +20,7 @@ use tokio_stream::wrappers::TcpListenerStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::Subject;
-use super::figure::{Figure, Medians, interleave};
+use crate::figure::{Figure, Medians, interleave};
 
 /// A segment has the unrolls of so many updates.
 const UPDATES: usize = 2;
