@@ -3,8 +3,10 @@
 //! # Layout
 //! - [`actor`] measures environments, policies, resets and images against the physics alone.
 //! - [`update`] measures the gradient step against its matrix products.
+//! - [`replay`] measures the replay's table against bare copies.
 //! - [`service`] measures the learner's service under thousands of simulated actors.
-//! - `median` is the one statistic that all of them print, and `figure` the line of most; `busy` are neighbours that compute.
+//! - `median` is the one statistic that all of them print, and `figure` the line of most; `busy` are neighbours that compute;
+//!   `transfer` is the experiment of off-policy learning that is measured.
 //!
 //! There are two programs, since the shipped ones use different allocators: `comic-bench-learner` uses mimalloc, as
 //! `comic-learner` does, and `comic-bench-actor` uses the system's. `cargo xtask bench` builds and starts them.
@@ -17,7 +19,9 @@ pub mod actor;
 mod busy;
 mod figure;
 mod median;
+pub mod replay;
 pub mod service;
+mod transfer;
 pub mod update;
 
 /// Logs to standard error what `RUST_LOG` chooses. The default is warnings: thousands of actors join in a measurement.

@@ -26,6 +26,8 @@ enum Side {
     Actor,
     /// The update, against its matrix products and against PyTorch
     Learner,
+    /// The replay's table, against bare copies
+    Replay,
     /// Images of the humanoid's camera
     Vision,
     /// Unrolls into batches, from 32 connections and from 1000
@@ -78,9 +80,10 @@ pub(crate) fn run(options: &Options) -> Result<()> {
             let mut networks = others.chain([vec!["--joint".to_owned()]]);
             networks.try_for_each(|network| learner(options.threads, &[network, arguments.clone()].concat()))
         }
-        Side::Ingest => service("ingest", arguments),
-        Side::Publish => service("publish", arguments),
-        Side::Swarm => service("swarm", arguments),
+        Side::Replay => printing("replay", arguments),
+        Side::Ingest => printing("ingest", arguments),
+        Side::Publish => printing("publish", arguments),
+        Side::Swarm => printing("swarm", arguments),
     }
 }
 
@@ -88,8 +91,8 @@ fn actor(arguments: &[String]) -> Result<()> {
     workspace::run(Command::new(workspace::program("comic-bench-actor")?).args(arguments))
 }
 
-/// The service under simulated actors. The program prints each figure when it is measured.
-fn service(figure: &str, arguments: &[String]) -> Result<()> {
+/// A measurement of the learner's program, which prints each figure when it is measured.
+fn printing(figure: &str, arguments: &[String]) -> Result<()> {
     workspace::run(Command::new(workspace::program("comic-bench-learner")?).arg(figure).args(arguments))
 }
 

@@ -1,6 +1,7 @@
 //! The program `comic-bench-learner`.
 
 use clap::{Parser, Subcommand};
+use comic_bench::replay::Replay;
 use comic_bench::service::{Crowd, Host, Ingest, Publish, Stalled, Swarm};
 use comic_bench::update::Update;
 
@@ -8,7 +9,7 @@ use comic_bench::update::Update;
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-/// Measures the learner's update and its service; one JSON line for each figure.
+/// Measures the learner's update, its replay and its service; one JSON line for each figure.
 #[derive(Debug, Parser)]
 #[command(version)]
 struct Arguments {
@@ -19,6 +20,7 @@ struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Measurement {
     Update(Update),
+    Replay(Replay),
     Ingest(Ingest),
     Publish(Publish),
     Stalled(Stalled),
@@ -36,6 +38,7 @@ fn main() -> anyhow::Result<()> {
     comic_learner::threads::wait_passively();
     match measurement {
         Measurement::Update(update) => update.run(),
+        Measurement::Replay(replay) => replay.run(),
         Measurement::Ingest(ingest) => ingest.run(),
         Measurement::Publish(publish) => publish.run(),
         Measurement::Stalled(stalled) => stalled.run(),
