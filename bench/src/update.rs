@@ -1,29 +1,35 @@
 //! The gradient step against its bare matrix products.
 //!
 //! # Layout
-//! - [`floor`] is the least that an update can cost; [`recorded`] is the batch that is learned from.
+//! - [`mod@floor`] is the least that an update can cost, [`vmpo`] and [`svg0`] have its layers; [`recorded`] is the batch that is
+//!   learned from.
 
 mod floor;
 mod recorded;
+mod svg0;
+mod vmpo;
 
 use std::time::Instant;
 
 use anyhow::{Result, anyhow};
 use clap::Args;
-use comic_experiment::{DeviceName, Experiment, Learner, LowLevelName, TaskSpec};
-use comic_learner::algorithm::Algorithm as _;
+use comic_experiment::{AlgorithmName, DeviceName, Experiment, Learner, LowLevelName, TaskName, TaskSpec};
 use comic_learner::algorithm::minibatch::MinibatchTensors;
+use comic_learner::algorithm::{Algorithm, Parts};
+use comic_learner::algorithms;
 use comic_learner::device::Backend;
-use comic_learner::vmpo::VmpoLearner;
-use comic_networks::to_safetensors;
 use serde_json::json;
+use tch::Device;
 
 use crate::busy::Busy;
 use crate::median::median;
+use crate::transfer;
 use floor::Floor;
 use recorded::Recorded;
 
-/// Measure a gradient step of paper size (128 unrolls of 32 steps) against the matrix products of the same shapes
+/// Measure a gradient step of paper size against the matrix products of the same shapes
+///
+/// V-MPO's has 128 unrolls of 32 steps. SVG(0)'s has 64, with 8 rows of burn-in, of go-to-target with a latent as its action.
 ///
 /// `value` is milliseconds of the step with its batch on the device. `floor` is milliseconds of its matrix products,
 /// forward and backward, on the same threads, and of libtorch's own LSTM where the network has one. `copy` is milliseconds
@@ -44,6 +50,9 @@ pub struct Update {
     /// Joint training of two tasks, and beside it the first task alone
     #[arg(long, conflicts_with = "low_level")]
     joint: bool,
+    /// SVG(0) instead of V-MPO
+    #[arg(long, conflicts_with_all = ["low_level", "joint"])]
+    svg0: bool,
     /// Measure it also beside busy processes
     #[arg(long)]
     contended: bool,
@@ -63,19 +72,18 @@ impl Update {
     pub fn run(&self) -> Result<()> {
         tch::set_num_threads(self.threads as i32);
         tch::manual_seed(1);
-        let (preset, figure) = self.subject();
-        let experiment = comic_experiment::resolve(&preset, &[])?;
+        let (experiment, figure) = self.subject()?;
         let backend = Backend::open(&Learner { device: self.device, ..experiment.learner.clone() })?;
         let mut networks = Networks::new(&experiment, &backend)?;
         let alone = Experiment { joint: Vec::new(), ..experiment.clone() };
         let mut one_task = self.joint.then(|| Networks::new(&alone, &backend)).transpose()?;
-        let products = Floor::new(&networks.spec, &experiment, backend.device());
+        let products = floor(&networks.spec, &experiment, backend.device());
         let (mut updates, mut one_tasks, mut floors) = (Vec::new(), Vec::new(), Vec::new());
         let (mut copies, mut reads, mut contended) = (Vec::new(), Vec::new(), Vec::new());
         for repeat in 0..self.repeats + WARM_UP {
             let copy = milliseconds(|| networks.refill(&backend))?;
             let update = networks.update(&backend)?;
-            let read = milliseconds(|| to_safetensors(networks.learner.policy_store()))?;
+            let read = milliseconds(|| networks.learner.policy_parameters())?;
             let one_task = one_task.as_mut().map(|networks| networks.update(&backend)).transpose()?;
             let floor = milliseconds(|| products.run(&backend))?;
             if self.contended && repeat >= WARM_UP {
@@ -113,23 +121,40 @@ impl Update {
         Ok(())
     }
 
-    /// The preset that is measured, and the figure's name.
-    fn subject(&self) -> (String, String) {
-        if self.joint {
-            return ("joint-get-up".into(), "learner.update.joint".into());
+    /// The experiment that is measured, and the figure's name.
+    fn subject(&self) -> Result<(Experiment, String)> {
+        if self.svg0 {
+            return Ok((transfer::experiment(TaskName::GoToTarget), "learner.svg0".into()));
         }
-        let figure = match self.low_level {
-            LowLevelName::Mlp => "learner.update".into(),
-            other => format!("learner.update.{other}"),
+        let (preset, figure) = match self.low_level {
+            _ if self.joint => ("joint-get-up".into(), "learner.update.joint".into()),
+            LowLevelName::Mlp => ("tracking-mlp".into(), "learner.update".into()),
+            other => (format!("tracking-{other}"), format!("learner.update.{other}")),
         };
-        (format!("tracking-{}", self.low_level), figure)
+        Ok((comic_experiment::resolve(&preset, &[])?, figure))
+    }
+}
+
+/// Unrolls of a gradient step.
+fn unrolls(experiment: &Experiment) -> usize {
+    match experiment.algorithm {
+        AlgorithmName::Vmpo => vmpo::unrolls(experiment),
+        AlgorithmName::Svg0 => svg0::unrolls(experiment),
+    }
+}
+
+/// The products of a gradient step.
+fn floor(spec: &TaskSpec, experiment: &Experiment, device: Device) -> Floor {
+    match experiment.algorithm {
+        AlgorithmName::Vmpo => vmpo::floor(spec, experiment, device),
+        AlgorithmName::Svg0 => svg0::floor(spec, experiment, device),
     }
 }
 
 /// Networks of paper size and a batch for them.
 struct Networks {
     spec: TaskSpec,
-    learner: VmpoLearner,
+    learner: Box<dyn Algorithm>,
     recorded: Recorded,
     minibatch: MinibatchTensors,
 }
@@ -137,8 +162,9 @@ struct Networks {
 impl Networks {
     fn new(experiment: &Experiment, backend: &Backend) -> Result<Self> {
         let spec = TaskSpec::new(experiment, vec!["clip".into()]).map_err(|name| anyhow!("no observation `{name}`"))?;
-        let learner = VmpoLearner::new(&spec, experiment, &vec![0.0; spec.action], backend.device())?;
-        let recorded = Recorded::new(&spec, experiment)?;
+        let (pose, device) = (vec![0.0; spec.action], backend.device());
+        let learner = algorithms::learner(Parts { experiment, spec: &spec, pose: &pose, device })?;
+        let recorded = Recorded::new(&spec, experiment, unrolls(experiment))?;
         let minibatch = recorded.to_tensors(backend.device())?;
         Ok(Self { spec, learner, recorded, minibatch })
     }

@@ -11,39 +11,18 @@ Shapes: B unrolls, T transitions, S proprioception, X task observation, Z latent
 networks and rules are the CoMic supplement's (Hasenclever et al., 2020) and V-MPO's (Song et al., 2020).
 """
 
-import argparse
-import json
-import os
-import statistics
-import sys
-import time
-
-sys.setdlopenflags(os.RTLD_LAZY)  # see bare_torch.py
+from torch_update import gaussian, mean_and_std, measure, mlp, standard_normal
 
 import torch
 from torch import nn
-from torch.distributions import Independent, Normal, kl_divergence
-from torch.nn import functional
+from torch.distributions import kl_divergence
 
 B, T = 128, 32
 X, S, Z, A, R = 1086, 205, 60, 56, 5
 CLIPS, EMBEDDING = 836, 30
 GAMMA, BETA, TOP_FRACTION = 0.95, 5e-4, 0.5
 EPSILON_ETA, EPSILON_MEAN, EPSILON_STD = 0.1, 0.1, 1e-5
-LEARNING_RATE, MIN_STD, MIN_MULTIPLIER = 1e-4, 1e-3, 1e-8
-
-
-def mlp(inputs, hidden, outputs):
-    """Linear, layer norm and tanh first; then linear and ELU; a linear head."""
-    layers = [nn.Linear(inputs, hidden[0]), nn.LayerNorm(hidden[0]), nn.Tanh()]
-    for before, after in zip(hidden, hidden[1:]):
-        layers += [nn.Linear(before, after), nn.ELU()]
-    return nn.Sequential(*layers, nn.Linear(hidden[-1], outputs))
-
-
-def diagonal_gaussian(parameters):
-    mean, raw = parameters.chunk(2, dim=-1)
-    return mean, functional.softplus(raw) + MIN_STD
+LEARNING_RATE, MIN_MULTIPLIER = 1e-4, 1e-8
 
 
 class Networks(nn.Module):
@@ -61,16 +40,12 @@ class Networks(nn.Module):
     def policy(self, x, s, previous_latent, noise):
         """The latent's distribution, and the action's given the latent that the stored noise makes."""
         inputs = torch.cat([x, s, previous_latent], dim=-1)
-        latent_mean, latent_std = diagonal_gaussian(self.encoder(inputs) + self.linear_path(inputs))
+        latent_mean, latent_std = mean_and_std(self.encoder(inputs) + self.linear_path(inputs))
         latent = latent_mean + latent_std * noise
-        return (latent_mean, latent_std), diagonal_gaussian(self.low_level(torch.cat([latent, s], dim=-1)))
+        return (latent_mean, latent_std), mean_and_std(self.low_level(torch.cat([latent, s], dim=-1)))
 
     def value(self, x, s, clip):
         return self.value_function(torch.cat([x, s, self.embedding(clip)], dim=-1))
-
-
-def gaussian(mean, std):
-    return Independent(Normal(mean, std, validate_args=False), 1, validate_args=False)
 
 
 def returns(reward, discount, valid, values):
@@ -114,8 +89,7 @@ def losses(networks, batch):
     alpha = limit(networks.alpha_mean, EPSILON_MEAN, kl_mean) + limit(networks.alpha_std, EPSILON_STD, kl_std)
 
     value = 0.5 * (values[:, :T] - targets)[valid].square().mean()
-    prior = gaussian(torch.zeros_like(latent[0]), torch.ones_like(latent[1]))
-    latent_kl = kl_divergence(gaussian(*latent), prior)[valid].mean()
+    latent_kl = kl_divergence(gaussian(*latent), standard_normal(latent[0]))[valid].mean()
     return policy, temperature, alpha, value, BETA * latent_kl
 
 
@@ -148,41 +122,12 @@ def update(networks, optimiser, batch):
     return [part.item() for part in parts]
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--repeats", type=int, default=10, help="updates to time at most")
-    parser.add_argument("--seconds", type=float, default=60.0, help="start no further update after so long")
-    parser.add_argument("--seed", type=int, default=1)
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    torch.manual_seed(arguments.seed)
-
+def prepare():
     networks = Networks()
     optimiser = torch.optim.Adam(networks.parameters(), lr=LEARNING_RATE)
     batch = random_batch(networks)
-    for _ in range(2):  # Adam allocates its moments at the first
-        update(networks, optimiser, batch)
-
-    milliseconds, begin = [], time.perf_counter()
-    while len(milliseconds) < arguments.repeats:
-        if milliseconds and time.perf_counter() - begin > arguments.seconds:
-            break
-        start = time.perf_counter()
-        parts = update(networks, optimiser, batch)
-        milliseconds.append(1e3 * (time.perf_counter() - start))
-        if any(part != part for part in parts):
-            raise SystemExit("a loss is not a number")
-    print(
-        json.dumps(
-            {
-                "milliseconds": statistics.median(milliseconds),
-                "threads": arguments.threads,
-                "repeats": len(milliseconds),
-            }
-        )
-    )
+    return lambda: update(networks, optimiser, batch)
 
 
 if __name__ == "__main__":
-    main()
+    measure(__doc__, prepare)

@@ -77,7 +77,7 @@ pub(crate) fn run(options: &Options) -> Result<()> {
                 return Ok(());
             }
             let others = other_low_levels().map(|name| vec!["--low-level".to_owned(), name.to_owned()]);
-            let mut networks = others.chain([vec!["--joint".to_owned()]]);
+            let mut networks = others.chain(["--joint", "--svg0"].map(|option| vec![option.to_owned()]));
             networks.try_for_each(|network| learner(options.threads, &[network, arguments.clone()].concat()))
         }
         Side::Replay => printing("replay", arguments),
@@ -96,35 +96,58 @@ fn printing(figure: &str, arguments: &[String]) -> Result<()> {
     workspace::run(Command::new(workspace::program("comic-bench-learner")?).arg(figure).args(arguments))
 }
 
+/// The options that choose another network than the MLP on one task.
+const NETWORKS: [&str; 3] = ["--low-level", "--joint", "--svg0"];
+
 /// Whether the arguments choose another network than the MLP on one task.
 fn chooses_network(arguments: &[String]) -> bool {
-    arguments.iter().any(|argument| argument.starts_with("--low-level") || argument == "--joint")
+    arguments.iter().any(|argument| NETWORKS.iter().any(|option| argument.starts_with(option)))
+}
+
+/// An update that is also written in Python PyTorch.
+struct Written {
+    /// Our figure.
+    figure: &'static str,
+    /// The figure of the comparison.
+    against: &'static str,
+    script: &'static str,
+}
+
+const VMPO: Written = Written { figure: "learner.update", against: "learner.pytorch", script: "torch_vmpo_update.py" };
+const SVG0: Written =
+    Written { figure: "learner.svg0", against: "learner.svg0.pytorch", script: "torch_svg0_update.py" };
+
+/// The update that the arguments choose, if it is written in PyTorch, too.
+fn written(arguments: &[String]) -> Option<Written> {
+    if !chooses_network(arguments) {
+        return Some(VMPO);
+    }
+    arguments.iter().any(|argument| argument == "--svg0").then_some(SVG0)
 }
 
 /// Our update and the same update in Python PyTorch. They take turns, so that other programs slow down both.
 fn learner(threads: u16, arguments: &[String]) -> Result<()> {
-    // The Python script has the MLP only.
-    let compares = !chooses_network(arguments);
+    let written = written(arguments);
     let mut ours = Vec::new();
     let mut theirs = Vec::new();
     for _ in 0..ROUNDS {
         let mut bench = Command::new(workspace::program("comic-bench-learner")?);
         bench.args(["update", "--threads", &threads.to_string()]).args(arguments);
-        if compares {
+        if written.is_some() {
             bench.arg("--contended");
         }
         ours.push(figures(&mut bench)?);
-        if compares {
-            theirs.push(pytorch(threads)?);
+        if let Some(Written { script, .. }) = written {
+            theirs.push(pytorch(script, threads)?);
         }
     }
     let mut lines = medians(&ours);
-    if compares {
-        let update = lines.iter().find(|figure| figure.figure == "learner.update");
-        let update = update.context("comic-bench-learner printed no learner.update")?.clone();
+    if let Some(Written { figure, against, .. }) = written {
+        let update = lines.iter().find(|line| line.figure == figure);
+        let update = update.with_context(|| format!("comic-bench-learner printed no {figure}"))?.clone();
         let floor = median(theirs);
         let rest = serde_json::Map::new();
-        lines.push(Figure { figure: "learner.pytorch".into(), floor, ratio: update.value / floor, rest, ..update });
+        lines.push(Figure { figure: against.into(), floor, ratio: update.value / floor, rest, ..update });
     }
     for figure in lines {
         println!("{}", serde_json::to_string(&figure)?);
@@ -154,15 +177,15 @@ fn medians(rounds: &[Vec<Figure>]) -> Vec<Figure> {
     lines
 }
 
-/// Milliseconds of the same update in Python PyTorch, with the same shapes and threads.
-fn pytorch(threads: u16) -> Result<f64> {
+/// Milliseconds of the update in a script in Python PyTorch, with the same shapes and threads.
+fn pytorch(script: &str, threads: u16) -> Result<f64> {
     #[derive(Deserialize)]
     struct Answer {
         milliseconds: f64,
     }
-    let mut command = python::script_command("torch_vmpo_update.py", "requirements-torch.txt")?;
+    let mut command = python::script_command(script, "requirements-torch.txt")?;
     let lines = output(command.args(["--threads", &threads.to_string()]))?;
-    let answer = lines.lines().last().context("torch_vmpo_update.py printed nothing")?;
+    let answer = lines.lines().last().with_context(|| format!("{script} printed nothing"))?;
     let answer: Answer = serde_json::from_str(answer).with_context(|| format!("unreadable answer: {answer}"))?;
     Ok(answer.milliseconds)
 }

@@ -18,9 +18,9 @@ pub(super) struct Recorded {
 }
 
 impl Recorded {
-    pub(super) fn new(spec: &TaskSpec, experiment: &Experiment) -> Result<Self> {
+    pub(super) fn new(spec: &TaskSpec, experiment: &Experiment, count: usize) -> Result<Self> {
         let layout = Arc::new(UnrollLayout::new(UnrollShape::new(spec, experiment)));
-        let (unroll, count) = (*layout.shape(), experiment.unroll.batch);
+        let unroll = *layout.shape();
         // The tasks take turns; each has one clip here.
         let tasks: Vec<usize> = (0..count).map(|index| index % spec.tasks.len()).collect();
         let rows = layout.rows(Field::Clip);
