@@ -49,12 +49,7 @@ impl Replay {
         ensure("replay.max_size", max_size, *max_size >= least, remedy)?;
         ensure("replay.min_size", min_size, min_size <= max_size, "must be at most replay.max_size")?;
         let (samples, buffer) = (*samples_per_insert, *error_buffer);
-        ensure(
-            "replay.samples_per_insert",
-            samples,
-            samples > 0.0 && samples <= 1e4,
-            "must be positive, at most 10000",
-        )?;
+        ensure("replay.samples_per_insert", samples, (1e-3..=1e4).contains(&samples), "must be 0.001 to 10000")?;
         let least = samples.max(minibatch as f64);
         let remedy = format!("must be 0, or {least} at least: with less, both sides would wait for ever");
         ensure("replay.error_buffer", buffer, buffer == 0.0 || (buffer >= least && buffer <= 1e9), remedy)

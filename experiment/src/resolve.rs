@@ -143,7 +143,8 @@ fn path_of(argument: &str) -> &str {
 fn with_unread_at_defaults(experiment: &Experiment) -> Result<Experiment, Error> {
     let mut document = Value::Table(experiment.to_table()?);
     let defaults = Value::Table(Experiment::default().to_table()?);
-    for name in experiment.unread() {
+    // Without its other tasks the experiment would be another one, so that is refused.
+    for name in experiment.unread().into_iter().filter(|name| *name != "joint") {
         let default = name.split('.').try_fold(&defaults, |place, part| place.get(part));
         if let (Some(place), Some(default)) = (place(&mut document, name), default) {
             *place = default.clone();

@@ -24,10 +24,10 @@ pub fn check_checkpoint_format(named: Option<u32>) -> Result<(), Error> {
 /// learned with them act without them.
 const RENAMED: [(&str, Option<&str>); 7] = [
     ("transfer.algorithm", Some("algorithm")),
-    ("svg0.replay_steps", Some("replay.max_size")),
-    ("svg0.replay_mib", Some("replay.memory_mib")),
-    ("svg0.samples_per_insert", Some("replay.samples_per_insert")),
-    ("svg0.begin_at", Some("replay.min_size")),
+    ("svg0.replay_steps", None),
+    ("svg0.replay_mib", None),
+    ("svg0.samples_per_insert", None),
+    ("svg0.begin_at", None),
     ("svg0.learning_rate", None),
     ("warm_start", None),
 ];
@@ -46,6 +46,14 @@ impl Experiment {
             let Some(value) = take(&mut document, before) else { continue };
             if let Some(now) = now {
                 put(&mut document, now, value);
+            }
+        }
+        // SVG(0) had the deviation of the other networks.
+        if document.get("algorithm").and_then(Value::as_str) == Some("svg0") {
+            for field in ["initial_std", "min_std"] {
+                if let Some(value) = take(&mut document, &format!("network.{field}")) {
+                    put(&mut document, &format!("svg0.{field}"), value);
+                }
             }
         }
         let text = toml::to_string(&document)
@@ -81,11 +89,11 @@ mod tests {
     #[test]
     fn a_document_of_the_release_before_is_read_by_the_new_names() {
         let text = "[transfer]\nalgorithm = \"svg0\"\n[svg0]\nlearning_rate = 0.5\nreplay_steps = 32000\nbegin_at = 640\n\
-            samples_per_insert = 4.0\nreplay_mib = 16384\n[warm_start]\nsteps = 0\n[vmpo]\nlambda = 0.9\n";
+            samples_per_insert = 4.0\nreplay_mib = 16384\n[warm_start]\nsteps = 0\n[vmpo]\nlambda = 0.9\n\
+            [network]\nmin_std = 0.125\n";
         let experiment = Experiment::from_earlier_toml("its experiment", text).unwrap();
         assert_eq!(experiment.algorithm.name(), "svg0");
-        let replay = &experiment.replay;
-        assert_eq!((replay.max_size, replay.min_size, replay.samples_per_insert), (32_000, 640, 4.0));
+        assert_eq!((experiment.svg0.min_std, &experiment.replay), (0.125, &crate::replay::Replay::default()));
         // What the algorithm does not read had no effect then.
         assert!(!experiment.to_toml().unwrap().contains("lambda = 0.9"));
         assert!(Experiment::from_toml("its experiment", text).is_err());

@@ -128,6 +128,7 @@ pub struct Budget {
     pub minutes: f64,
     /// Environment steps of the batches that were trained on, in the whole run.
     pub environment_steps: u64,
-    /// Batches that were trained on, in the whole run.
+    /// Batches that were trained on, in the whole run. With a replay and without lockstep a batch is what had arrived, from one
+    /// unroll on, so this limit depends on the machine.
     pub updates: u64,
 }

@@ -74,7 +74,7 @@ fn the_replay_is_refused_where_neither_side_could_move() {
         ("replay.error_buffer=7", "8 at least"),
         ("replay.max_size=255", "256 environment steps"),
         ("replay.min_size=2000000", "at most replay.max_size"),
-        ("replay.samples_per_insert=0", "must be positive"),
+        ("replay.samples_per_insert=0", "must be 0.001 to 10000"),
     ] {
         let refused = with(field).expect_err(field);
         assert!(refused.contains(remedy), "{refused}");

@@ -14,9 +14,9 @@
 //! - `descent`: gradients, their norms, and a step of Adam that is taken as a whole or not at all.
 //!
 //! # A third algorithm
-//! It is an entry of the list `for_each_algorithm!` and a file in each of three crates: its parameters in
-//! `experiment/src/algorithms/`, its policy in `networks/src/`, and its learner in a folder of this crate, whose `Builder`
-//! makes it. Losses are reported by name, so they reach the metrics without another list.
+//! It is an entry of the list `for_each_algorithm!`, a section of the document, and a file in each of three crates: its
+//! parameters in `experiment/src/algorithms/`, its policy in `networks/src/`, and its learner in a folder of this crate. In each
+//! crate a `Builder` of that name makes it. Losses are reported by name, so they reach the metrics without another list.
 
 pub(crate) mod descent;
 pub mod error;

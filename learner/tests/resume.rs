@@ -289,6 +289,7 @@ fn a_resumed_run_with_a_saved_replay_ends_bit_for_bit_where_an_unbroken_one_ends
         trained_on(&off_policy(UPDATES, saves), run, UPDATES)
     };
     let resumed = ended(broken.path(), true);
+    assert_eq!(resumed.parts.len(), expected.parts.len());
     for ((name, expected), (_, resumed)) in comparable(&expected).iter().zip(&comparable(&resumed)) {
         assert!(expected == resumed, "{name} differs after a resume");
     }
@@ -300,6 +301,30 @@ fn a_resumed_run_with_a_saved_replay_ends_bit_for_bit_where_an_unbroken_one_ends
     // Without it, learning begins again with an empty replay.
     let lost = ended(forgetful.path(), false);
     assert_ne!(lost.part("policy.safetensors").unwrap(), expected.part("policy.safetensors").unwrap());
+}
+
+/// As actors use it: unrolls enter as they arrive, and the rate limiter decides.
+#[test]
+fn off_policy_learning_goes_on_without_lockstep_also_with_other_numbers_after_a_resume() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let run = tempfile::tempdir().unwrap();
+    for (updates, samples_per_insert) in [(12, 2.0), (24, 8.0), (36, 0.5)] {
+        let mut experiment = off_policy(updates, true);
+        experiment.unroll.lockstep = false;
+        experiment.replay.samples_per_insert = samples_per_insert;
+        let Epoch { ended, prometheus: telemetry, .. } = live(&experiment, run.path(), u64::MAX, |_, _| {});
+        assert_eq!(ended.unwrap(), Ending::Budget);
+        let shown = |name: &str| {
+            let line = telemetry.lines().find_map(|line| line.strip_prefix(name)).unwrap();
+            line.trim().parse::<f64>().unwrap()
+        };
+        assert!(shown("comic_gradient_steps_total") > 0.0, "{telemetry}");
+        let lines = std::fs::read_to_string(run.path().join("metrics.jsonl")).unwrap();
+        let line: serde_json::Value = serde_json::from_str(lines.lines().last().unwrap()).unwrap();
+        assert_eq!(line["replay"]["inserted"], line["accounting"]["trained"], "{line}");
+        // The batch that set the normaliser's first scale.
+        assert_eq!(line["accounting"]["dropped"]["superseded"], BATCH, "{line}");
+    }
 }
 
 #[test]

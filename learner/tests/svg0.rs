@@ -11,7 +11,7 @@ use comic_learner::svg0::Svg0Learner;
 use comic_networks::{Policy as _, RecurrentState, Routing, Svg0Policy, from_safetensors};
 use comic_proto::Field;
 use svg0_support::{
-    ACTION, GENERATOR, LENGTH, SEQUENCES, Sequences, after_step, experiment, largest_difference, learner, spec,
+    GENERATOR, LENGTH, SEQUENCES, Sequences, after_step, experiment, largest_difference, learner, spec,
 };
 use tch::{Device, Kind, Tensor, nn};
 
@@ -100,7 +100,7 @@ fn a_step_that_is_not_finite_changes_nothing() {
     let state = |learner: &Svg0Learner| {
         let mut state: HashMap<String, Tensor> = learner.state().into_iter().collect();
         // It decides the next step's noise.
-        state.remove("gradient_steps").unwrap();
+        assert!(state.remove("gradient_steps").is_some());
         state
     };
     let before = state(&learner);

@@ -126,6 +126,21 @@ impl RateLimiter {
         self.counts.inserted >= self.min_size && self.error() - items(n as u64) >= -self.error_buffer
     }
 
+    /// Whether the error of the ratio is within the error buffer, as it is wherever the limiter was obeyed.
+    pub fn is_within(&self) -> bool {
+        let begins = self.counts.inserted < self.min_size && self.counts.sampled == 0;
+        begins || self.error().abs() <= self.error_buffer
+    }
+
+    /// The same limiter with as many samples counted as make the error 0, or none if there are too few items: for counts that
+    /// another limiter kept.
+    #[must_use]
+    pub fn balanced(self) -> Self {
+        let inserted = i128::from(self.counts.inserted.saturating_sub(self.min_size));
+        let sampled = u64::try_from((inserted * self.samples_per_insert) >> 32).unwrap_or(u64::MAX);
+        self.with_counts(Counts { sampled, ..self.counts })
+    }
+
     /// Counts inserted items.
     pub fn did_insert(&mut self, n: usize) {
         self.counts.inserted = self.counts.inserted.saturating_add(n as u64);

@@ -66,13 +66,17 @@ impl Default for Svg0 {
 }
 
 /// What SVG(0) does not read: it has networks of its own.
-const UNREAD: [&str; 11] = [
+const UNREAD: [&str; 15] = [
     "joint",
     "network.encoder",
     "network.encoder_linear_path",
     "network.value",
     "network.value_lstm",
     "network.clip_embedding",
+    "network.latent.beta",
+    "network.latent.prior",
+    "network.latent.initial_std",
+    "network.latent.min_std",
     "network.initial_std",
     "network.final_std",
     "network.min_std",
@@ -82,7 +86,7 @@ const UNREAD: [&str; 11] = [
 
 /// What it does not read either where no frozen low level acts. With one, these fields describe it.
 const OF_LOW_LEVELS: [&str; 5] =
-    ["network.low_level", "network.mlp", "network.lstm", "network.primitives", "network.latent"];
+    ["network.low_level", "network.mlp", "network.lstm", "network.primitives", "network.latent.size"];
 
 impl AlgorithmParameters for Svg0 {
     fn check(&self, rest: &Rest<'_>) -> Result<(), Fault> {

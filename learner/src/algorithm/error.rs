@@ -37,9 +37,6 @@ pub enum Error {
         /// Clips the value function knows.
         known: usize,
     },
-    /// The algorithm cannot do what is asked of it.
-    #[error("{0}")]
-    Unsupported(&'static str),
     /// The networks refused their parameters or sizes.
     #[error(transparent)]
     Networks(#[from] comic_networks::Error),

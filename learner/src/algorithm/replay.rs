@@ -29,8 +29,8 @@ pub struct Replay {
     sample: Sample,
     shape: MinibatchShape,
     device: Device,
-    /// Unrolls that enter at once, at most; `None` in lockstep, where a batch enters.
-    at_once: Option<usize>,
+    /// Unrolls that enter at once, and the gradient steps that follow, at most; `None` in lockstep, where a batch enters.
+    at_once: Option<(usize, usize)>,
     /// The ages of the unrolls sampled since the last report, and their number.
     ages: (u64, u64),
 }
@@ -83,7 +83,8 @@ impl Replay {
             (replay.min_sequences(length, minibatch) as u64, replay.error_buffer(length, minibatch));
         let limiter = RateLimiter::new(replay.samples_per_insert, min_size, error_buffer, minibatch as u64);
         let limiter = limiter.map_err(|error| Error::configuration(format!("replay: {error}")))?;
-        let at_once = (steps_at_once as f64 * minibatch as f64 / replay.samples_per_insert) as usize;
+        let steps = usize::try_from(steps_at_once).unwrap_or(usize::MAX).max(1);
+        let unrolls = (steps as f64 * minibatch as f64 / replay.samples_per_insert) as usize;
         Ok(Self {
             table,
             config,
@@ -91,27 +92,39 @@ impl Replay {
             sample: Sample::new(Arc::clone(layout), minibatch),
             shape: MinibatchShape { unrolls: minibatch, tasks, unroll: *layout.shape() },
             device,
-            at_once: (!unroll.lockstep).then_some(at_once.max(1)),
+            at_once: (!unroll.lockstep).then_some((unrolls.max(1), steps)),
             ages: (0, 0),
         })
     }
 
-    /// The next unrolls that may enter, if there are some within this time.
+    /// The next unrolls that may enter, if there are some within this time. The first ones are a whole batch: they give the
+    /// normaliser its first scale.
     pub(super) fn next(&self, batcher: &Batcher, patience: Duration) -> Next {
         match self.at_once {
-            Some(at_once) => batcher.next_available_within(patience, at_once.min(self.limiter.insertable())),
-            None => batcher.next_batch_within(patience),
+            Some((unrolls, _)) if !self.table.is_empty() => {
+                batcher.next_available_within(patience, unrolls.min(self.limiter.insertable()))
+            }
+            _ => batcher.next_batch_within(patience),
         }
     }
 
-    /// Takes unrolls in. Returns how many minibatches are then sampled: as many as may be, so that the limiter always allows
-    /// another insert afterwards.
+    /// Takes unrolls in. Returns how many minibatches are then sampled: in lockstep all that may be, otherwise at most those of
+    /// one publication, but so many that the limiter allows another insert.
     pub(super) fn insert(&mut self, batch: &Batch) -> usize {
         let tasks = batch.tasks();
         self.table.insert(batch.as_unrolls(), &tasks);
         self.limiter.did_insert(tasks.len());
         let (mut ahead, minibatch) = (self.limiter, self.shape.unrolls);
-        std::iter::from_fn(|| ahead.can_sample(minibatch).then(|| ahead.did_sample(minibatch))).count()
+        if self.table.len() < minibatch {
+            return 0;
+        }
+        let most = self.at_once.map_or(usize::MAX, |(_, steps)| steps);
+        let mut due = 0;
+        while ahead.can_sample(minibatch) && (due < most || ahead.insertable() == 0) {
+            ahead.did_sample(minibatch);
+            due += 1;
+        }
+        due
     }
 
     /// Samples a minibatch.
@@ -164,6 +177,10 @@ impl Replay {
         self.table = Table::new(Arc::clone(&layout), small).map_err(|error| damaged(&error))?;
         self.table = Table::read_from(layout, self.config, reader).map_err(|error| damaged(&error))?;
         self.limiter = self.limiter.with_counts(self.table.counts());
+        if !self.limiter.is_within() {
+            tracing::warn!("samples are counted anew: the replay was saved with other numbers of its rate limiter");
+            self.limiter = self.limiter.balanced();
+        }
         Ok(())
     }
 }
@@ -184,6 +201,6 @@ fn allowed_memory(mebibytes: u64) -> Result<u64> {
             "replay.memory_mib = {mebibytes}: this process may use {} MiB in all",
             limit / MIB
         ))),
-        (mebibytes, _) => Ok(mebibytes * MIB),
+        (mebibytes, _) => Ok(mebibytes.saturating_mul(MIB)),
     }
 }

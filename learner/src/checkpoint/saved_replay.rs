@@ -1,7 +1,7 @@
 //! The saved replay of a run: one file beside the checkpoints, of the newest checkpoint that has one. It is written apart from them,
 //! because it can be a thousand times as large.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{self, BufReader, BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
@@ -86,18 +86,49 @@ impl SavedReplay {
         }
     }
 
-    /// Removes the replays of all other checkpoints, if this one has one, and what is half-written.
+    /// Bytes of the replay of the checkpoint after so many updates; 0 if it has none.
+    pub(crate) fn size(&self, updates: u64) -> u64 {
+        self.path(updates).metadata().map_or(0, |found| found.len())
+    }
+
+    /// Removes the replays of earlier checkpoints, if this one has one.
     ///
     /// # Errors
     /// When the disk refuses.
-    pub(super) fn keep_only(&self, updates: u64) -> Result<()> {
-        let own = self.path(updates);
-        let replaced = own.is_file();
+    pub(crate) fn remove_earlier(&self, updates: u64) -> Result<()> {
+        let replaced = self.path(updates).is_file();
+        self.remove(|found| replaced && found < updates)
+    }
+
+    /// Removes what is half-written, and the replays of checkpoints that the run does not have: those after `updates`, with
+    /// which it begins.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub(crate) fn tidy(&self, updates: u64) -> Result<()> {
         for path in entries(&self.directory)? {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
-            let is_old = replaced && name.starts_with(NAME) && path != own;
-            if is_old || name.strip_prefix('.').is_some_and(|name| name.starts_with(NAME)) {
-                fs::remove_file(&path).map_err(Error::file("remove", &path))?;
+            if name.strip_prefix('.').is_some_and(|name| name.starts_with(NAME)) {
+                Step::Remove(path).carry_out()?;
+            }
+        }
+        self.remove(|found| found > updates)
+    }
+
+    /// Removes the replay of a checkpoint that could not be written.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub(super) fn forget(&self, updates: u64) -> Result<()> {
+        Step::Remove(self.path(updates)).carry_out()
+    }
+
+    fn remove(&self, unwanted: impl Fn(u64) -> bool) -> Result<()> {
+        for path in entries(&self.directory)? {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            let updates = name.strip_prefix(NAME).and_then(|digits| digits.parse().ok());
+            if updates.is_some_and(&unwanted) {
+                Step::Remove(path).carry_out()?;
             }
         }
         Ok(())
@@ -106,6 +137,7 @@ impl SavedReplay {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
     use std::io::Read as _;
 
     use super::*;
@@ -124,14 +156,19 @@ mod tests {
         };
         replay.write(1, |writer| writer.write_all(b"one")).unwrap();
         replay.write(2, |writer| writer.write_all(b"two")).unwrap();
-        replay.keep_only(2).unwrap();
+        replay.remove_earlier(2).unwrap();
         assert_eq!((contents(1), contents(2).as_deref()), (None, Some("two")));
         let full = || io::Error::from(ErrorKind::StorageFull);
         let refused = replay.write(3, |writer| writer.write_all(b"half").and(Err(full()))).unwrap_err();
         assert!(refused.to_string().contains("replay-0000000003"), "{refused}");
         // The checkpoint after three updates has none, so the one before keeps its own.
-        replay.keep_only(3).unwrap();
+        replay.remove_earlier(3).unwrap();
         assert_eq!(contents(2).as_deref(), Some("two"));
+        // A run that begins again with the second checkpoint.
+        replay.write(4, |writer| writer.write_all(b"four")).unwrap();
+        fs::write(run.path().join("checkpoints/.replay-0000000005"), b"half").unwrap();
+        replay.tidy(2).unwrap();
+        assert_eq!((contents(2).as_deref(), contents(4), replay.size(2)), (Some("two"), None, 3));
         assert_eq!(fs::read_dir(run.path().join("checkpoints")).unwrap().count(), 1);
     }
 

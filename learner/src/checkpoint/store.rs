@@ -141,13 +141,19 @@ impl Store {
         let path = self.path(name);
         if let Err(error) = carry_out(&self.steps(name, snapshot)?) {
             // On a full disk the next checkpoint may need the space.
-            if let Err(left) = self.repair() {
+            let replay = match name {
+                Name::Updates(updates) if !self.has(name) => SavedReplay::within(&self.directory).forget(updates),
+                _ => Ok(()),
+            };
+            if let Err(left) = self.repair().and(replay) {
                 tracing::warn!("{}", comic_proto::chain(&left));
             }
             return Err(error);
         }
-        if let Name::Updates(updates) = name {
-            SavedReplay::within(&self.directory).keep_only(updates)?;
+        if let Name::Updates(updates) = name
+            && let Err(left) = SavedReplay::within(&self.directory).remove_earlier(updates)
+        {
+            tracing::warn!("{}", comic_proto::chain(&left));
         }
         Ok(path)
     }

@@ -122,13 +122,14 @@ fn batches(unroll: &Unroll) -> Config {
 }
 
 /// Checks that a run is resumed with the experiment that it had, unless it is `allowed` to change. The budget, the intervals
-/// and the numbers of threads may always change.
+/// and the numbers of threads may always change, and how a replay is kept.
 fn check_same_experiment(now: &Experiment, spec: &TaskSpec, snapshot: &Snapshot, allowed: bool) -> Result<()> {
     let then = Experiment::from_toml("experiment.toml of the checkpoint", snapshot.text("experiment.toml")?)?;
     let mut now = now.clone();
     now.budget = then.budget.clone();
     now.learner = then.learner.clone();
     now.actor = then.actor.clone();
+    (now.replay.save, now.replay.memory_mib) = (then.replay.save, then.replay.memory_mib);
     // Only what is there counts, not where it is.
     now.transfer.low_level.clone_from(&then.transfer.low_level);
     let changed = |Difference { field, ours, theirs }| format!("{field} was {ours} and is {theirs}");

@@ -1,5 +1,6 @@
 //! The trainer: one OS thread that owns the device. Batches in, parameters out.
 
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use comic_experiment::{Experiment, TaskSpec};
@@ -80,7 +81,7 @@ impl Trainer {
         let saved_replay = experiment.replay.save.then(|| SavedReplay::of(&run));
         if let Some(replay) = experience.replay() {
             let resumed = resume.as_ref().map(|_| state.progress.updates);
-            begin_replay(replay, saved_replay.as_ref(), resumed).map_err(|error| incompatible(&run, error))?;
+            begin_replay(replay, saved_replay.as_ref(), resumed, &run)?;
         }
         let mut trainer = Self {
             experience,
@@ -125,6 +126,9 @@ impl Trainer {
         self.reports.write(&self.state.progress, self.batcher.accounting_by_task());
         self.write_last_checkpoint()?;
         self.checkpoints.finish()?;
+        if let Some(saved) = &self.saved_replay {
+            saved.remove_earlier(self.state.progress.updates)?;
+        }
         Ok(ending)
     }
 
@@ -344,14 +348,18 @@ impl Trainer {
         Ok(())
     }
 
-    /// A step that was skipped at the very end changed nothing, so finite parameters are enough.
+    /// A step that was skipped at the very end changed nothing, so finite parameters are enough. The replay comes after the
+    /// checkpoint, because it can take longer than an operator waits.
     fn write_last_checkpoint(&mut self) -> Result<()> {
         let name = Name::Updates(self.state.progress.updates);
-        if self.state.algorithm.is_finite() {
-            self.write_checkpoint(name)
-        } else {
-            self.write_checkpoint_if_sound(name)
+        if !self.state.algorithm.is_finite() && !self.is_sound() {
+            tracing::warn!(checkpoint = %name, "not written: the last gradient steps were not finite");
+            return Ok(());
         }
+        let snapshot = self.snapshot()?;
+        self.checkpoints.write(name, snapshot)?;
+        self.save_replay(name);
+        Ok(())
     }
 
     fn write_checkpoint(&mut self, name: Name) -> Result<()> {
@@ -365,6 +373,8 @@ impl Trainer {
     fn save_replay(&mut self, name: Name) {
         if let (Name::Updates(updates), Some(saved), Some(replay)) =
             (name, &self.saved_replay, self.experience.replay())
+            // That of the same number of updates is the same.
+            && saved.size(updates) == 0
             && let Err(error) = saved.write(updates, |writer| replay.write_to(writer))
         {
             tracing::error!(checkpoint = %name, "the replay is not saved: {}", comic_proto::chain(&error));
@@ -391,20 +401,23 @@ impl Trainer {
 }
 
 /// Begins with the replay that was saved with the checkpoint after `resumed` updates, or with an empty one.
-fn begin_replay(replay: &mut Replay, saved: Option<&SavedReplay>, resumed: Option<u64>) -> Result<()> {
-    let found = match (saved, resumed) {
-        (Some(saved), Some(updates)) => saved.open(updates)?,
-        _ => None,
+fn begin_replay(replay: &mut Replay, saved: Option<&SavedReplay>, resumed: Option<u64>, run: &Path) -> Result<()> {
+    let updates = resumed.unwrap_or(0);
+    let Some(saved) = saved else {
+        if resumed.is_some() {
+            tracing::warn!("the replay begins empty, because replay.save is off");
+        }
+        return Ok(());
     };
-    if let Some((path, mut file)) = found {
-        let remedy = "remove it to begin with an empty replay";
-        replay.read_from(&mut file).map_err(Error::within(format!("{}: {remedy}", path.display())))?;
-    } else if resumed.is_some() {
-        tracing::warn!("the replay begins empty: no replay was saved with this checkpoint (replay.save)");
+    saved.tidy(updates)?;
+    match saved.open(updates)?.filter(|_| resumed.is_some()) {
+        Some((path, mut file)) => {
+            let remedy = format!("{}: remove it to begin with an empty replay", path.display());
+            replay.read_from(&mut file).map_err(|error| incompatible(run, Error::within(remedy)(error)))?;
+        }
+        None if resumed.is_some() => tracing::warn!("the replay begins empty: none was saved with this checkpoint"),
+        None => {}
     }
-    match saved {
-        // While one is replaced, there are two.
-        Some(saved) => saved.check_room(2 * replay.memory()),
-        None => Ok(()),
-    }
+    // While one is replaced, there are two.
+    saved.check_room((2 * replay.memory()).saturating_sub(saved.size(updates)))
 }
