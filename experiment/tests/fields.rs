@@ -20,7 +20,8 @@ fn the_unique_end_of_a_name_finds_the_field() {
 fn an_ambiguous_end_of_a_name_is_refused_with_all_candidates() {
     assert_eq!(
         find_field("sweep.toml", "initial_std").unwrap_err().to_string(),
-        "sweep.toml: `initial_std` could be `network.initial_std` or `network.latent.initial_std`; write one of them"
+        "sweep.toml: `initial_std` could be `network.initial_std` or `network.latent.initial_std` or `svg0.initial_std`; \
+         write one of them"
     );
 }
 

@@ -79,8 +79,7 @@ impl Step {
         };
         let noise = fixture.array("noise");
         let sizes = |values: Tensor| Vec::<f32>::try_from(values).unwrap().iter().map(|size| *size as usize).collect();
-        let mut experiment = Experiment::default();
-        experiment.algorithm = AlgorithmName::Svg0;
+        let mut experiment = Experiment { algorithm: AlgorithmName::Svg0, ..Experiment::default() };
         experiment.transfer.mean_scale = fixture.scalar("mean_scale");
         experiment.svg0.min_std = fixture.scalar("min_std");
         experiment.network.normaliser_steps = 1;

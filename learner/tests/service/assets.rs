@@ -80,7 +80,7 @@ async fn an_asset_that_shrank_or_vanished_after_the_start_is_an_error() {
 fn offer(folder: &Path, updates: u64, policy: &str) -> Offer {
     let random = serde_json::to_string(&Pcg64::seed_from_u64(1)).unwrap();
     let progress = format!(
-        r#"{{"run": 7, "epoch": 3, "updates": {updates}, "environment_steps": 70, "seconds": 2.5, "version": 9,
+        r#"{{"format": 2, "run": 7, "epoch": 3, "updates": {updates}, "gradient_steps": 40, "environment_steps": 70, "seconds": 2.5, "version": 9,
             "random": {random}}}"#
     );
     let mut snapshot = Snapshot::default();

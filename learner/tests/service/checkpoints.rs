@@ -10,6 +10,7 @@ use proptest::prelude::*;
 fn snapshot(content: &str) -> Snapshot {
     let mut snapshot = Snapshot::default();
     snapshot.parts.insert("part".into(), content.as_bytes().to_vec());
+    snapshot.parts.insert("progress.json".into(), br#"{"format": 2}"#.to_vec());
     snapshot
 }
 
@@ -255,7 +256,7 @@ fn evaluated_run(updates: &[u64]) -> (tempfile::TempDir, Store) {
 
 fn write_evaluated(store: &Store, updates: u64) {
     let mut snapshot = snapshot("policy");
-    let progress = format!("{{\"run\": {RUN}, \"epoch\": 3, \"version\": 1, \"updates\": {updates}}}");
+    let progress = format!("{{\"format\": 2, \"run\": {RUN}, \"epoch\": 3, \"version\": 1, \"updates\": {updates}}}");
     snapshot.parts.insert("progress.json".into(), progress.into_bytes());
     store.write(Name::Updates(updates), &snapshot).unwrap();
 }

@@ -36,8 +36,7 @@ pub(crate) fn spec() -> TaskSpec {
 }
 
 pub(crate) fn experiment() -> Experiment {
-    let mut experiment = Experiment::default();
-    experiment.algorithm = AlgorithmName::Svg0;
+    let mut experiment = Experiment { algorithm: AlgorithmName::Svg0, ..Experiment::default() };
     experiment.unroll.length = LENGTH;
     let svg0 = &mut experiment.svg0;
     (svg0.encoder, svg0.action_value) = (vec![8], vec![16]);

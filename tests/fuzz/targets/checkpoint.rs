@@ -47,7 +47,7 @@ fn run() -> Run {
         ("policy.safetensors", policy.clone()),
         ("target.safetensors", policy),
         ("learner.safetensors", tensors::to_bytes(&state).expect("tensors can be written")),
-        ("progress.json", br#"{"epoch": 2, "version": 30, "updates": 29}"#.to_vec()),
+        ("progress.json", br#"{"format": 2, "epoch": 2, "version": 30, "updates": 29}"#.to_vec()),
         ("accounting.json", text(serde_json::to_vec(&batcher.snapshot()))),
     ];
     let valid = Snapshot { parts: parts.map(|(name, bytes)| (name.to_owned(), bytes)).into() };

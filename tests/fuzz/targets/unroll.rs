@@ -29,10 +29,7 @@ static SERVICE: LazyLock<Service> = LazyLock::new(|| {
             unroll.row_mut(field, t).fill(1.0);
         }
     }
-    let header = UnrollHeader {
-        layout_hash: layout.hash().to_vec(),
-        ..UnrollHeader::default()
-    };
+    let header = UnrollHeader { layout_hash: layout.hash().to_vec(), ..UnrollHeader::default() };
     let message = UnrollMessage { header: Some(header), payload: unroll.into_bytes() }.encode_to_vec();
     seed("valid", &[&[128], &message[..]].concat());
     Service { layout, clips: spec.tasks.iter().map(|task| task.clips).collect() }
