@@ -93,12 +93,12 @@ fn solve(config: &Svg0) -> Solution {
             let reward = state as f64;
             solution.action_value[state] = [state, 1 - state].map(|next| reward + config.discount * value[next]);
         }
-        for state in 0..2 {
+        for (state, value) in value.iter_mut().enumerate() {
             let [stay, go] = solution.action_value[state];
             let worth = |(probability, gain, ..): &(f64, f64, f64, f64)| probability * (go - stay) + gain;
             let best = candidates.iter().max_by(|one, other| worth(one).total_cmp(&worth(other))).unwrap();
             let (probability, _, mean, std) = *best;
-            value[state] = stay + probability * (go - stay) - config.kl * (kl(mean, std) + kl(0.0, idle));
+            *value = stay + probability * (go - stay) - config.kl * (kl(mean, std) + kl(0.0, idle));
             solution.std[state] = [std, idle];
         }
     }
