@@ -19,8 +19,9 @@ async fn a_second_signal_ends_a_learner_in_the_middle_of_an_update() -> Result<(
     let _actor = system.start_actor()?;
 
     let mut learner = system.learner.take().context("no learner")?;
-    // Before that, a first signal ends the learner by itself: there is no update to finish.
-    learner.until_log_holds("gradient_step", LIMIT).await?;
+    // Before that, a first signal ends the learner by itself: there is no update to finish. A span's name ends with a colon;
+    // without it the field `gradient_steps` of the first metrics would be taken for the span.
+    learner.until_log_holds("gradient_step:", LIMIT).await?;
     learner.ask_to_end()?;
     learner.until_log_holds("stopping after this update", LIMIT).await?;
     learner.ask_to_end()?;
