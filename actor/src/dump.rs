@@ -11,7 +11,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use comic_clips::Catalogue;
 use comic_experiment::Experiment;
-use comic_tasks::{Environment, Episode, Outcome, Simulated, Simulation, Step};
+use comic_tasks::{Achievement, Environment, Episode, Outcome, Simulated, Simulation, Step};
 use serde::{Deserialize, Serialize};
 
 use crate::Error;
@@ -356,6 +356,10 @@ impl Environment for Watched {
 
     fn take_gradients(&mut self) -> Vec<[f32; 56]> {
         self.environment.take_gradients()
+    }
+
+    fn achievement(&self) -> Achievement {
+        self.environment.achievement()
     }
 
     fn servo_action(&self, action: &mut [f32]) {

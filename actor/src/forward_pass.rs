@@ -298,6 +298,29 @@ pub trait ForwardPass {
         batch.command.copy_from_slice(&batch.action);
         Ok(())
     }
+
+    /// Turns derivatives with respect to commands into derivatives with respect to the actions they were made of, `[N, A]`.
+    ///
+    /// # Errors
+    /// When libtorch fails.
+    fn action_derivatives(&mut self, actuated: Actuated) -> Result<Vec<f32>, Error> {
+        Ok(actuated.derivatives)
+    }
+}
+
+/// N steps of one environment: what made the commands, and the derivatives of the coming rewards with respect to them.
+#[derive(Clone, Debug, Default)]
+pub struct Actuated {
+    /// N.
+    pub steps: usize,
+    /// The policy's actions, `[N, A]`.
+    pub action: Vec<f32>,
+    /// `[N, P]`.
+    pub proprioception: Vec<f32>,
+    /// The recurrent state that a frozen low level read, `[N, S]`.
+    pub low_level_state: Vec<f32>,
+    /// With respect to the commands, `[N, 56]`.
+    pub derivatives: Vec<f32>,
 }
 
 impl<F: ForwardPass + ?Sized> ForwardPass for Box<F> {
@@ -315,6 +338,10 @@ impl<F: ForwardPass + ?Sized> ForwardPass for Box<F> {
 
     fn actuate(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
         (**self).actuate(batch)
+    }
+
+    fn action_derivatives(&mut self, actuated: Actuated) -> Result<Vec<f32>, Error> {
+        (**self).action_derivatives(actuated)
     }
 }
 

@@ -8,7 +8,7 @@ use tch::nn::VarStore;
 use tch::{Device, TchError, Tensor};
 
 use crate::Error;
-use crate::forward_pass::{ActingBatch, ForwardPass, LowLevelShape};
+use crate::forward_pass::{ActingBatch, Actuated, ForwardPass, LowLevelShape};
 
 /// The behaviour policy: its networks and their parameters, on the CPU.
 #[derive(Debug)]
@@ -143,6 +143,20 @@ impl ForwardPass for TorchPolicy {
                 Ok(())
             }
         }
+    }
+
+    fn action_derivatives(&mut self, actuated: Actuated) -> Result<Vec<f32>, Error> {
+        let Some(frozen) = &self.low_level else { return Ok(actuated.derivatives) };
+        let matrix = |values: &[f32]| matrix(values, actuated.steps as i64);
+        let derivatives = frozen.action_derivatives(
+            &matrix(&actuated.action)?,
+            &matrix(&actuated.proprioception)?,
+            &matrix(&actuated.low_level_state)?,
+            &matrix(&actuated.derivatives)?,
+        )?;
+        let mut found = vec![0.0; actuated.action.len()];
+        read(&derivatives, &mut found)?;
+        Ok(found)
     }
 }
 

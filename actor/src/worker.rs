@@ -99,7 +99,7 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
     ) -> Result<Self, Error> {
         let (length, records) = (layout.shape().length, layout.shape().action_gradient > 0);
         let mut acting = ActingLoop::new(environments, layout.shape(), forward.low_level());
-        let recorder = UnrollRecorder::new(layout, (first..).take(acting.rollouts.len()), seed);
+        let recorder = UnrollRecorder::new(layout, forward.low_level(), (first..).take(acting.rollouts.len()), seed);
         for (index, rollout) in acting.rollouts.iter_mut().enumerate() {
             if records {
                 rollout.environment.record_gradients()?;
@@ -194,7 +194,8 @@ impl<E: Environment, F: ForwardPass> Worker<E, F> {
         let ActingLoop { rollouts, batch } = &mut self.acting;
         let mut unrolls = Vec::with_capacity(rollouts.len());
         for ((index, rollout), environment) in rollouts.iter_mut().enumerate().zip(self.first..) {
-            self.recorder.write_gradients(index, &rollout.environment.take_gradients())?;
+            let gradients = rollout.environment.take_gradients();
+            self.recorder.write_gradients(index, &gradients, &mut self.forward)?;
             let RecordedUnroll { payload, episodes, task } = self.recorder.take(index);
             if rollout.ended {
                 rollout.environment.reset();

@@ -9,6 +9,13 @@ use crate::nearest::hint;
 
 /// Format: `data/make_builtin.py`; provenance: `data/README.md`, `data/builtin.json`.
 const BYTES: &[u8] = include_bytes!("../data/builtin.bin");
+/// The terms of the built-in recordings and of what is made of them; NOTICE has them, too.
+pub const BUILTIN_TERMS: &str = "The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with \
+    funding from NSF EIA-0196217. CMU's terms: \"This data is free for use in research projects. You may include this data in \
+    commercially-sold products, but you may not resell this data directly, even in converted form. If you publish results \
+    obtained using this data, we would appreciate it if you would send the citation to your published paper to \
+    jkh+mocap@cs.cmu.edu, and also would add this text to your acknowledgments section: The data used in this project was \
+    obtained from mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217.\"";
 const MAGIC: &[u8; 8] = b"COMICLIP";
 const VERSION: u32 = 1;
 const HEADER: usize = 32;

@@ -9,7 +9,8 @@
 //! - [`import`] makes clips from CMU's ASF and AMC files, [`check`] finds defects, [`ClipWriter`] writes files that
 //!   dm_control reads, and [`merge()`] joins several files. They compute body positions by forward kinematics.
 //! - [`spatial`] has vectors, rotation matrices and quaternions.
-//! - [`subset`] lists dm_control's named subsets, [`builtin_names`] the names that can follow `builtin:`.
+//! - [`subset`] lists dm_control's named subsets, [`builtin_names`] the names that can follow `builtin:`, and
+//!   [`BUILTIN_TERMS`] the terms of those recordings.
 //!
 //! A source is `builtin:NAME` (compiled in, or made by the program) or the path of an HDF5 file in the layout of
 //! dm_control's mocap files. Such a file has a group per clip. The group has a group `walkers/walker_0` with one
@@ -33,7 +34,7 @@ pub mod spatial;
 mod subsets;
 mod write;
 
-pub use builtin::builtin_names;
+pub use builtin::{BUILTIN_TERMS, builtin_names};
 pub use catalogue::{Asset, Catalogue};
 pub use clip::{Clip, Features, Motion};
 pub use comic_experiment::SUBSETS;

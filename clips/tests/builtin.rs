@@ -5,7 +5,7 @@ mod support;
 
 use std::collections::BTreeMap;
 
-use comic_clips::{Catalogue, Clip, JOINT_RANGES, Motion, WalkerModel, builtin_names};
+use comic_clips::{BUILTIN_TERMS, Catalogue, Clip, JOINT_RANGES, Motion, WalkerModel, builtin_names};
 use comic_experiment::ClipSource;
 use sha2::{Digest as _, Sha256};
 use support::{names, recordings, refused, with_ids};
@@ -143,4 +143,10 @@ fn a_builtin_clip_takes_neither_subset_nor_ids() {
 #[test]
 fn a_builtin_clip_named_without_its_prefix_is_recognised() {
     assert_eq!(refused(ClipSource::whole("walk")), "no clip file `walk` (did you mean `builtin:walk`?)");
+}
+
+#[test]
+fn the_terms_are_those_of_the_notice() {
+    let words = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(words(include_str!("../../NOTICE")).contains(&words(BUILTIN_TERMS)));
 }

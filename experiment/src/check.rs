@@ -137,10 +137,17 @@ fn network(network: &Network) -> Result<(), Fault> {
     ensure("network.latent.min_std", latent.min_std, positive(latent.min_std), POSITIVE)?;
     let holds = positive(latent.initial_std) && latent.initial_std > latent.min_std;
     ensure("network.latent.initial_std", latent.initial_std, holds, "must exceed network.latent.min_std")?;
-    match latent.prior {
+    match &latent.prior {
         Prior::Standard => Ok(()),
+        Prior::State { hidden } => {
+            let holds = (1..=16).contains(&hidden.len()) && hidden.iter().all(|size| (1..=16384).contains(size));
+            let remedy = "must be 1 to 16 layers of 1 to 16384 units";
+            ensure("network.latent.prior.state.hidden", hidden, holds, remedy)?;
+            let remedy = "must be positive with a network.latent.prior of the state";
+            ensure("network.latent.size", latent.size, latent.size > 0, remedy)
+        }
         Prior::Ar1 { alpha } => {
-            ensure("network.latent.prior.ar1.alpha", alpha, (0.0..1.0).contains(&alpha), "must be in [0, 1)")
+            ensure("network.latent.prior.ar1.alpha", alpha, (0.0..1.0).contains(alpha), "must be in [0, 1)")
         }
     }
 }

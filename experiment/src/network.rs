@@ -204,7 +204,7 @@ pub struct Latent {
     pub min_std: f64,
     /// The encoder's standard deviation before learning (D).
     pub initial_std: f64,
-    /// The prior p(z_t | z_{t−1}).
+    /// The prior of z_t.
     pub prior: Prior,
 }
 
@@ -215,11 +215,17 @@ impl Default for Latent {
 }
 
 /// The latent's prior.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Prior {
     /// N(0, I).
     Standard,
+    /// p(z_t | s_t): a Gaussian that a network makes of proprioception, and that is learned in the KL divergence. The encoder
+    /// then gives the difference from the prior's mean (PULSE; Luo et al., 2024). An exported low level has this prior.
+    State {
+        /// Hidden sizes of the prior's network.
+        hidden: Vec<usize>,
+    },
     /// N(α z_{t−1}, (1 − α²) I), N(0, I) at an episode's first step (NPMP: α = 0.95).
     Ar1 {
         /// α.

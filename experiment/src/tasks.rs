@@ -21,7 +21,7 @@ pub use corridor::Corridor;
 pub use gaps::Gaps;
 pub use get_up::{GetUp, GradientOfStanding, LyingPose};
 pub use go_to_target::GoToTarget;
-pub use shared::{StartPose, Vision};
+pub use shared::{GradientOfSpeed, StartPose, Vision};
 pub use tracking::{
     GradientOfReward, TRACKING_MAX_REWARD, TRACKING_OBSERVATIONS, TRACKING_REWARD_TERMS, TRACKING_TERM_LIMITS,
     TerminationError, Tracking, tracking_observation_size,

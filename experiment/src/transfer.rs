@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Transfer {
-    /// A file that `comic-learner export --part low-level` wrote, or a run's directory, whose newest checkpoint is used. Empty
-    /// is no transfer: the low level is learned.
+    /// `builtin`, which is the low level in the programs; a file that `comic-learner export --part low-level` wrote; or a run's
+    /// directory, whose newest checkpoint is used. Empty is no transfer: the low level is learned.
     pub low_level: String,
     /// SHA-256 of the low level, hexadecimal. The learner fills it in; if it stands here, another low level is refused.
     pub sha256: String,
@@ -49,6 +49,9 @@ impl Default for Transfer {
 }
 
 impl Transfer {
+    /// The name of the low level that is compiled into the programs. There is one, so it has no other name.
+    pub const BUILTIN: &'static str = "builtin";
+
     /// Whether the experiment uses a frozen low level.
     pub fn is_on(&self) -> bool {
         !self.low_level.is_empty()

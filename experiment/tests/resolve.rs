@@ -126,9 +126,10 @@ fn the_error_of_an_unknown_document_lists_the_presets() {
     assert!(message.starts_with("no preset or file `trackin-mlp` ("), "{message}");
     assert!(
         message.ends_with(
-            "presets are ball-catch, gaps, get-up, go-to-target, joint-ball, joint-get-up, quickstart, \
-             quickstart-from-zero, tracking-lstm, tracking-mixture, tracking-mlp, tracking-product, walks-and-more, \
-             walls"
+            "presets are ball-catch, corridor, gaps, get-up, go-to-target, joint-ball, joint-get-up, low-level, \
+             quickstart, quickstart-from-zero, tracking-lstm, tracking-mixture, tracking-mlp, tracking-product, \
+             transfer-ball-catch, transfer-corridor, transfer-corridor-svg0, transfer-gaps, transfer-get-up, \
+             transfer-go-to-target, transfer-paper, transfer-walls, walks-and-more, walls"
         ),
         "{message}"
     );

@@ -6,7 +6,7 @@ use comic_experiment::{ACTION_SIZE, Experiment, TaskSpec, TransferPrior, resolve
 /// Go-to-target with a low level and these fields.
 fn transfer(fields: &[&str]) -> Result<Experiment, comic_experiment::Error> {
     let fields = ["transfer.low_level=low_level.safetensors"].iter().chain(fields);
-    resolve("go-to-target", &fields.map(|field| (*field).to_string()).collect::<Vec<_>>())
+    resolve("transfer-go-to-target", &fields.map(|field| (*field).to_string()).collect::<Vec<_>>())
 }
 
 #[test]
@@ -31,7 +31,6 @@ fn the_policys_action_is_the_latent_and_it_has_no_latent_and_no_memory_of_its_ow
 #[test]
 fn fields_that_make_no_sense_beside_a_low_level_are_refused() {
     for (field, remedy) in [
-        ("vmpo.action_gradient=1", "vmpo.action_gradient"),
         ("network.initial_pose=reference-mean", "network.initial_pose"),
         (r#"joint=[{task="get-up", probability=0.1}]"#, "joint"),
         ("transfer.sha256=12", "64 hexadecimal digits"),

@@ -3,6 +3,7 @@
 pub mod certs;
 pub mod export;
 pub mod health;
+pub mod low_level;
 pub mod prior;
 pub mod sizes;
 pub mod status;

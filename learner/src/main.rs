@@ -69,6 +69,7 @@ fn run_command(command: &Command, options: &Options) -> Result<()> {
     match command {
         Command::Export { checkpoint, part, out } => commands::export::run(checkpoint, *part, out),
         Command::Prior(prior) => prior.run(),
+        Command::LowLevel(low_level) => low_level.run(),
         Command::Sizes => {
             let table = commands::sizes::table(&options.document)?;
             let written = std::io::stdout().write_all(table.as_bytes());

@@ -8,6 +8,7 @@ use comic_networks::export::Part;
 
 use crate::commands::certs::Certs;
 use crate::commands::health::Health;
+use crate::commands::low_level::LowLevel;
 use crate::commands::prior::Prior;
 use crate::commands::status::Status;
 use crate::document::DocumentArguments;
@@ -74,6 +75,8 @@ pub enum Command {
     },
     /// Fit the prior of a low level's latents, for a transfer with `transfer.prior = "state"`.
     Prior(Prior),
+    /// Print the card of a low level: what it was learned from, how well, and how it is made again.
+    LowLevel(LowLevel),
     /// Print how many parameters the networks of the paper's presets have, or those of --preset and --set.
     Sizes,
     /// Print the state of a running learner.

@@ -8,7 +8,6 @@
 
 mod fixture;
 
-use comic_experiment::Prior;
 use comic_learner::vmpo::{Evidence, KlLimits, Multipliers, policy_improvement, returns};
 use comic_networks::{ActionDistribution, DiagonalGaussian};
 use fixture::{Fixture, Folder};
@@ -78,9 +77,9 @@ fn gaussians_equal_pytorchs_distributions() {
         fixture.compare("kl_std", &policy.kl_std(&behaviour));
         fixture.compare("kl_standard", &policy.kl_to_standard_normal());
         if let Some(previous) = fixture.find("previous") {
-            let prior = Prior::Ar1 { alpha: fixture.scalar("alpha") };
+            let alpha = fixture.scalar("alpha");
             let first = previous.select(-1, 0).zeros_like();
-            fixture.compare("kl_ar1", &policy.kl_to_prior(&prior, &previous, &first));
+            fixture.compare("kl_ar1", &policy.kl_to_ar1(alpha, &previous, &first));
         }
     }
 }

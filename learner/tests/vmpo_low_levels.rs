@@ -5,7 +5,9 @@
 
 mod vmpo_support;
 
-use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives};
+use std::collections::BTreeMap;
+
+use comic_experiment::{Experiment, LowLevelName, Lstm, Primitives, Prior};
 use comic_learner::algorithm::Algorithm as _;
 use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::vmpo::VmpoLearner;
@@ -116,6 +118,39 @@ fn acting_step_by_step_is_acting_on_the_whole_unroll() {
         assert_close(&format!("{name}: latent"), &acting.latent, &Tensor::from_slice(&latents));
         assert_close(&format!("{name}: state"), &acting.state, &state);
     }
+}
+
+#[test]
+fn a_prior_of_the_state_is_learned_in_the_latents_kl() {
+    let (_, mut experiment) = every_low_level().remove(0);
+    experiment.network.latent.prior = Prior::State { hidden: vec![6] };
+    experiment.network.latent.beta = 1.0;
+    let mut learner = learner(&experiment, 1);
+    let Acted { unrolls, latents, .. } = acted(&learner, &experiment, 2);
+    let acting = unrolls.act_at_once(&learner, &experiment, &Routing::single());
+    assert_close("latent", &acting.latent, &Tensor::from_slice(&latents));
+    let kl = acting.latent_posterior.unwrap().kl(&acting.latent_prior.unwrap());
+    let valid = Tensor::from_slice(&unrolls.valid);
+    let expected = ((kl * &valid).sum(Kind::Double) / valid.sum(Kind::Double)).double_value(&[]);
+    let before: Vec<Tensor> = prior_of(&learner).into_values().map(|tensor| tensor.detach().copy()).collect();
+    assert!(!before.is_empty());
+    let losses = learner.step(&unrolls.minibatch()).unwrap().to_values();
+    let found = f64::from(losses.get("latent_kl").unwrap());
+    assert!((found - expected).abs() < 1e-5 * expected, "{found} is not {expected}");
+    for ((name, tensor), before) in prior_of(&learner).into_iter().zip(before) {
+        let moved = (tensor - before).abs();
+        assert!(moved.max().double_value(&[]) > 0.0, "{name} does not learn");
+        if name == "prior.head.bias" {
+            // The second half makes σ, which only the KL reaches.
+            let half = moved.size()[0] / 2;
+            assert!(moved.narrow(0, half, half).min().double_value(&[]) > 0.0, "the KL does not train the prior");
+        }
+    }
+}
+
+/// The parameters of the prior by name.
+fn prior_of(learner: &VmpoLearner) -> BTreeMap<String, Tensor> {
+    learner.policy_store().variables().into_iter().filter(|(name, _)| name.starts_with("prior.")).collect()
 }
 
 #[test]

@@ -63,12 +63,14 @@ impl Encoder {
         Self { networks: PerTask::new(networks.collect()), head }
     }
 
-    /// `input` is `[N, X+P+Z]`, `noise` `[N, Z]`.
-    pub(crate) fn forward(&self, input: &Tensor, noise: &Tensor, routing: &Routing) -> Encoded {
+    /// `input` is `[N, X+P+Z]`, `noise` `[N, Z]`. `from` is what the latent's mean is a difference from, `[N, Z]`: the mean of a
+    /// prior of the state, if there is one.
+    pub(crate) fn forward(&self, input: &Tensor, from: Option<&Tensor>, noise: &Tensor, routing: &Routing) -> Encoded {
         let output = self.networks.forward(input, routing);
         match self.head {
             Head::Latent { min_std } => {
-                let posterior = gaussian(&output, min_std);
+                let DiagonalGaussian { mean, std } = gaussian(&output, min_std);
+                let posterior = DiagonalGaussian { mean: from.map_or(mean.shallow_clone(), |from| from + &mean), std };
                 let latent = posterior.sample(noise);
                 Encoded { intent: latent.shallow_clone(), latent, posterior: Some(posterior) }
             }

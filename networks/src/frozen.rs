@@ -1,7 +1,7 @@
 //! A low level that was learned before and is not trained any more.
 
 use comic_experiment::{ACTION_SIZE, Network, PROPRIOCEPTION_SIZE, Transfer, TransferPrior};
-use tch::{Device, Tensor, nn};
+use tch::{Device, Kind, Tensor, nn};
 
 use crate::low_level::{self, LowLevel};
 use crate::lstm::RecurrentState;
@@ -46,7 +46,7 @@ impl FrozenLowLevel {
         let statistics =
             [path.zeros_no_train("proprioception_mean", &size), path.ones_no_train("proprioception_std", &size)];
         let normaliser = normalises.then_some(statistics);
-        let prior = prior.map(|hidden| StatePrior::new(&(&root / "prior"), network, hidden));
+        let prior = prior.map(|hidden| StatePrior::new(&(&root / "prior"), PROPRIOCEPTION_SIZE, network, hidden));
         let prior = prior.filter(|_| transfer.prior == TransferPrior::State);
         let latent_limit = transfer.latent_limit;
         (store, Self { low_level, normaliser, prior, latent_limit, state_size: network.state_size() })
@@ -63,6 +63,32 @@ impl FrozenLowLevel {
             Some([mean, std]) => normalise(proprioception, mean, std),
             None => proprioception.shallow_clone(),
         }
+    }
+
+    /// The derivatives `[N, A]` with respect to the policy's actions, for derivatives `[N, 56]` with respect to the commands that
+    /// [`act`](Self::act) made of them. Later commands are held fixed, also where the low level is recurrent. They are 0 for a
+    /// mixture, whose latent only chooses the component.
+    ///
+    /// # Errors
+    /// libtorch fails.
+    pub fn action_derivatives(
+        &self,
+        action: &Tensor,
+        proprioception: &Tensor,
+        state: &Tensor,
+        derivatives: &Tensor,
+    ) -> Result<Tensor, tch::TchError> {
+        tch::with_grad(|| {
+            let action = action.detach().set_requires_grad(true);
+            let (command, _) = self.act(&action, proprioception, state);
+            let along = (command * derivatives).sum(Kind::Float);
+            // The mean of a mixture is that of its most likely component. libtorch would crash: it has nothing to go back through.
+            if !along.requires_grad() {
+                return Ok(action.zeros_like());
+            }
+            let mut found = Tensor::f_run_backward(&[along], &[&action], false, false)?;
+            found.pop().ok_or_else(|| tch::TchError::Torch("no derivative".into()))
+        })
     }
 
     /// The low level's mean action `[N, 56]` for the policy's actions `[N, Z]`, and its next recurrent state `[N, S]`. An action

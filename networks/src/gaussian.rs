@@ -1,6 +1,5 @@
 //! Gaussians with a diagonal covariance.
 
-use comic_experiment::Prior;
 use tch::{Kind, Tensor};
 
 /// ½ ln 2π.
@@ -73,23 +72,17 @@ impl DiagonalGaussian {
         sum_last(&terms)
     }
 
-    /// KL(self ‖ p(z_t | z_{t−1})) for the prior p.
+    /// KL(self ‖ p(z_t | z_{t−1})) for the prior p = N(α z_{t−1}, (1 − α²) I). With this variance N(0, I) is stationary.
     ///
-    /// `previous` is z_{t−1}, `[.., D]`. `first` is `[..]` and 1 at the first step of an episode, where every prior is
-    /// N(0, I). The AR(1) prior is N(α z_{t−1}, (1 − α²) I); with this variance N(0, I) is stationary.
-    pub fn kl_to_prior(&self, prior: &Prior, previous: &Tensor, first: &Tensor) -> Tensor {
-        match *prior {
-            Prior::Standard => self.kl_to_standard_normal(),
-            Prior::Ar1 { alpha } => {
-                let first = first.unsqueeze(-1);
-                let other = Self {
-                    mean: previous * ((1.0 - &first) * alpha),
-                    // √(1 − α²) inside an episode, 1 at its first step.
-                    std: (&first * (alpha * alpha) + (1.0 - alpha * alpha)).sqrt(),
-                };
-                self.kl(&other)
-            }
-        }
+    /// `previous` is z_{t−1}, `[.., D]`. `first` is `[..]` and 1 at the first step of an episode, where the prior is N(0, I).
+    pub fn kl_to_ar1(&self, alpha: f64, previous: &Tensor, first: &Tensor) -> Tensor {
+        let first = first.unsqueeze(-1);
+        let other = Self {
+            mean: previous * ((1.0 - &first) * alpha),
+            // √(1 − α²) inside an episode, 1 at its first step.
+            std: (&first * (alpha * alpha) + (1.0 - alpha * alpha)).sqrt(),
+        };
+        self.kl(&other)
     }
 }
 

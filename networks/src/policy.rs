@@ -21,6 +21,8 @@ pub struct Acting {
     pub action: ActionDistribution,
     /// q(z_t | x_t, s_t, z_{t−1}), over `[N, Z]`; `None` if the policy has no latent.
     pub latent_posterior: Option<DiagonalGaussian>,
+    /// p(z_t | s_t), over `[N, Z]`; `None` if the policy does not learn a prior of the state.
+    pub latent_prior: Option<DiagonalGaussian>,
     /// The recurrent state after the last row of each unroll, `[B, S]`.
     pub state: Tensor,
 }
@@ -80,6 +82,8 @@ pub(crate) trait Builder {
 pub(crate) struct Weights {
     /// Of a low level of its own.
     pub(crate) low_level: u64,
+    /// Of a prior of the state that is learned with it.
+    pub(crate) prior: u64,
     /// Of everything else.
     pub(crate) rest: u64,
 }

@@ -1,6 +1,6 @@
 //! The prior of the state: which latents are likely in a pose.
 
-use comic_experiment::{Network, PROPRIOCEPTION_SIZE};
+use comic_experiment::Network;
 use tch::{Tensor, nn};
 
 use crate::gaussian::DiagonalGaussian;
@@ -9,8 +9,8 @@ use crate::layers::{GaussianHead, GaussianHeadConfig, Torso};
 /// Least standard deviation of an entry of the latent (D).
 const MIN_STD: f64 = 1e-2;
 
-/// p(z | s), fitted to the latents of an encoder: normalised proprioception → torso → mean and σ of the latent. It begins near
-/// N(0, I).
+/// p(z | s), learned with an encoder or fitted to its latents: normalised proprioception → torso → mean and σ of the latent. It
+/// begins near N(0, I).
 #[derive(Debug)]
 pub struct StatePrior {
     torso: Torso,
@@ -18,9 +18,10 @@ pub struct StatePrior {
 }
 
 impl StatePrior {
-    /// A prior for the latents of `network`, with its parameters in `path`. `hidden` has at least one layer.
-    pub fn new(path: &nn::Path, network: &Network, hidden: &[usize]) -> Self {
-        let torso = Torso::new(path, PROPRIOCEPTION_SIZE as i64, hidden);
+    /// A prior for the latents of `network`, with its parameters in `path`. `proprioception` is P; `hidden` has at least one
+    /// layer.
+    pub fn new(path: &nn::Path, proprioception: usize, network: &Network, hidden: &[usize]) -> Self {
+        let torso = Torso::new(path, proprioception as i64, hidden);
         let mean = vec![0.0; network.latent.size];
         let start = GaussianHeadConfig { mean: &mean, initial_std: 1.0, min_std: MIN_STD, scale: 0.1 };
         let head = GaussianHead::new(path, torso.output(), &start);

@@ -82,6 +82,7 @@ impl Policy for Svg0Policy {
             latent: rows(latent_noise),
             action: ActionDistribution::Gaussian(action),
             latent_posterior: None,
+            latent_prior: None,
             state: Tensor::cat(&[core_state, policy_state], 1),
         }
     }
@@ -116,7 +117,7 @@ impl policy::Builder for Builder {
         let lstm = |input: u64, units: u64| 4 * units * (input + units);
         let [core, policy] = [core, policy].map(|units| *units as u64);
         let head = policy * 2 * spec.action as u64;
-        Weights { low_level: 0, rest: weights + lstm(width, core) + lstm(core, policy) + head }
+        Weights { low_level: 0, prior: 0, rest: weights + lstm(width, core) + lstm(core, policy) + head }
     }
 }
 

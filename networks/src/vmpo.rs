@@ -1,6 +1,6 @@
 //! The policy of V-MPO: a reference encoder and a low level, or, in transfer, a high level.
 
-use comic_experiment::{Experiment, Network, TaskSpec, Transfer};
+use comic_experiment::{Experiment, Network, Prior, TaskSpec, Transfer};
 use tch::{Tensor, nn};
 
 use crate::action::ActionDistribution;
@@ -13,8 +13,9 @@ use crate::low_level::{self, Layer, LowLevel, Sizes, low_level_layers};
 use crate::lstm::RecurrentState;
 use crate::normaliser::{NormalisedObservation, Normaliser, NormaliserStatistics};
 use crate::policy::{self, Acting, Policy, Weights};
+use crate::prior::StatePrior;
 use crate::routing::Routing;
-use crate::weights::{hidden, image_features};
+use crate::weights::{self, hidden, image_features};
 
 /// Largest standard deviation that a schedule can set, as the experiment's check has it.
 const LARGEST_STD: f64 = 1e3;
@@ -37,7 +38,7 @@ pub struct VmpoPolicy {
 #[derive(Debug)]
 enum Head {
     /// A latent, and from it the action.
-    LowLevel { encoder: Encoder, low_level: Box<dyn LowLevel> },
+    LowLevel { encoder: Encoder, prior: Option<StatePrior>, low_level: Box<dyn LowLevel> },
     /// In transfer: the action is the latent of a frozen low level.
     HighLevel(HighLevel),
 }
@@ -60,12 +61,16 @@ impl policy::Builder for Builder {
     fn weights(&self, spec: &TaskSpec, experiment: &Experiment) -> Weights {
         let network = &experiment.network;
         if experiment.transfer.is_on() {
-            return Weights { low_level: 0, rest: high_level_weights(spec, network) };
+            return Weights { low_level: 0, prior: 0, rest: high_level_weights(spec, network) };
         }
         let sizes = Sizes { proprioception: spec.proprioception, actions: spec.action, network };
         Weights {
             low_level: low_level_layers(&sizes).into_iter().map(Layer::weights).sum(),
             rest: spec.tasks.iter().map(|task| encoder_weights(spec, task.observation, network)).sum(),
+            prior: match &network.latent.prior {
+                Prior::State { hidden } => weights::prior(spec, network, hidden),
+                Prior::Standard | Prior::Ar1 { .. } => 0,
+            },
         }
     }
 }
@@ -98,7 +103,11 @@ impl VmpoPolicy {
         let encoder = Encoder::new(&(store / "encoder"), spec, image_features, config);
         let low_level = low_level::Config { latent, proprioception, pose, network: config };
         let low_level = low_level::build(&(store / "low_level"), &low_level);
-        let head = Head::LowLevel { encoder, low_level };
+        let prior = match &config.latent.prior {
+            Prior::State { hidden } => Some(StatePrior::new(&(store / "prior"), spec.proprioception, config, hidden)),
+            Prior::Standard | Prior::Ar1 { .. } => None,
+        };
+        let head = Head::LowLevel { encoder, prior, low_level };
         Ok(Self::assemble(store, "low_level", spec, config, image_encoder, head))
     }
 
@@ -161,13 +170,15 @@ impl Policy for VmpoPolicy {
     ) -> Acting {
         let NormalisedObservation { proprioception, task, routing } = observation;
         let acting = match &self.head {
-            Head::LowLevel { encoder, low_level } => {
+            Head::LowLevel { encoder, prior, low_level } => {
                 let input = rows(&Tensor::cat(&[task, proprioception, previous_latent], -1));
-                let encoded = encoder.forward(&input, &rows(latent_noise), routing);
                 let proprioception = &rows(proprioception);
+                let latent_prior = prior.as_ref().map(|prior| prior.forward(proprioception));
+                let from = latent_prior.as_ref().map(|prior| &prior.mean);
+                let encoded = encoder.forward(&input, from, &rows(latent_noise), routing);
                 let input = low_level::Input { intent: &encoded.intent, proprioception, recurrent };
                 let low_level::Output { action, state } = low_level.act(&input);
-                Acting { latent: encoded.latent, action, latent_posterior: encoded.posterior, state }
+                Acting { latent: encoded.latent, action, latent_posterior: encoded.posterior, latent_prior, state }
             }
             Head::HighLevel(high_level) => Acting {
                 latent: rows(latent_noise),
@@ -175,6 +186,7 @@ impl Policy for VmpoPolicy {
                     high_level.forward(&rows(&Tensor::cat(&[task, proprioception], -1))),
                 ),
                 latent_posterior: None,
+                latent_prior: None,
                 state: recurrent.state.shallow_clone(),
             },
         };

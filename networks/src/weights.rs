@@ -11,3 +11,9 @@ pub(crate) fn hidden(input: u64, sizes: &[usize]) -> (u64, u64) {
 pub(crate) fn image_features(spec: &TaskSpec, network: &Network) -> usize {
     if spec.image > 0 { network.image_features } else { 0 }
 }
+
+/// The number of weights of a prior of the state with these hidden sizes.
+pub(crate) fn prior(spec: &TaskSpec, network: &Network, sizes: &[usize]) -> u64 {
+    let (weights, width) = hidden(spec.proprioception as u64, sizes);
+    weights + width * 2 * network.latent.size as u64
+}

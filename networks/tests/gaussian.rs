@@ -1,6 +1,5 @@
 //! Diagonal Gaussians: closed forms and properties.
 
-use comic_experiment::Prior;
 use comic_networks::DiagonalGaussian;
 use proptest::prelude::*;
 use tch::Tensor;
@@ -43,12 +42,11 @@ fn ar1_prior_has_variance_one_minus_alpha_squared() {
     let alpha = 0.95f32;
     let previous = Tensor::from_slice(&[0.4f32, -1.2]).unsqueeze(0);
     let prior = gaussian(&[alpha * 0.4, alpha * -1.2], &[(1.0 - alpha * alpha).sqrt(); 2]);
-    let prior_of = Prior::Ar1 { alpha: 0.95 };
     let inside = Tensor::from_slice(&[0f32]);
-    assert!(number(&prior.kl_to_prior(&prior_of, &previous, &inside)).abs() < 1e-5);
+    assert!(number(&prior.kl_to_ar1(0.95, &previous, &inside)).abs() < 1e-5);
     let other = gaussian(&[0.1, 0.2], &[0.3, 0.9]);
     let expected = number(&other.kl(&prior));
-    assert!(close(number(&other.kl_to_prior(&prior_of, &previous, &inside)), expected));
+    assert!(close(number(&other.kl_to_ar1(0.95, &previous, &inside)), expected));
 }
 
 #[test]
@@ -56,7 +54,7 @@ fn ar1_prior_is_the_standard_normal_at_an_episodes_first_step() {
     let previous = Tensor::from_slice(&[3f32, -3.0]).unsqueeze(0);
     let first = Tensor::from_slice(&[1f32]);
     let posterior = gaussian(&[0.1, 0.2], &[0.3, 0.9]);
-    let kl = posterior.kl_to_prior(&Prior::Ar1 { alpha: 0.95 }, &previous, &first);
+    let kl = posterior.kl_to_ar1(0.95, &previous, &first);
     assert!(close(number(&kl), number(&posterior.kl_to_standard_normal())));
 }
 

@@ -4,7 +4,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use comic_experiment::{Experiment, LowLevelName, TaskSpec, resolve};
+use comic_experiment::{Experiment, LowLevelName, TaskSpec, Transfer, TransferPrior, resolve};
 use comic_networks::export::{Exported, KEY, Source};
 use comic_networks::{Error, Policy, RecurrentState, Routing, new_policy, to_safetensors};
 use safetensors::SafeTensors;
@@ -102,6 +102,64 @@ fn a_frozen_low_level_acts_as_the_policy_it_was_taken_from() {
             assert!(!action.requires_grad(), "a frozen low level has no gradient");
         }
     }
+}
+
+/// c · ∂command/∂action against central differences of c · command, for each low level, with and without a prior of the state.
+#[test]
+fn the_derivative_with_respect_to_the_action_is_that_of_the_command() {
+    let _guard = GENERATOR.lock().unwrap();
+    for low_level in LowLevelName::ALL {
+        for prior in [TransferPrior::Standard, TransferPrior::State] {
+            let name = format!("network.low_level={low_level}");
+            let experiment = small("tracking-mlp", &[&name, "network.latent.prior={state={hidden=[6]}}"]);
+            let file = exported("low-level", &experiment, None).unwrap();
+            let frozen = file.freeze(&Transfer { prior, latent_limit: 100.0, ..Transfer::default() }).unwrap();
+            let (action, state) = (random(3, 4), random(3, experiment.network.state_size()) * 0.1);
+            let (proprioception, along) =
+                (random(3, comic_experiment::PROPRIOCEPTION_SIZE), random(3, comic_experiment::ACTION_SIZE));
+            let found = frozen.action_derivatives(&action, &proprioception, &state, &along).unwrap();
+            assert_eq!(found.size(), [3, 4]);
+            if low_level == LowLevelName::Mixture {
+                assert_eq!(found.abs().max().double_value(&[]), 0.0, "the latent only chooses the component");
+                continue;
+            }
+            for entry in 0..4 {
+                let step = Tensor::zeros([3, 4], (Kind::Float, Device::Cpu));
+                let _ = step.select(1, entry).fill_(1e-2);
+                let at = |action: Tensor| {
+                    let (command, _) = frozen.act(&action, &proprioception, &state);
+                    (command * &along).sum_dim_intlist(1, false, Kind::Double)
+                };
+                let expected = (at(&action + &step) - at(&action - &step)) / 2e-2;
+                let error = difference(&found.select(1, entry).to_kind(Kind::Double), &expected);
+                let size = expected.abs().max().double_value(&[]);
+                // The differences of float32 numbers have an error of their own.
+                assert!(size > 1e-4 && error < 0.02 * size + 1e-4, "{low_level}, {prior:?}: {error} of {size}");
+            }
+        }
+    }
+}
+
+/// A prior that was learned with the encoder is in the file of the low level, and a fit afterwards replaces it.
+#[test]
+fn a_learned_prior_is_the_one_that_acting_used() {
+    let _guard = GENERATOR.lock().unwrap();
+    let experiment = small("tracking-mlp", &["network.latent.prior={state={hidden=[6]}}"]);
+    let (store, policy, spec) = policy(&experiment);
+    let parameters = to_safetensors(&store).unwrap();
+    let file = Exported::new("low-level".parse().unwrap(), &experiment, Source::default(), &parameters, None).unwrap();
+    assert_eq!(file.spec.prior.as_ref().map(|prior| &prior.hidden[..]), Some(&[6][..]));
+    let transfer = |prior| Transfer { prior, latent_limit: 100.0, ..Transfer::default() };
+    let (proprioception, task, none) = (random(3, spec.proprioception), random(3, spec.task), random(3, 0));
+    let observation = policy.normalise(&proprioception, &task, None, &Routing::single());
+    let recurrent = RecurrentState { state: &none, first: None };
+    let acting = policy.act(&observation, &random(3, 4), &random(3, 4), recurrent);
+    let prior = acting.latent_prior.unwrap();
+    let deviation = random(3, 4);
+    let (expected, _) =
+        file.freeze(&transfer(TransferPrior::Standard)).unwrap().act(&prior.sample(&deviation), &proprioception, &none);
+    let (found, _) = file.freeze(&transfer(TransferPrior::State)).unwrap().act(&deviation, &proprioception, &none);
+    assert!(difference(&found, &expected) < 1e-6);
 }
 
 #[test]

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use comic_experiment::TaskSpec;
 use mujoco_rs::prelude::MjModel;
 
+use crate::achievement::Achievement;
 use crate::error::Error;
 use crate::physics::Simulation;
 
@@ -74,8 +75,8 @@ pub trait Environment: Debug + Send {
     /// The start of the current episode.
     fn episode(&self) -> Episode;
 
-    /// From now on records what [`take_gradients`](Self::take_gradients) needs, about 20 kB a step. Only tracking and
-    /// get-up do.
+    /// From now on records what [`take_gradients`](Self::take_gradients) needs, about 20 kB a step. Ball-catch
+    /// does not.
     ///
     /// # Errors
     /// [`Error::NoDerivative`]: this body has none.
@@ -95,6 +96,9 @@ pub trait Environment: Debug + Send {
     fn position_errors(&self, errors: &mut Vec<[f64; 3]>) {
         errors.clear();
     }
+
+    /// What the current episode has achieved so far. The task defines it; evaluations ask for it at the episode's end.
+    fn achievement(&self) -> Achievement;
 
     /// Writes the servo action: the action whose servos aim at the pose of the next reference frame. It is a baseline.
     /// In a task without a reference the servos aim at the current pose.
@@ -136,6 +140,10 @@ impl<E: Environment + ?Sized> Environment for Box<E> {
 
     fn position_errors(&self, errors: &mut Vec<[f64; 3]>) {
         (**self).position_errors(errors);
+    }
+
+    fn achievement(&self) -> Achievement {
+        (**self).achievement()
     }
 
     fn servo_action(&self, action: &mut [f32]) {

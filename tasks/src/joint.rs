@@ -7,6 +7,7 @@ use mujoco_rs::prelude::MjModel;
 use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 
+use crate::achievement::Achievement;
 use crate::environment::{ClipStarts, Environment, Episode, MAX_REWARD_TERMS, Scenery, Simulated, Step, Task};
 use crate::error::Error;
 use crate::physics::Simulation;
@@ -150,6 +151,10 @@ impl Environment for JointEnvironment {
 
     fn position_errors(&self, errors: &mut Vec<[f64; 3]>) {
         self.environment().position_errors(errors);
+    }
+
+    fn achievement(&self) -> Achievement {
+        self.environment().achievement()
     }
 
     fn servo_action(&self, action: &mut [f32]) {

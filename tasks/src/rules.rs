@@ -9,5 +9,6 @@ mod get_up;
 mod go_to_target;
 mod interface;
 mod poses;
+mod speed;
 mod stage;
 mod walls;

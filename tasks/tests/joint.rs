@@ -97,6 +97,7 @@ fn each_task_is_as_alone_with_its_observation_last_and_its_reward_in_one_term() 
             let (expected, found) = (own.step(&action), environment.step(&action));
             assert_eq!((found.reward(), found.discount), (expected.reward(), expected.discount), "{name}");
             assert_eq!(found.reward_terms[1..], [0.0; MAX_REWARD_TERMS - 1]);
+            assert_eq!(environment.achievement(), own.achievement(), "{name}");
             if expected.outcome != Outcome::Running {
                 break;
             }

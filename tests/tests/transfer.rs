@@ -139,12 +139,14 @@ async fn a_low_level_that_cannot_be_used_ends_the_learner_with_2_and_says_why() 
     export(&tracking.run(), "low-level", &file("whole.safetensors"))?;
     let whole = fs::read(file("whole.safetensors"))?;
     fs::write(file("cut.safetensors"), &whole[..whole.len() / 2])?;
+    low_level(directory.path(), "mixture.safetensors", &["network.low_level=mixture"]).await?;
     let zeros = format!("transfer.sha256={}", "0".repeat(64));
     for (name, field, reason) in [
         ("absent.safetensors", "seed=1", "No such file"),
         ("cut.safetensors", "seed=1", "not a valid safetensors document"),
         ("policy.safetensors", "seed=1", "--part low-level"),
         ("whole.safetensors", zeros.as_str(), "its SHA-256 is"),
+        ("mixture.safetensors", "vmpo.action_gradient=1", "is a mixture"),
     ] {
         let said = refused(&mut transfer(&file(name), &[field])?).await?;
         ensure!(said.contains("transfer.low_level") && said.contains(reason), "{name}: {said}");
@@ -173,7 +175,11 @@ async fn a_checkpoint_of_a_transfer_is_evaluated_while_it_trains() -> Result<()>
 fn assessed(low_level: &Path) -> Result<Vec<(String, f64)>> {
     let mut command = Command::new(program("comic-actor")?);
     command.args(["assess", "--json", "--episodes", "3", "--seconds", "0.5", "--low-level"]).arg(low_level);
-    let rows: Vec<Value> = serde_json::from_slice(&run(&mut command)?.stdout)?;
+    let assessment: Value = serde_json::from_slice(&run(&mut command)?.stdout)?;
+    let rows = assessment["rows"].as_array().context("no rows")?;
+    // Half a second is too short to pass.
+    ensure!(assessment["gate"].is_null() || assessment["gate"]["passed"] == false, "{assessment}");
+    ensure!(assessment["gate"].is_null() == rows.iter().all(|row| row["latents"] != "p(z | s)"), "{assessment}");
     let row = |row: &Value| Some((row["latents"].as_str()?.to_owned(), row["seconds_upright"].as_f64()?));
     rows.iter().map(|found| row(found).with_context(|| format!("{found}"))).collect()
 }
@@ -196,7 +202,7 @@ async fn a_prior_is_fitted_to_latents_and_a_policy_deviates_from_it() -> Result<
     let (without, with) = (assessed(&file("low_level.safetensors"))?, assessed(&file("with_prior.safetensors"))?);
     let names = |rows: &[(String, f64)]| rows.iter().map(|(name, _)| name.clone()).collect::<Vec<_>>();
     ensure!(names(&without) == ["N(0, I)", "z = 0", "untrained, N(0, I)"], "{without:?}");
-    ensure!(names(&with)[0] == "p(z | s)" && with[1..] == without, "{with:?}");
+    ensure!(names(&with)[..2] == ["p(z | s)", "μ(s)"] && with[2..] == without, "{with:?}");
     ensure!(with.iter().all(|(_, seconds)| (0.03..=0.51).contains(seconds)), "{with:?}");
 
     let said = refused(&mut transfer(&file("low_level.safetensors"), &["transfer.prior=state"])?).await?;
@@ -282,4 +288,24 @@ async fn svg0_also_learns_without_a_low_level() -> Result<()> {
     let mut scratch = svg0(&["transfer.mean_scale=1", "budget.updates=3"])?;
     train(&mut scratch).await?;
     normalised_reward(&scratch.run()).map(drop)
+}
+
+/// The description of a low level, as `comic-learner low-level --json` prints it.
+fn described(low_level: &Path) -> Result<Value> {
+    let mut command = Command::new(program("comic-learner")?);
+    Ok(serde_json::from_slice(&run(command.args(["low-level", "--json"]).arg(low_level))?.stdout)?)
+}
+
+#[tokio::test]
+async fn a_transfer_needs_no_file_of_ones_own() -> Result<()> {
+    let builtin = Path::new("builtin");
+    let mut system = transfer(builtin, &["transfer.prior=state"])?;
+    train(&mut system).await?;
+    let kept = system.run().join("low_level.safetensors");
+    ensure!(described(builtin)? == described(&kept)?, "the run has another low level");
+    ensure!(assessed(builtin)? == assessed(&kept)?, "it acts otherwise");
+    let mut command = Command::new(program("comic-learner")?);
+    let text = String::from_utf8(run(command.arg("low-level").arg(builtin))?.stdout)?;
+    ensure!(text.contains("builtin:CMU_007_01") && text.contains("SHA-256"), "{text}");
+    Ok(())
 }

@@ -37,9 +37,12 @@ pub(crate) struct ClipEvaluation {
     /// Reward per survived step / the largest reward of a step.
     pub(crate) reward_per_step: f64,
     pub(crate) fraction_survived: f64,
-    /// Absent in evaluations of earlier releases, as the two below.
+    /// Absent in evaluations of earlier releases, as the three below.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) success_rate: Option<f64>,
+    /// The task's measures of success, by name.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub(crate) measures: BTreeMap<String, f64>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) tracking_error: Option<TrackingError>,
     /// m.

@@ -10,7 +10,7 @@
 //! - [`sweep`] trains with varied fields of an experiment, and compares the runs.
 //! - [`mod@bench`] measures; [`python`] runs other people's code for comparison.
 //! - [`plot`] draws learning curves; [`metrics`] and [`evaluations`] read the files that it draws.
-//! - [`film`] makes the film of the README.
+//! - [`film`] makes the film of the README, and [`low_level`] the built-in low level.
 //!
 //! This program runs before libtorch and MuJoCo are installed, so it links neither.
 
@@ -22,6 +22,7 @@ mod evaluations;
 mod film;
 mod fuzz;
 mod images;
+mod low_level;
 mod metrics;
 mod plot;
 mod python;
@@ -80,6 +81,8 @@ enum Command {
     },
     /// Set up, build, and make the film of the README from a checkpoint
     Film(film::Options),
+    /// Set up, build, and make the built-in low level again: train, fit its prior, measure it, and write it with its card
+    LowLevel(low_level::Options),
     /// Make the tests' fixtures again with the scripts in tests/python
     Fixtures(python::FixtureOptions),
     /// Become a program that gets SIGTERM when the process PARENT ends
@@ -99,6 +102,7 @@ fn main() -> ExitCode {
         Command::Bench(options) => bench::run(&options),
         Command::Plot { metrics, quantities, seeds, out } => plot::run(&metrics, &quantities, seeds, &out),
         Command::Film(options) => film::run(&options),
+        Command::LowLevel(options) => low_level::run(options),
         Command::Fixtures(options) => python::fixtures(&options),
         Command::Child(options) => train::child::run(&options),
     };

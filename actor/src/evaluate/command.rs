@@ -36,7 +36,10 @@ With --json one object goes to standard output:
     normalised_reward  mean of return / (most a step pays x steps left at the episode's start)
     reward_per_step    reward per survived step / most a step pays, 1.45 in tracking
     fraction_survived  mean of steps / steps left in the clip at the episode's start
-    success_rate       share of the episodes that lasted to the end of their clip, or of their time
+    success_rate       share of the episodes that are a success by the task's definition (docs/tasks.md);
+                       in tracking they lasted to the end of their clip
+    measures           means over episodes, by name: targets in go-to-target, metres and obstacles in gaps
+                       and walls, held_steps in ball-catch
     tracking_error     in tracking, means over all steps and the bodies, as PHC defines them:
       position_mm           distance in the world, mm
       local_position_mm     distance when both roots are at the same place, mm

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use comic_experiment::{TaskPart, TaskSpec};
-use comic_tasks::{MAX_REWARD_TERMS, Outcome};
+use comic_tasks::{Achievement, MAX_REWARD_TERMS, Outcome};
 use serde::{Deserialize, Serialize};
 
 use super::settings::RolloutSettings;
@@ -26,6 +26,8 @@ pub struct Finished {
     pub head_heights: f64,
     /// Sums of the distances to the reference.
     pub tracking: TrackingSums,
+    /// What it achieved, by the task's own definition.
+    pub achievement: Achievement,
     /// Why the episode ended.
     pub outcome: Outcome,
 }
@@ -77,9 +79,12 @@ pub struct ClipReport {
     pub reward_per_step: f64,
     /// Mean of steps / steps left in the clip at the start.
     pub fraction_survived: f64,
-    /// Share of the episodes that did not end in the task's own failure: in tracking they lasted to the clip's end. (PHC has
-    /// another rule for a failure: a mean distance above 0.5 m.)
+    /// Share of the episodes that are a success by the task's own definition (`docs/tasks.md`): in tracking they lasted to the
+    /// clip's end. (PHC has another rule for a failure: a mean distance above 0.5 m.)
     pub success_rate: f64,
+    /// Means of the task's measures of success, by name; in joint training over the episodes of the tasks that have them.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub measures: BTreeMap<String, f64>,
     /// Mean distances to the reference; absent in a task without a reference.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tracking_error: Option<TrackingError>,
@@ -157,7 +162,8 @@ impl ClipReport {
             normalised_reward: mean(&|episode| ratio(total(episode), most(episode) * episode.steps_left as f64)),
             reward_per_step: per_step(&|episode| ratio(total(episode), most(episode))),
             fraction_survived: mean(&|episode| ratio(episode.steps() as f64, episode.steps_left as f64)),
-            success_rate: mean(&|episode| if episode.outcome == Outcome::Truncated { 1.0 } else { 0.0 }),
+            success_rate: mean(&|episode| if episode.achievement.success { 1.0 } else { 0.0 }),
+            measures: measures(finished),
             tracking_error: TrackingError::of(finished),
             head_height: per_step(&|episode| episode.head_heights),
             reward_terms: spec
@@ -168,6 +174,16 @@ impl ClipReport {
                 .collect(),
         }
     }
+}
+
+/// The mean of each measure over the episodes that have it.
+fn measures(finished: &[&Finished]) -> BTreeMap<String, f64> {
+    let mut sums: BTreeMap<&str, (f64, f64)> = BTreeMap::new();
+    for (name, value) in finished.iter().flat_map(|episode| episode.achievement.measures()) {
+        let (sum, count) = sums.entry(name).or_default();
+        (*sum, *count) = (*sum + value, *count + 1.0);
+    }
+    sums.into_iter().map(|(name, (sum, count))| (name.to_owned(), ratio(sum, count))).collect()
 }
 
 /// A quotient, 0 when the divisor is 0: JSON has no NaN.
@@ -201,7 +217,8 @@ mod tests {
         let (position, local_position) = (0.02 * steps as f64, 0.01 * steps as f64);
         let tracking = TrackingSums { position, local_position, velocity: 0.0, steps };
         let rewards = vec![0.0; steps];
-        Finished { clip, start: 0, steps_left, rewards, returns, head_heights, tracking, outcome }
+        let achievement = Achievement::new(outcome == Outcome::Truncated);
+        Finished { clip, start: 0, steps_left, rewards, returns, head_heights, tracking, achievement, outcome }
     }
 
     #[test]
@@ -254,5 +271,36 @@ mod tests {
         let report = Report::new(&spec(), &[], &RolloutSettings::default());
         let json = serde_json::to_string(&report).unwrap();
         assert_eq!(serde_json::from_str::<Report>(&json).unwrap(), report);
+    }
+
+    /// An episode of clip `clip` that held so many targets.
+    fn with_targets(clip: usize, targets: f64) -> Finished {
+        let achievement = Achievement::new(targets > 0.0).measuring(&["targets"], [targets]);
+        Finished { achievement, ..episode(clip, 10, 10, 0.0, 0.0) }
+    }
+
+    #[test]
+    fn success_and_measures_are_the_tasks_own() {
+        // All last to the end, but only those with a target are a success.
+        let finished = [with_targets(0, 3.0), with_targets(0, 0.0), with_targets(1, 0.0), episode(2, 10, 10, 0.0, 0.0)];
+        let report = Report::new(&spec(), &finished, &RolloutSettings::default());
+        let rates: Vec<f64> = report.clips.iter().map(|clip| clip.success_rate).collect();
+        assert_eq!(rates, [0.5, 0.0, 1.0]);
+        let targets: Vec<_> = report.clips.iter().map(|clip| clip.measures.get("targets").copied()).collect();
+        assert_eq!(targets, [Some(1.5), Some(0.0), None]);
+        assert_eq!(report.overall.measures["targets"], 1.0, "over the episodes that have the measure");
+        let table = report.to_string();
+        let header: Vec<&str> = table.lines().next().unwrap().split("  ").filter(|cell| !cell.is_empty()).collect();
+        let row: Vec<&str> = table.lines().nth(1).unwrap().split("  ").filter(|cell| !cell.is_empty()).collect();
+        let cell = |name: &str| row[header.iter().position(|column| column.trim() == name).unwrap()].trim();
+        assert_eq!((cell("success"), cell("targets")), ("0.500", "1.50"));
+    }
+
+    #[test]
+    fn a_report_of_an_earlier_release_is_read() {
+        let report = Report::new(&spec(), &[episode(0, 10, 10, 0.0, 0.0)], &RolloutSettings::default());
+        let json = serde_json::to_value(&report).unwrap();
+        assert!(json["overall"].get("measures").is_none(), "a task without measures writes none");
+        assert_eq!(serde_json::from_value::<Report>(json).unwrap(), report);
     }
 }

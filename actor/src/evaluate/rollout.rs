@@ -136,6 +136,7 @@ impl<E: Environment> EpisodeRecorder<'_, E> {
             returns: rollout.returns,
             head_heights: rollout.head_heights,
             tracking: tracking.sums(),
+            achievement: rollout.environment.achievement(),
             outcome,
         });
         self.audience.count(self.finished.len(), self.all);
@@ -199,7 +200,7 @@ impl<E: Environment> Recorder<E> for EpisodeRecorder<'_, E> {
 #[cfg(test)]
 mod tests {
     use comic_proto::Field;
-    use comic_tasks::{Episode, MAX_REWARD_TERMS, Step};
+    use comic_tasks::{Achievement, Episode, MAX_REWARD_TERMS, Step};
 
     use super::*;
     use crate::forward_pass::ActingBatch;
@@ -250,6 +251,9 @@ mod tests {
         fn episode(&self) -> Episode {
             Episode { clip: 0, start: self.start, steps_left: 10, task: 0 }
         }
+        fn achievement(&self) -> Achievement {
+            Achievement::new(self.step == 10)
+        }
         fn servo_action(&self, action: &mut [f32]) {
             action.fill(0.25);
         }
@@ -279,6 +283,7 @@ mod tests {
         let starts: Vec<Start> = (0..7).map(|start| Start { clip: 0, start }).collect();
         let options = RolloutSettings { deterministic: true, ..RolloutSettings::default() };
         let finished = run(controller, environments, &SHAPE, &starts, &options, &mut |_: usize, _: usize| ()).unwrap();
+        assert!(finished.iter().all(|episode| episode.achievement.success == (episode.steps() == 10)));
         let mut found: Vec<_> = finished.iter().map(|e| (e.steps(), e.steps_left, e.returns[0])).collect();
         found.sort_by(|a, b| a.partial_cmp(b).unwrap());
         found

@@ -1,5 +1,6 @@
 //! A report as a table.
 
+use std::collections::BTreeMap;
 use std::fmt;
 
 use super::{ClipReport, Report};
@@ -9,8 +10,10 @@ const FIXED: [&str; 9] =
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let terms: Vec<&str> = self.overall.reward_terms.keys().map(String::as_str).collect();
-        let mut rows = vec![header(&terms)];
+        let names = |values: &BTreeMap<String, f64>| values.keys().cloned().collect::<Vec<_>>();
+        let (measures, terms) = (names(&self.overall.measures), names(&self.overall.reward_terms));
+        let row = |clip: &ClipReport| row(clip, &measures);
+        let mut rows = vec![header(&measures, &terms)];
         rows.extend(self.clips.iter().map(row));
         // A task of one clip already has a row.
         if self.clips.len() > self.tasks.len() {
@@ -34,11 +37,13 @@ impl fmt::Display for Report {
     }
 }
 
-fn header(terms: &[&str]) -> Vec<String> {
-    ["clip"].iter().chain(&FIXED).chain(terms).map(|cell| (*cell).to_string()).collect()
+fn header(measures: &[String], terms: &[String]) -> Vec<String> {
+    let fixed = ["clip"].into_iter().chain(FIXED).map(str::to_owned);
+    fixed.chain(measures.iter().chain(terms).cloned()).collect()
 }
 
-fn row(clip: &ClipReport) -> Vec<String> {
+/// A row with these measures. In joint training a task has only some of them.
+fn row(clip: &ClipReport, measures: &[String]) -> Vec<String> {
     let mut cells = vec![
         clip.clip.clone(),
         clip.episodes.to_string(),
@@ -51,6 +56,7 @@ fn row(clip: &ClipReport) -> Vec<String> {
         clip.tracking_error.map_or("–".into(), |error| format!("{:.0} mm", error.position_mm)),
         format!("{:.2} m", clip.head_height),
     ];
+    cells.extend(measures.iter().map(|name| clip.measures.get(name).map_or("–".into(), |value| format!("{value:.2}"))));
     cells.extend(clip.reward_terms.values().map(|value| format!("{value:.3}")));
     cells
 }

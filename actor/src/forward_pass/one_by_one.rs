@@ -2,7 +2,7 @@
 
 use comic_proto::UnrollShape;
 
-use super::{ActingBatch, ForwardPass, LowLevelShape};
+use super::{ActingBatch, Actuated, ForwardPass, LowLevelShape};
 use crate::Error;
 
 /// A forward pass for each environment alone. The order of a library's sums depends on the size of the batch. With a batch
@@ -53,6 +53,11 @@ impl<F: ForwardPass> ForwardPass for OneByOne<F> {
             return self.forward.actuate(batch);
         }
         self.each(batch, F::actuate)
+    }
+
+    /// The steps are those of one environment already.
+    fn action_derivatives(&mut self, actuated: Actuated) -> Result<Vec<f32>, Error> {
+        self.forward.action_derivatives(actuated)
     }
 }
 

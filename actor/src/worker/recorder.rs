@@ -4,6 +4,7 @@ use std::ops::ControlFlow;
 use std::sync::Arc;
 
 use bytes::Bytes;
+use comic_experiment::LARGEST_ACTION_GRADIENT;
 use comic_proto::v1::{EpisodeEnd, EpisodeStatistics};
 use comic_proto::{Field, UnrollBuffer, UnrollLayout};
 use comic_tasks::{Environment, Outcome};
@@ -12,7 +13,7 @@ use rand_pcg::Pcg64;
 
 use crate::Error;
 use crate::acting_loop::{Recorder, Rollout};
-use crate::forward_pass::ActingRow;
+use crate::forward_pass::{ActingRow, Actuated, ForwardPass, LowLevelShape};
 use crate::seeds::EnvironmentSeeds;
 
 /// The unrolls of all environments of a worker, filled row by row.
@@ -34,6 +35,8 @@ struct OpenUnroll {
     /// Noise of this environment only, so that other environments cannot change it.
     rng: Pcg64,
     buffer: UnrollBuffer,
+    /// The recurrent state that a frozen low level read in each row, `[T, S]`.
+    low_level_states: Vec<f32>,
     /// The task of the unroll: that of its first row. An episode of another task waits for the next unroll.
     task: usize,
     /// Episodes that ended in this unroll.
@@ -49,33 +52,60 @@ pub(super) struct RecordedUnroll {
 
 impl UnrollRecorder {
     /// Empty unrolls of environments with these numbers; `seed` and the number decide an environment's noise.
-    pub(super) fn new(layout: Arc<UnrollLayout>, numbers: impl Iterator<Item = u32>, seed: u64) -> Self {
+    /// `low_level` is the frozen low level that acts, if any.
+    pub(super) fn new(
+        layout: Arc<UnrollLayout>,
+        low_level: Option<LowLevelShape>,
+        numbers: impl Iterator<Item = u32>,
+        seed: u64,
+    ) -> Self {
+        let states = layout.shape().length * low_level.map_or(0, |shape| shape.state);
         let open = |number| OpenUnroll {
             rng: Pcg64::seed_from_u64(EnvironmentSeeds::new(seed, number).noise),
             buffer: UnrollBuffer::new(&layout),
+            low_level_states: vec![0.0; states],
             task: 0,
             episodes: Vec::new(),
         };
         Self { unrolls: numbers.map(open).collect(), layout, t: 0, steps: 0, episodes: 0 }
     }
 
-    /// Writes the derivatives of the transitions of an environment's unroll, in their order. A task without derivatives has
-    /// none, and the rows stay 0.
+    /// Writes the derivatives with respect to the actions of an environment's unroll. `gradients` are those with respect to the
+    /// commands, one for each transition, in their order. A task without derivatives has none, and the rows stay 0.
     ///
     /// # Errors
-    /// [`Error::Derivatives`]: there is not one for each transition.
-    pub(super) fn write_gradients(&mut self, index: usize, gradients: &[[f32; 56]]) -> Result<(), Error> {
+    /// [`Error::Derivatives`]: there is not one for each transition. A low level that fails.
+    pub(super) fn write_gradients(
+        &mut self,
+        index: usize,
+        gradients: &[[f32; 56]],
+        forward: &mut impl ForwardPass,
+    ) -> Result<(), Error> {
         if gradients.is_empty() {
             return Ok(());
         }
-        let buffer = &mut self.unrolls[index].buffer;
-        let length = buffer.layout().shape().length;
-        let transitions: Vec<usize> = (0..length).filter(|t| buffer.row(Field::Valid, *t)[0] == 1.0).collect();
+        let OpenUnroll { buffer, low_level_states, .. } = &mut self.unrolls[index];
+        let shape = *buffer.layout().shape();
+        let transitions: Vec<usize> = (0..shape.length).filter(|t| buffer.row(Field::Valid, *t)[0] == 1.0).collect();
         if transitions.len() != gradients.len() {
             return Err(Error::Derivatives { transitions: transitions.len(), derivatives: gradients.len() });
         }
-        for (t, gradient) in transitions.into_iter().zip(gradients) {
-            buffer.row_mut(Field::ActionGradient, t).copy_from_slice(gradient);
+        let of = |field| transitions.iter().flat_map(|t| buffer.row(field, *t)).copied().collect();
+        let state = low_level_states.len() / shape.length.max(1);
+        let states = transitions.iter().flat_map(|t| &low_level_states[t * state..(t + 1) * state]);
+        let actuated = Actuated {
+            steps: transitions.len(),
+            action: of(Field::Action),
+            proprioception: of(Field::Proprioception),
+            low_level_state: states.copied().collect(),
+            derivatives: gradients.as_flattened().to_vec(),
+        };
+        let found = forward.action_derivatives(actuated)?;
+        for (t, row) in transitions.into_iter().zip(found.chunks_exact(shape.action_gradient.max(1))) {
+            // A low level can make a derivative larger than the wire takes.
+            if row.iter().all(|entry| entry.abs() <= LARGEST_ACTION_GRADIENT) {
+                buffer.row_mut(Field::ActionGradient, t).copy_from_slice(row);
+            }
         }
         Ok(())
     }
@@ -119,6 +149,9 @@ impl<E: Environment> Recorder<E> for UnrollRecorder {
         let unroll = &mut self.unrolls[index];
         if rollout.episode.task == unroll.task && !rollout.ended {
             row.sample(&mut unroll.rng);
+            // The low level replaces it when it acts.
+            let state = row.low_level_state.len();
+            unroll.low_level_states[self.t * state..][..state].copy_from_slice(row.low_level_state);
         }
     }
 

@@ -1,7 +1,7 @@
 //! The rows of unrolls, with an environment and a policy that count episodes and steps.
 
 use comic_proto::{Field, UnrollShape};
-use comic_tasks::{Episode, MAX_REWARD_TERMS, Outcome, Step};
+use comic_tasks::{Achievement, Episode, MAX_REWARD_TERMS, Outcome, Step};
 use proptest::prelude::*;
 
 use super::*;
@@ -76,6 +76,9 @@ impl Environment for Counter {
     fn episode(&self) -> Episode {
         let clip = if self.tasks.is_empty() { self.episodes % 2 } else { self.task() };
         Episode { clip, start: 0, steps_left: self.length(), task: self.task() }
+    }
+    fn achievement(&self) -> Achievement {
+        Achievement::default()
     }
     fn servo_action(&self, action: &mut [f32]) {
         action.fill(self.step as f32 / 1000.0);

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use comic_tasks::raw_physics::{PhysicsState, RawPhysics};
-use comic_tasks::{Environment, Episode, Simulated, Step};
+use comic_tasks::{Achievement, Environment, Episode, Simulated, Step};
 use parking_lot::Mutex;
 
 /// Physics steps in a control step of 0.03 s.
@@ -92,6 +92,9 @@ impl Environment for Recorded {
     }
     fn take_gradients(&mut self) -> Vec<[f32; 56]> {
         self.environment.take_gradients()
+    }
+    fn achievement(&self) -> Achievement {
+        self.environment.achievement()
     }
     fn servo_action(&self, action: &mut [f32]) {
         self.environment.servo_action(action);

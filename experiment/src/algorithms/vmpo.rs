@@ -48,8 +48,8 @@ pub struct Vmpo {
     /// variance. 0 is off (V). A mixture has none.
     pub control_variate: f64,
     /// Weight w of the simulator's derivative of the reward with respect to the actions (D): the policy loss has the term
-    /// −w/η · mean over valid steps of derivative · mean action. The actors compute the derivative, as `tracking.gradient`
-    /// and `get_up.gradient` say; other tasks have none. 0 is off.
+    /// −w/η · mean over valid steps of derivative · mean action. The actors compute the derivative, as the section `gradient`
+    /// of the task says; ball-catch has none. With a frozen low level it goes on through the low level, to the latent. 0 is off.
     pub action_gradient: f64,
     /// Weight of the value loss (D).
     pub value_weight: f64,
@@ -123,13 +123,11 @@ impl AlgorithmParameters for Vmpo {
         let remedy = "must be 0 without a recurrent value function; set network.value_lstm, or leave this 0";
         ensure("vmpo.value_burn_in", burn_in, holds, remedy)?;
         let weight = self.action_gradient;
-        let remedy = "must be 0 with transfer.low_level";
-        ensure("vmpo.action_gradient", weight, weight == 0.0 || !transfers, remedy)?;
         let has = |wanted| rest.tasks.contains(&wanted);
         let linear = tracking.termination_error == TerminationError::DmControl;
-        let differentiable = if has(TaskName::Tracking) { linear } else { has(TaskName::GetUp) };
-        let remedy =
-            "must be 0 without tracking and get-up, and with another tracking.termination_error than dm-control";
+        let others = [TaskName::GetUp, TaskName::GoToTarget, TaskName::Gaps, TaskName::Walls];
+        let differentiable = if has(TaskName::Tracking) { linear } else { others.into_iter().any(has) };
+        let remedy = "must be 0 with ball-catch alone, and with another tracking.termination_error than dm-control";
         ensure("vmpo.action_gradient", weight, weight == 0.0 || differentiable, remedy)?;
         let holds = self.control_variate == 0.0 || *transfers || network.components() == 1;
         let remedy = "must be 0 with network.low_level = \"mixture\", whose KL has no closed form";

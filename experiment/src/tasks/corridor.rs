@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{StartPose, Vision};
+use super::{GradientOfSpeed, StartPose, Vision};
 use crate::fault::{Fault, POSITIVE, Section, positive};
 
 /// What both corridors share (`dm_control/locomotion/tasks/corridors.py`).
@@ -26,6 +26,8 @@ pub struct Corridor {
     pub arena_steps: u32,
     /// How the egocentric camera's images are drawn.
     pub vision: Vision,
+    /// What actors differentiate if `vmpo.action_gradient` is not 0: the speed along the corridor, and the head's height.
+    pub gradient: GradientOfSpeed,
 }
 
 impl Default for Corridor {
@@ -39,6 +41,7 @@ impl Default for Corridor {
             start_pose: StartPose::Clip,
             arena_steps: 512,
             vision: Vision::Fast,
+            gradient: GradientOfSpeed::default(),
         }
     }
 }
@@ -49,6 +52,9 @@ pub(super) const REWARD_TERMS: [&str; 1] = ["velocity"];
 pub(super) const OBSERVATIONS: [(&str, usize); 1] = [("body_height", 1)];
 
 impl Corridor {
+    /// An episode is a success if the humanoid comes this share of the way that `target_velocity` allows in `time_limit` (D).
+    pub const SUCCESS_SHARE: f64 = 0.5;
+
     /// # Errors
     /// The first field with a meaningless value.
     pub(super) fn check(&self, section: Section) -> Result<(), Fault> {
@@ -58,6 +64,7 @@ impl Corridor {
         let velocity = self.target_velocity;
         section.ensure("corridor.target_velocity", velocity, positive(velocity), POSITIVE)?;
         section.ensure("corridor.fall_height", fall, fall.is_finite(), "must be a height in metres")?;
-        section.seconds("corridor.time_limit", self.time_limit)
+        section.seconds("corridor.time_limit", self.time_limit)?;
+        self.gradient.check(section, "corridor.")
     }
 }

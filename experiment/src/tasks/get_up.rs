@@ -38,6 +38,11 @@ pub struct GetUp {
     pub gradient: GradientOfStanding,
 }
 
+impl GetUp {
+    /// An episode is a success if the head ends at least at this share of `target_height` (D): 1.63 m by default.
+    pub const STANDING_SHARE: f64 = 0.9;
+}
+
 /// What the simulator's derivative of `vmpo.action_gradient` is the derivative of (D): the rewards of the coming steps, and
 /// three terms of standing. A body begins to fall long before its head is lower, so the reward alone says nothing of balance.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{StartPose, TaskParameters, fixed};
+use super::{GradientOfSpeed, StartPose, TaskParameters, fixed};
 use crate::fault::{AT_LEAST_ONE, Fault, Section};
 
 /// Walk to targets (`dm_control/locomotion/tasks/go_to_target.py`).
@@ -25,6 +25,9 @@ pub struct GoToTarget {
     pub time_limit: f64,
     /// The pose in which an episode begins.
     pub start_pose: StartPose,
+    /// What actors differentiate if `vmpo.action_gradient` is not 0: the speed towards the target while it is not reached, and
+    /// the head's height.
+    pub gradient: GradientOfSpeed,
 }
 
 impl Default for GoToTarget {
@@ -38,6 +41,7 @@ impl Default for GoToTarget {
             carry_count: false,
             time_limit: 25.0,
             start_pose: StartPose::Clip,
+            gradient: GradientOfSpeed::default(),
         }
     }
 }
@@ -47,7 +51,8 @@ impl TaskParameters for GoToTarget {
         section.metres("half_width", self.half_width)?;
         section.metres("tolerance", self.tolerance)?;
         section.ensure("steps_at_target", self.steps_at_target, self.steps_at_target > 0, AT_LEAST_ONE)?;
-        section.seconds("time_limit", self.time_limit)
+        section.seconds("time_limit", self.time_limit)?;
+        self.gradient.check(section, "")
     }
 
     fn reward_terms(&self) -> &'static [&'static str] {

@@ -24,6 +24,11 @@ pub struct Tracking {
     pub time_limit: f64,
     /// Start every episode at its clip's first frame instead of a random one.
     pub always_start_at_clip_start: bool,
+    /// Noise of the starts of training, as a factor (D): a start of training differs from its frame by normal numbers whose
+    /// standard deviations are this number times 0.1 rad (joint angles), 0.5 rad/s (velocities of the joints and angular
+    /// velocities of the root) and 0.3 m/s (velocity of the root). A policy that was never off its reference cannot come back
+    /// to it. Evaluations have no such noise.
+    pub start_noise: f64,
     /// Set the actuators' filter state to the reference pose at reset. dm_control sets it to 0, the middle of the range.
     pub preset_actuators: bool,
     /// Task observations, by dm_control's names without `walker/`, in this order
@@ -86,6 +91,7 @@ impl Default for Tracking {
             termination_error: TerminationError::DmControl,
             time_limit: 30.0,
             always_start_at_clip_start: false,
+            start_noise: 0.0,
             preset_actuators: false,
             observations: ["body_height", "reference_rel_bodies_pos_local", "reference_rel_bodies_quats"]
                 .map(String::from)
@@ -117,6 +123,7 @@ impl TaskParameters for Tracking {
         section.ensure("min_steps", min_steps, (1..=100_000).contains(min_steps), "must be 1 to 100000")?;
         section.ensure("termination_threshold", termination_threshold, *termination_threshold > 0.0, POSITIVE)?;
         section.ensure("time_limit", time_limit, *time_limit > 0.0, "must be positive seconds")?;
+        section.deviation("start_noise", self.start_noise)?;
         let GradientOfReward { decay, root_velocity, .. } = self.gradient;
         section.ensure("gradient.decay", decay, (0.0..=1.0).contains(&decay), "must be in [0, 1]")?;
         for (name, power) in TRACKING_REWARD_TERMS.iter().zip(self.gradient.powers()) {

@@ -168,7 +168,8 @@ mod tests {
             "deterministic": true,
             "clips": clips.iter().map(clip).collect::<Vec<_>>(),
             "overall": { "clip": "overall", "normalised_reward": 0.5, "success_rate": 0.25,
-                "tracking_error": { "position_mm": 30.0 }, "reward_terms": { "pose": 0.75 } },
+                "measures": { "targets": 1.5 }, "tracking_error": { "position_mm": 30.0 },
+                "reward_terms": { "pose": 0.75 } },
         });
         Evaluation {
             updates,
@@ -207,7 +208,8 @@ mod tests {
         assert_eq!(*step, 4096 * 7);
         let points: Vec<_> =
             values.iter().filter_map(|value| Some((value.tag.as_str(), value.simple_value?))).collect();
-        let expected: [(&str, f32); 6] = [
+        let expected: [(&str, f32); 7] = [
+            ("evaluation/measures/targets", 1.5),
             ("evaluation/normalised_reward", 0.5),
             ("evaluation/reward_terms/pose", 0.75),
             ("evaluation/success_rate", 0.25),

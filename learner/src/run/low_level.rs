@@ -35,19 +35,25 @@ impl LowLevel {
             return Ok(None);
         }
         let kept = resume.and_then(|snapshot| kept(snapshot, &experiment.transfer));
+        let reads_action_gradient = experiment.reads_action_gradient();
         let Transfer { low_level, sha256, prior, .. } = &mut experiment.transfer;
         let path = Path::new(low_level.as_str());
         let refused = |problem: String| Error::configuration(format!("transfer.low_level {low_level}: {problem}"));
         let file = match kept {
             Some(bytes) => Exported::read(bytes).map_err(Error::from),
-            None if path.is_dir() => {
+            None if path.is_dir() && low_level.as_str() != Transfer::BUILTIN => {
                 let (place, snapshot) = checkpoint::find(path)?;
                 export::read(&place, Part::LowLevel, &snapshot)
             }
-            None => Exported::open(path).map_err(Error::from),
+            None => Exported::open_or_builtin(path).map_err(Error::from),
         };
         let file = file.map_err(|error| refused(comic_proto::chain(&error)))?;
         file.describe_low_level(&mut experiment.network).map_err(|error| refused(error.to_string()))?;
+        if reads_action_gradient && experiment.network.components() > 1 {
+            let problem = "is a mixture, whose latent only chooses the component, so the simulator's derivative does not reach \
+                           it: set vmpo.action_gradient = 0, or give a low level of another kind";
+            return Err(refused(problem.into()));
+        }
         // Actors would refuse what cannot be built.
         file.freeze(&Transfer { prior: *prior, ..Transfer::default() }).map_err(|error| refused(error.to_string()))?;
         let found: [u8; 32] = Sha256::digest(&file.bytes).into();

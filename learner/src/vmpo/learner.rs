@@ -133,10 +133,13 @@ impl VmpoLearner {
         let valid_share = valid.mean(Kind::Float);
         let valid = self.learnt_from(valid).reshape([-1]);
         let errors = (&values - &targets).square().sum_dim_intlist(-1i64, false, Kind::Float) * 0.5;
-        let prior: &Prior = &network.latent.prior;
-        let latent_kl = match &acting.latent_posterior {
-            Some(posterior) => posterior.kl_to_prior(prior, &rows(previous_latent), &first.reshape([-1])),
-            None => valid.zeros_like(),
+        let latent_kl = match (&acting.latent_posterior, &acting.latent_prior, &network.latent.prior) {
+            (None, _, _) => valid.zeros_like(),
+            (Some(posterior), Some(prior), _) => posterior.kl(prior),
+            (Some(posterior), None, Prior::Ar1 { alpha }) => {
+                posterior.kl_to_ar1(*alpha, &rows(previous_latent), &first.reshape([-1]))
+            }
+            (Some(posterior), None, _) => posterior.kl_to_standard_normal(),
         };
         let [mean, std, log_weights] =
             [Field::Mean, Field::Std, Field::LogWeights].map(|field| rows(&minibatch[field]));

@@ -5,12 +5,13 @@ use std::fs::File;
 use std::io::Read as _;
 use std::path::Path;
 
-use comic_experiment::{Experiment, Network, TaskSpec, Transfer, TransferPrior};
+use comic_experiment::{Experiment, Network, Prior, TaskSpec, Transfer, TransferPrior};
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use sha2::{Digest as _, Sha256};
 use tch::{Device, nn};
 
+use super::card::Card;
 use super::part::Part;
 use super::spec::{FORMAT, FittedPrior, Source, Spec, task_spec};
 use super::weights;
@@ -114,7 +115,7 @@ impl Exported {
         let experiment = read("its experiment", &spec.experiment).map_err(Error::Experiment)?;
         agree(&spec, &experiment)?;
         let sizes = task_spec(&experiment)?;
-        let prior = spec.prior.as_ref().map_or(&[][..], |prior| &prior.hidden);
+        let prior = spec.prior.as_ref().map(|prior| &prior.hidden[..]);
         let expected = weights::count(spec.part, prior, &sizes, &experiment);
         let counted = metadata.tensors().into_iter().filter(|(name, info)| weights::is_counted(name, &info.shape));
         let found: u64 = counted.map(|(_, info)| info.shape.iter().map(|size| *size as u64).product::<u64>()).sum();
@@ -222,7 +223,7 @@ impl Exported {
         Ok(frozen)
     }
 
-    /// The same low level with parameters that were never trained, drawn from `seed`. The normaliser stays.
+    /// The same low level with parameters that were never trained, drawn from `seed`, and without a card. The normaliser stays.
     ///
     /// # Errors
     /// As of [`describe_low_level`](Self::describe_low_level).
@@ -237,11 +238,11 @@ impl Exported {
             let view = if name.starts_with("low_level.") { fresh.tensor(&name)? } else { view };
             views.push((name, view));
         }
-        Self::written(views, &self.spec)
+        Self::written(views, &Spec { card: None, ..self.spec.clone() })
     }
 
     /// The same low level with a prior of its latents, whose parameters are in `store` under the path `prior`. An earlier prior
-    /// is replaced.
+    /// is replaced. The new file has no card.
     ///
     /// # Errors
     /// As of [`describe_low_level`](Self::describe_low_level), and if the parameters are not those of `prior`.
@@ -252,8 +253,18 @@ impl Exported {
         let fitted = SafeTensors::deserialize(&fitted)?;
         let kept = own.tensors().into_iter().filter(|(name, _)| !name.starts_with("prior."));
         let views: Vec<_> = kept.chain(fitted.tensors()).collect();
-        let spec = Spec { prior: Some(prior), ..self.spec.clone() };
+        let spec = Spec { prior: Some(prior), card: None, ..self.spec.clone() };
         Self::written(views, &spec)
+    }
+
+    /// The same low level with this card. An earlier card is replaced.
+    ///
+    /// # Errors
+    /// As of [`describe_low_level`](Self::describe_low_level).
+    pub fn with_card(&self, card: Card) -> Result<Self, Error> {
+        self.describe_low_level(&mut self.experiment.network.clone())?;
+        let own = SafeTensors::deserialize(&self.bytes)?;
+        Self::written(own.tensors(), &Spec { card: Some(card), ..self.spec.clone() })
     }
 
     /// Sets the parameters of this part in `store` by their names. All other parameters stay unchanged.
@@ -270,9 +281,14 @@ impl Exported {
     /// New networks of the experiment, and of the prior if the file has one.
     pub(super) fn policy(&self, sizes: &TaskSpec) -> Result<(nn::VarStore, Box<dyn Policy>), Error> {
         let store = nn::VarStore::new(Device::Cpu);
-        let policy = new_policy(&store.root(), sizes, &self.experiment, &vec![0.0; sizes.action])?;
+        let mut experiment = self.experiment.clone();
+        if self.spec.part == Part::LowLevel {
+            // The description has the sizes: a prior that was fitted afterwards may have replaced the one that was learned.
+            experiment.network.latent.prior = Prior::Standard;
+        }
+        let policy = new_policy(&store.root(), sizes, &experiment, &vec![0.0; sizes.action])?;
         if let Some(prior) = &self.spec.prior {
-            StatePrior::new(&(store.root() / "prior"), &self.experiment.network, &prior.hidden);
+            StatePrior::new(&(store.root() / "prior"), sizes.proprioception, &self.experiment.network, &prior.hidden);
         }
         Ok((store, policy))
     }

@@ -12,9 +12,11 @@ use crate::error::Error;
 pub enum Part {
     /// The whole policy, of all tasks or of one.
     Policy(Option<TaskName>),
-    /// The encoder of one task, the image encoder, and the statistics that normalise their inputs.
+    /// The encoder of one task, the image encoder, the statistics that normalise their inputs, and the prior of the state from
+    /// whose mean the latent is a difference, if there is one.
     Encoder(TaskName),
-    /// The low level, with the statistics that normalise proprioception, and a prior of its latents if one was fitted.
+    /// The low level, with the statistics that normalise proprioception, and a prior of its latents if one was learned or
+    /// fitted.
     LowLevel,
 }
 
@@ -36,7 +38,8 @@ impl Part {
             Self::Policy(None) => true,
             Self::Policy(Some(task)) => !name.starts_with("encoder.") || encodes(task),
             Self::Encoder(task) => {
-                encodes(task) || name.starts_with("image_encoder.") || name.starts_with("normaliser.")
+                let shared = ["image_encoder.", "normaliser.", "prior."];
+                encodes(task) || shared.iter().any(|start| name.starts_with(start))
             }
             Self::LowLevel => {
                 ["low_level.", "normaliser.proprioception_", "prior."].iter().any(|start| name.starts_with(start))
@@ -124,11 +127,12 @@ mod tests {
             "normaliser.proprioception_std",
             "normaliser.task_std",
             "image_encoder.first.weight",
+            "prior.head.bias",
         ];
         let held = |part: &str| names.map(|name| part.parse::<Part>().unwrap().holds(name));
-        assert_eq!(held("policy"), [true; 6]);
-        assert_eq!(held("policy:get-up"), [false, true, true, true, true, true]);
-        assert_eq!(held("encoder:tracking"), [true, false, false, true, true, true]);
-        assert_eq!(held("low-level"), [false, false, true, true, false, false]);
+        assert_eq!(held("policy"), [true; 7]);
+        assert_eq!(held("policy:get-up"), [false, true, true, true, true, true, true]);
+        assert_eq!(held("encoder:tracking"), [true, false, false, true, true, true, true]);
+        assert_eq!(held("low-level"), [false, false, true, true, false, false, true]);
     }
 }

@@ -1,8 +1,9 @@
 //! The description in an exported file.
 
-use comic_experiment::{ACTION_SIZE, Experiment, PROPRIOCEPTION, TaskSpec};
+use comic_experiment::{ACTION_SIZE, Experiment, PROPRIOCEPTION, Prior, TaskSpec};
 use serde::{Deserialize, Serialize};
 
+use super::card::Card;
 use super::part::Part;
 use crate::error::Error;
 use crate::normaliser::NORMALISED_LIMIT;
@@ -25,9 +26,12 @@ pub struct Spec {
     pub outputs: Vec<Vector>,
     /// The normalisation of the observations.
     pub normalisation: Normalisation,
-    /// The prior of the latents, if one was fitted to a low level.
+    /// The prior of a low level's latents, if one was learned with it or fitted afterwards.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prior: Option<FittedPrior>,
+    /// The card of a low level, if it has one. An export has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub card: Option<Card>,
     /// The run and the checkpoint.
     pub source: Source,
     /// The resolved experiment (TOML). For a part of one task, it has only that task.
@@ -78,12 +82,26 @@ pub struct Normalisation {
 pub struct FittedPrior {
     /// Hidden sizes.
     pub hidden: Vec<usize>,
-    /// Latents that it was fitted to.
+    /// Latents that it was fitted to; 0 if it was learned with the encoder.
     pub latents: u64,
     /// Mean −ln p(z | s) of latents that it was not fitted to, nats.
-    pub nats: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub nats: Option<f64>,
     /// Mean −ln N(z; 0, I) of the same latents, nats.
-    pub standard_nats: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub standard_nats: Option<f64>,
+}
+
+impl FittedPrior {
+    /// The prior that was learned with the encoders of this experiment, if there is one.
+    fn learned(experiment: &Experiment) -> Option<Self> {
+        match &experiment.network.latent.prior {
+            Prior::State { hidden } => {
+                Some(Self { hidden: hidden.clone(), latents: 0, nats: None, standard_nats: None })
+            }
+            Prior::Standard | Prior::Ar1 { .. } => None,
+        }
+    }
 }
 
 /// The run and the checkpoint that a file comes from.
@@ -127,7 +145,8 @@ impl Spec {
             inputs,
             outputs,
             normalisation: Normalisation { active, limit: NORMALISED_LIMIT },
-            prior: None,
+            prior: if part == Part::LowLevel { FittedPrior::learned(experiment) } else { None },
+            card: None,
             source,
             experiment: experiment.to_toml().map_err(Error::Experiment)?,
         })
@@ -202,10 +221,14 @@ fn encoder(experiment: &Experiment, sizes: &TaskSpec) -> Result<(Vec<Vector>, Ve
     let previous = Vector::plain("previous_latent", latent, "zeros at the first step of an episode");
     let mut inputs = observations(experiment, sizes)?;
     inputs.extend([proprioception(), previous]);
+    let mean = match network.latent.prior {
+        Prior::State { .. } => "mean of the diagonal Gaussian of the latent: the prior's mean and the encoder's output",
+        Prior::Standard | Prior::Ar1 { .. } => "mean of the diagonal Gaussian of the latent",
+    };
     let outputs = match latent {
         0 => vec![Vector::plain("weights", network.primitives.count, "weights of the primitives, before the gate")],
         latent => vec![
-            Vector::plain("latent_mean", latent, "mean of the diagonal Gaussian of the latent"),
+            Vector::plain("latent_mean", latent, mean),
             Vector::plain("latent_std", latent, "standard deviation of the latent"),
         ],
     };

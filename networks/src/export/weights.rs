@@ -5,17 +5,17 @@ use comic_experiment::{Experiment, TaskSpec};
 use super::part::Part;
 use crate::algorithms;
 use crate::policy::Weights;
-use crate::weights::hidden;
+use crate::weights;
 
 /// Number of entries of the matrices of encoders and low level in `part`. A reader compares it with the content of a
 /// file, so that a small file cannot describe networks that need huge memory. `prior` has the hidden sizes of a prior. A
 /// transfer's frozen low level is a file of its own inside, which is counted when that file is read.
-pub(super) fn count(part: Part, prior: &[usize], spec: &TaskSpec, experiment: &Experiment) -> u64 {
-    let Weights { low_level, rest } = algorithms::weights(spec, experiment);
+pub(super) fn count(part: Part, prior: Option<&[usize]>, spec: &TaskSpec, experiment: &Experiment) -> u64 {
+    let Weights { low_level, prior: own_prior, rest } = algorithms::weights(spec, experiment);
     match part {
-        Part::Policy(_) => rest + low_level,
-        Part::Encoder(_) => rest,
-        Part::LowLevel => low_level + of_prior(prior, spec, experiment.network.latent.size as u64),
+        Part::Policy(_) => rest + own_prior + low_level,
+        Part::Encoder(_) => rest + own_prior,
+        Part::LowLevel => low_level + prior.map_or(0, |sizes| weights::prior(spec, &experiment.network, sizes)),
     }
 }
 
@@ -26,15 +26,9 @@ pub(super) fn is_counted(name: &str, shape: &[usize]) -> bool {
     matrix && parts.iter().any(|part| name.starts_with(part))
 }
 
-/// `prior` is empty if there is none.
-fn of_prior(prior: &[usize], spec: &TaskSpec, latent: u64) -> u64 {
-    let (weights, width) = hidden(spec.proprioception as u64, prior);
-    if prior.is_empty() { 0 } else { weights + width * 2 * latent }
-}
-
 #[cfg(test)]
 mod tests {
-    use comic_experiment::{presets, resolve};
+    use comic_experiment::{Prior, presets, resolve};
     use tch::{Device, nn};
 
     use super::*;
@@ -44,8 +38,9 @@ mod tests {
     #[test]
     fn the_count_is_that_of_the_built_networks_in_every_preset() {
         let bare = ["network.latent.size=0".to_string()];
+        let state_prior = ["network.latent.prior={state={hidden=[8,4]}}".to_string()];
         for (name, _) in presets::ALL {
-            for overrides in [&[][..], &bare[..]] {
+            for overrides in [&[][..], &bare[..], &state_prior[..]] {
                 // Not every low level can do without a bottleneck.
                 let Ok(experiment) = resolve(name, overrides) else { continue };
                 let spec = task_spec(&experiment).unwrap();
@@ -60,7 +55,11 @@ mod tests {
                         .filter(|(name, tensor)| part.holds(name) && is_counted(name, &sizes(tensor)))
                         .map(|(_, tensor)| tensor.numel())
                         .sum();
-                    assert_eq!(count(part, &[], &spec, &experiment), built as u64, "{name}: {part}");
+                    let prior = match &experiment.network.latent.prior {
+                        Prior::State { hidden } if experiment.learns_low_level() => Some(&hidden[..]),
+                        _ => None,
+                    };
+                    assert_eq!(count(part, prior, &spec, &experiment), built as u64, "{name}: {part}");
                 }
             }
         }

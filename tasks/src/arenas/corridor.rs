@@ -15,6 +15,8 @@ const THICKNESS: f64 = 0.16;
 /// Height of the planes at the sides (m, `_SIDE_WALL_HEIGHT`), and their group, which is not drawn.
 const SIDE_HEIGHT: f64 = 4.0;
 const SIDE_GROUP: i32 = 3;
+/// Platforms that are no further apart meet (m): positions are not exact.
+const NO_GAP: f64 = 1e-6;
 /// Depth of the ground under the gaps (m).
 const GAP_DEPTH: f64 = 10.0;
 /// Height of the spare boxes above that ground (m). They are inside the model's extent, because the extent decides what is
@@ -46,6 +48,27 @@ pub struct Block {
     pub half_size: [f64; 3],
     /// Red, green, blue and opacity.
     pub colour: [f32; 4],
+}
+
+impl Block {
+    /// Where it begins and ends along the corridor, m.
+    fn range(&self) -> [f64; 2] {
+        [self.position[0] - self.half_size[0], self.position[0] + self.half_size[0]]
+    }
+}
+
+/// Where each gap between `platforms` ends, m along the corridor. There is none between platforms that meet.
+pub(crate) fn gap_ends(platforms: &[Block]) -> Vec<f64> {
+    let end = |pair: &[Block]| match pair {
+        [before, after] => Some(after.range()[0]).filter(|start| start - before.range()[1] > NO_GAP),
+        _ => None,
+    };
+    platforms.windows(2).filter_map(end).collect()
+}
+
+/// Where each wall ends, m along the corridor.
+pub(crate) fn wall_ends(walls: &[Block]) -> Vec<f64> {
+    walls.iter().map(|wall| wall.range()[1]).collect()
 }
 
 /// Length of the platform on which the humanoid starts, m.

@@ -29,6 +29,7 @@ use super::get_up::standing_reward;
 use super::interface::{Rules, Verdict};
 use super::poses::Poses;
 use super::stage::{Arena, Part, Stage};
+use crate::achievement::Achievement;
 use crate::arenas::floor;
 use crate::build_task::{BuildTask, Context};
 use crate::environment::{MAX_REWARD_TERMS, Task};
@@ -64,6 +65,8 @@ pub(crate) struct State {
     radius: f64,
     /// Consecutive steps in which the ball was held.
     held_steps: u32,
+    /// All steps of the episode in which the ball was held.
+    all_held_steps: u32,
     caught: bool,
     /// The target of walking after the ball is caught: x and y, m.
     target: [f64; 2],
@@ -105,6 +108,7 @@ impl BallCatchRules {
     /// Counts the consecutive steps in which the ball was held.
     fn count(&self, holds: bool, state: &mut State) {
         state.held_steps = if holds { state.held_steps.saturating_add(1) } else { 0 };
+        state.all_held_steps = state.all_held_steps.saturating_add(u32::from(holds));
         state.caught |= state.held_steps >= self.config.hold_steps;
     }
 
@@ -200,6 +204,11 @@ impl Rules for BallCatchRules {
             reward_terms[3] = config.walking_reward * (speed / config.walking_speed).clamp(0.0, 1.0);
         }
         Verdict { reward_terms, failed: false }
+    }
+
+    /// The steps in which the ball was held. Success: the ball was caught, also if it fell later.
+    fn achievement(&self, _: &Stage, state: &State, _: bool) -> Achievement {
+        Achievement::new(state.caught).measuring(&["held_steps"], [f64::from(state.all_held_steps)])
     }
 
     fn observe<T: Number>(&self, stage: &Stage, state: &State, out: &mut [T]) {
@@ -336,7 +345,7 @@ mod tests {
             qvel[0] = speed;
             stage.place(&qpos, &qvel);
             for (caught, expected) in [(false, 0.0), (true, expected)] {
-                let mut state = State { caught, target: [3.0, 0.0], radius: 0.1, held_steps: 0 };
+                let mut state = State { caught, target: [3.0, 0.0], radius: 0.1, ..State::default() };
                 let verdict = rules.judge(&mut stage, &mut state, &mut random);
                 assert!((verdict.reward_terms[3] - expected).abs() < 1e-12, "{speed} {caught}: {verdict:?}");
             }
@@ -346,17 +355,21 @@ mod tests {
     #[test]
     fn a_ball_is_caught_after_ten_consecutive_steps() {
         let rules = rules(&one_size());
-        let mut state = State::default();
+        let (mut stage, mut state, mut random) = first_state(&rules);
         for (holds, caught) in (0..9).map(|_| (true, false)).chain([(false, false)]) {
             rules.count(holds, &mut state);
             assert_eq!(state.caught, caught);
         }
         for step in 1..=12 {
             rules.count(true, &mut state);
-            assert_eq!(state.caught, step >= 10, "step {step}");
+            let achieved = rules.achievement(&stage, &state, false);
+            assert_eq!((state.caught, achieved.success), (step >= 10, step >= 10), "step {step}");
         }
-        rules.count(false, &mut state);
-        assert!(state.caught, "a caught ball stays caught");
+        put(&mut stage, [2.0, 0.0, 0.095]);
+        assert!(rules.judge(&mut stage, &mut state, &mut random).failed);
+        let achieved = rules.achievement(&stage, &state, true);
+        assert!(achieved.success, "a ball that is dropped later was caught");
+        assert_eq!(achieved.measures().collect::<Vec<_>>(), [("held_steps", 21.0)]);
     }
 
     #[test]

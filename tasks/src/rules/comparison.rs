@@ -10,6 +10,7 @@ use super::environment::RuledEnvironment;
 use super::go_to_target::{GoToTargetRules, State as GoToTargetState};
 use super::interface::Recorded;
 use super::poses::{Pose, Poses, UP};
+use super::stage::Arena;
 pub use crate::arenas::corridor::Block;
 use crate::arenas::corridor::{self, Extent};
 use crate::arenas::floor;
@@ -146,7 +147,9 @@ impl RecordedObstacles {
 }
 
 impl Obstacles for RecordedObstacles {
-    fn draw(&self, extent: Extent, _: &mut Pcg64) -> Result<MjModel, Error> {
-        self.build(extent)
+    fn draw(&self, extent: Extent, _: &mut Pcg64) -> Result<Arena, Error> {
+        // A corridor has platforms or walls.
+        let ends = [corridor::gap_ends(&self.platforms), corridor::wall_ends(&self.walls)].concat();
+        Ok(Arena::new(self.build(extent)?)?.with_obstacles(ends))
     }
 }

@@ -10,6 +10,7 @@ use rand_pcg::Pcg64;
 use super::interface::{Rules, Verdict};
 use super::poses::Pose;
 use super::stage::{CONTROL_TIMESTEP, Stage};
+use crate::achievement::Achievement;
 use crate::environment::{ClipStarts, Environment, Episode, Outcome, Scenery, Simulated, Step, Task, control};
 use crate::error::Error;
 use crate::gradient::GradientTape;
@@ -64,6 +65,8 @@ pub(crate) struct RuledEnvironment<R: Rules> {
     steps: usize,
     /// Control steps until the time limit of this episode.
     max_steps: usize,
+    /// Whether a step of this episode failed.
+    failed: bool,
     diverged: bool,
     /// Records steps for the derivative of the reward, if somebody wants it.
     tape: Option<GradientTape>,
@@ -75,8 +78,7 @@ impl<R: Rules> RuledEnvironment<R> {
         let stage = task.rules.stage(&mut random)?;
         let state = R::State::default();
         let max_steps = steps_in(task.rules.training_time_limit());
-        let mut environment =
-            Self { task, stage, state, random, start: 0, steps: 0, max_steps, diverged: false, tape: None };
+        let mut environment = Self::of_parts(task, stage, state, random, max_steps);
         environment.reset();
         Ok(environment)
     }
@@ -88,7 +90,12 @@ impl<R: Rules> RuledEnvironment<R> {
         stage.place(&pose.qpos, &pose.qvel);
         let task = Arc::new(RuledTask::new(rules, TaskSpec::default()));
         let max_steps = steps_in(task.rules.time_limit());
-        Ok(Self { task, stage, state, random, start: 0, steps: 0, max_steps, diverged: false, tape: None })
+        Ok(Self::of_parts(task, stage, state, random, max_steps))
+    }
+
+    fn of_parts(task: Arc<RuledTask<R>>, stage: Stage, state: R::State, random: Pcg64, max_steps: usize) -> Self {
+        let (start, steps, failed, diverged, tape) = (0, 0, false, false, None);
+        Self { task, stage, state, random, start, steps, max_steps, failed, diverged, tape }
     }
 
     pub(crate) fn stage(&self) -> &Stage {
@@ -105,7 +112,8 @@ impl<R: Rules> RuledEnvironment<R> {
 
     /// Begins an episode of at most so many seconds.
     fn begin(&mut self, time_limit: f64) {
-        (self.steps, self.diverged, self.max_steps) = (0, false, steps_in(time_limit));
+        (self.steps, self.max_steps) = (0, steps_in(time_limit));
+        (self.failed, self.diverged) = (false, false);
         if let Some(tape) = &mut self.tape {
             tape.end_episode();
         }
@@ -183,6 +191,11 @@ impl<R: Rules> Environment for RuledEnvironment<R> {
         self.tape.as_mut().map_or_else(Vec::new, GradientTape::take)
     }
 
+    fn achievement(&self) -> Achievement {
+        let achievement = self.task.rules.achievement(&self.stage, &self.state, self.failed);
+        if self.diverged { achievement.of_divergence() } else { achievement }
+    }
+
     fn servo_action(&self, action: &mut [f32]) {
         // The servos hold the joints in their current positions.
         let joints: [f64; 56] = std::array::from_fn(|joint| self.stage.data.qpos()[7 + joint]);
@@ -211,6 +224,7 @@ impl<R: Rules> Simulated for RuledEnvironment<R> {
         }
         let Verdict { reward_terms, failed } =
             self.task.rules.judge(&mut self.stage, &mut self.state, &mut self.random);
+        self.failed |= failed;
         let outcome = if failed {
             Outcome::Terminated
         } else if self.steps >= self.max_steps {
@@ -219,7 +233,8 @@ impl<R: Rules> Simulated for RuledEnvironment<R> {
             Outcome::Running
         };
         if let Some(tape) = &mut self.tape {
-            tape.end_step(self.task.rules.differentiate(&self.stage), outcome != Outcome::Running);
+            let reward = self.task.rules.differentiate(&self.stage, &self.state);
+            tape.end_step(reward, outcome != Outcome::Running);
         }
         let discount = if failed { 0.0 } else { 1.0 };
         Step { reward_terms, discount, outcome, head_height: self.stage.head_height() }

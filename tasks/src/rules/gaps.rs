@@ -3,13 +3,13 @@
 use std::sync::Arc;
 
 use comic_experiment::Gaps;
-use mujoco_rs::prelude::*;
 use rand::Rng as _;
 use rand_pcg::Pcg64;
 
 use super::corridor::{CorridorRules, Obstacles};
 use super::environment::RuledTask;
 use super::poses::Poses;
+use super::stage::Arena;
 use crate::arenas::corridor::{self, Block, Extent};
 use crate::build_task::{BuildTask, Context};
 use crate::environment::Task;
@@ -24,12 +24,13 @@ impl BuildTask for Gaps {
 }
 
 impl Obstacles for Gaps {
-    fn draw(&self, extent: Extent, random: &mut Pcg64) -> Result<MjModel, Error> {
+    fn draw(&self, extent: Extent, random: &mut Pcg64) -> Result<Arena, Error> {
         let platforms = platforms(self, extent, random);
         let most = most_platforms(self, extent);
-        humanoid::build_in(|directory| {
+        let model = humanoid::build_in(|directory| {
             corridor::with_gaps(directory, extent, &platforms, most.saturating_sub(platforms.len()))
-        })
+        })?;
+        Ok(Arena::new(model)?.with_obstacles(corridor::gap_ends(&platforms)))
     }
 }
 
@@ -100,6 +101,14 @@ mod tests {
         let mean = counts.iter().sum::<usize>() as f64 / counts.len() as f64;
         assert!((40.0..42.0).contains(&mean), "{mean}");
         assert!(counts.iter().all(|count| *count <= most_platforms(&config, EXTENT)));
+    }
+
+    #[test]
+    fn a_gap_ends_where_the_next_platform_begins_and_platforms_that_meet_have_none() {
+        let platform = |start, length| corridor::platform(0, start, length, EXTENT);
+        let platforms = [corridor::first_platform(EXTENT), platform(6.0, 1.0), platform(8.0, 0.5), platform(9.25, 1.0)];
+        let ends = corridor::gap_ends(&platforms);
+        assert!(ends.len() == 2 && (ends[0] - 8.0).abs() < 1e-9 && (ends[1] - 9.25).abs() < 1e-9, "{ends:?}");
     }
 
     #[test]

@@ -26,6 +26,7 @@ use super::environment::RuledTask;
 use super::interface::{Rules, Verdict};
 use super::poses::{Pose, Poses, UP};
 use super::stage::{Arena, CONTROL_TIMESTEP, Part, Stage};
+use crate::achievement::Achievement;
 use crate::arenas::floor;
 use crate::build_task::{BuildTask, Context};
 use crate::environment::Task;
@@ -159,6 +160,12 @@ impl Rules for GetUpRules {
         Verdict::of(standing_reward(stage.head_height(), self.config.target_height), false)
     }
 
+    /// Success: standing after the last step, the head at least at [`GetUp::STANDING_SHARE`] of its target height.
+    fn achievement(&self, stage: &Stage, _: &State, failed: bool) -> Achievement {
+        let lowest = GetUp::STANDING_SHARE * self.config.target_height;
+        Achievement::new(!failed && stage.head_height() >= lowest)
+    }
+
     fn observe<T: Number>(&self, stage: &Stage, _: &State, out: &mut [T]) {
         fill(out, [stage.root().0[2]]);
     }
@@ -177,7 +184,7 @@ impl Rules for GetUpRules {
     }
 
     /// Of the reward and of the terms of [`GradientOfStanding`].
-    fn differentiate(&self, stage: &Stage) -> RewardDerivative {
+    fn differentiate(&self, stage: &Stage, _: &State) -> RewardDerivative {
         let mut derivative = RewardDerivative::ZERO;
         let RewardDerivative { position, velocity } = &mut derivative;
         let GradientOfStanding { balance, stillness, pose, .. } = self.config.gradient;

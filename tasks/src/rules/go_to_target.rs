@@ -11,13 +11,19 @@ use rand_pcg::Pcg64;
 use super::environment::RuledTask;
 use super::interface::{Recorded, Rules, Verdict};
 use super::poses::{Poses, UP};
+use super::speed::{self, Way};
 use super::stage::{Arena, Stage};
+use crate::achievement::Achievement;
 use crate::arenas::floor;
 use crate::build_task::{BuildTask, Context};
 use crate::environment::Task;
 use crate::error::Error;
+use crate::gradient::RewardDerivative;
 use crate::humanoid;
 use crate::humanoid::observation::{Number, fill};
+
+/// Speed towards the target that is differentiated unless the experiment says another, m/s (D).
+const WALKING_SPEED: f64 = 1.0;
 
 /// The rules of go-to-target.
 #[derive(Debug)]
@@ -33,6 +39,14 @@ pub(crate) struct State {
     /// x and y on the floor, m.
     pub(crate) target: [f64; 2],
     pub(crate) rewarded_steps: u32,
+    /// Whether the root was ever outside the tolerance of the current target in this episode. Otherwise the target appeared
+    /// where the humanoid stood.
+    pub(crate) was_away: bool,
+    /// Steps of this episode near the current target after that. Unlike `rewarded_steps` they are counted for a target that
+    /// does not move, too, and an episode begins with 0.
+    pub(crate) near_steps: u32,
+    /// Targets of this episode that were reached and held.
+    pub(crate) held_targets: u32,
     /// Targets that come before random ones, the next one last; for comparisons with recorded episodes.
     pub(crate) script: Vec<[f64; 2]>,
 }
@@ -54,6 +68,15 @@ impl GoToTargetRules {
         state.script.pop().unwrap_or_else(|| self.place(random))
     }
 
+    /// Counts the target when it was reached and has been held for long enough, once.
+    fn count(&self, near: bool, state: &mut State) {
+        state.was_away |= !near;
+        if near && state.was_away {
+            state.near_steps = state.near_steps.saturating_add(1);
+            state.held_targets += u32::from(state.near_steps == self.config.steps_at_target);
+        }
+    }
+
     fn place(&self, random: &mut Pcg64) -> [f64; 2] {
         let half = self.config.half_width;
         [random.random_range(-half..=half), random.random_range(-half..=half)]
@@ -69,6 +92,7 @@ impl Rules for GoToTargetRules {
 
     fn begin(&self, stage: &mut Stage, state: &mut State, random: &mut Pcg64) {
         state.target = self.next_target(state, random);
+        (state.was_away, state.near_steps, state.held_targets) = (false, 0, 0);
         if !self.config.carry_count {
             state.rewarded_steps = 0;
         }
@@ -86,7 +110,7 @@ impl Rules for GoToTargetRules {
         // The target moves one step after the last rewarded step. The reward of this step already uses the new target.
         if self.config.moving_target && state.rewarded_steps >= self.config.steps_at_target {
             state.target = self.next_target(state, random);
-            state.rewarded_steps = 0;
+            (state.rewarded_steps, state.was_away, state.near_steps) = (0, false, 0);
         }
         let (root, _) = stage.root();
         let [x, y] = state.target;
@@ -94,7 +118,14 @@ impl Rules for GoToTargetRules {
         if near && self.config.moving_target {
             state.rewarded_steps += 1;
         }
+        self.count(near, state);
         Verdict::of(f64::from(u8::from(near)), failed)
+    }
+
+    /// The targets that were reached and held: within the tolerance for `steps_at_target` steps, which need not follow each
+    /// other, after the root was outside. Success: at least one.
+    fn achievement(&self, _: &Stage, state: &State, _: bool) -> Achievement {
+        Achievement::new(state.held_targets > 0).measuring(&["targets"], [f64::from(state.held_targets)])
     }
 
     /// The target relative to the root, in the root's frame, m.
@@ -110,6 +141,20 @@ impl Rules for GoToTargetRules {
 
     fn target(&self, state: &State) -> Option<[f64; 2]> {
         Some(state.target)
+    }
+
+    fn gradient_decay(&self) -> Option<f64> {
+        Some(self.config.gradient.decay)
+    }
+
+    /// Of the root's speed towards the target while it is not within the tolerance, and of the head's height.
+    fn differentiate(&self, stage: &Stage, state: &State) -> RewardDerivative {
+        let (root, _) = stage.root();
+        let way = [state.target[0] - root[0], state.target[1] - root[1]];
+        let distance = way[0].hypot(way[1]);
+        let way = Way { direction: way.map(|entry| entry / distance), distance };
+        let way = (distance >= self.config.tolerance).then_some(&way);
+        speed::differentiate(stage, way, WALKING_SPEED, &self.config.gradient)
     }
 }
 
@@ -138,6 +183,7 @@ mod tests {
     use rand::SeedableRng as _;
 
     use super::*;
+    use crate::rules::poses::Pose;
 
     fn rules(config: &GoToTarget) -> GoToTargetRules {
         GoToTargetRules::new(&GoToTarget { start_pose: StartPose::Upright, ..config.clone() }, Poses::upright())
@@ -160,6 +206,53 @@ mod tests {
         assert_eq!(rules.judge(&mut stage, &mut state, &mut random).reward_terms[0], 0.0);
         assert_ne!(state.target, near);
         assert_eq!(state.rewarded_steps, 0);
+    }
+
+    /// The measured targets after each step of an episode in which the root has these distances from its target, m. Every
+    /// target is at the same place.
+    fn held(config: &GoToTarget, distances: &[f64]) -> Vec<f64> {
+        let (rules, mut random) = (rules(config), Pcg64::seed_from_u64(1));
+        let mut stage = rules.stage(&mut random).unwrap();
+        let mut state = State { rewarded_steps: 3, near_steps: 3, held_targets: 3, was_away: true, ..State::default() };
+        state.script = vec![[0.0; 2]; distances.len() + 1];
+        rules.begin(&mut stage, &mut state, &mut random);
+        let mut step = |distance: &f64| {
+            let pose = Pose::upright().moved(*distance, 0.0);
+            stage.place(&pose.qpos, &pose.qvel);
+            let reward = rules.judge(&mut stage, &mut state, &mut random).reward_terms[0];
+            assert_eq!(reward, f64::from(u8::from(*distance < 1.0)));
+            let achievement = rules.achievement(&stage, &state, false);
+            let targets = achievement.measures().collect::<Vec<_>>();
+            assert_eq!((targets.len(), targets[0].0), (1, "targets"));
+            assert_eq!(achievement.success, targets[0].1 > 0.0);
+            targets[0].1
+        };
+        distances.iter().map(&mut step).collect()
+    }
+
+    fn fixed() -> GoToTarget {
+        GoToTarget { moving_target: false, ..GoToTarget::default() }
+    }
+
+    #[test]
+    fn a_target_counts_after_its_tenth_step_and_a_fixed_one_once() {
+        // The target moves in the step after the tenth one near it. The body leaves it in that step, and comes again.
+        let way = [vec![1.1], vec![0.9; 10]].concat().repeat(3);
+        let expected: Vec<f64> = (0..33).map(|step| f64::from((step + 1) / 11)).collect();
+        assert_eq!(held(&GoToTarget::default(), &way), expected);
+        assert_eq!(held(&fixed(), &way), [vec![0.0; 10], vec![1.0; 23]].concat());
+        // Steps near a target need not follow each other.
+        let in_and_out = [1.1, 0.9].repeat(10);
+        assert_eq!(held(&GoToTarget::default(), &in_and_out), [vec![0.0; 19], vec![1.0]].concat());
+    }
+
+    #[test]
+    fn standing_still_is_no_success_neither_far_from_a_target_nor_at_one() {
+        for config in [GoToTarget::default(), fixed()] {
+            for distance in [1.1, 0.9] {
+                assert_eq!(held(&config, &[distance; 40]), [0.0; 40], "{distance} m away");
+            }
+        }
     }
 
     #[test]

@@ -6,12 +6,14 @@ use comic_experiment::Vision;
 use rand_pcg::Pcg64;
 
 use super::stage::Stage;
+use crate::achievement::Achievement;
 use crate::environment::MAX_REWARD_TERMS;
 use crate::error::Error;
 use crate::gradient::RewardDerivative;
 use crate::humanoid::observation::Number;
 
-/// How an episode begins, the reward of a step, and when the humanoid fails. All environments share the rules.
+/// How an episode begins, the reward of a step, when the humanoid fails, and what an episode achieved. All environments
+/// share the rules.
 pub(crate) trait Rules: Debug + Send + Sync + 'static {
     /// What one environment keeps from step to step.
     type State: Debug + Default + Send;
@@ -27,6 +29,10 @@ pub(crate) trait Rules: Debug + Send + Sync + 'static {
 
     /// The result of the control step that was just simulated.
     fn judge(&self, stage: &mut Stage, state: &mut Self::State, random: &mut Pcg64) -> Verdict;
+
+    /// What the episode has achieved so far. `failed` says whether it ended in failure. After a divergence the stage's
+    /// positions mean nothing, and the environment takes the success away.
+    fn achievement(&self, stage: &Stage, state: &Self::State, failed: bool) -> Achievement;
 
     /// Writes the task observation.
     fn observe<T: Number>(&self, stage: &Stage, state: &Self::State, out: &mut [T]);
@@ -45,7 +51,7 @@ pub(crate) trait Rules: Debug + Send + Sync + 'static {
     }
 
     /// The derivative of the reward of the control step that was just simulated with respect to the state after it.
-    fn differentiate(&self, _: &Stage) -> RewardDerivative {
+    fn differentiate(&self, _: &Stage, _: &Self::State) -> RewardDerivative {
         RewardDerivative::ZERO
     }
 

@@ -57,6 +57,8 @@ pub(crate) struct Arena {
     pub(crate) hands: [usize; 2],
     /// Body of the ball, if there is a ball.
     pub(crate) ball: Option<usize>,
+    /// Where each gap or wall of a corridor ends, m along the corridor; empty in other arenas.
+    pub(crate) obstacle_ends: Vec<f64>,
 }
 
 impl Arena {
@@ -66,7 +68,12 @@ impl Arena {
         let hand = |name: &str| body(&format!("{PREFIX}{name}")).ok_or_else(|| missing("body", name));
         let (hands, ball) = ([hand("lhand")?, hand("rhand")?], body(BALL));
         let parts = parts(&model);
-        Ok(Self { models: Models::new(model, SUBSTEPS), walker, parts, hands, ball })
+        Ok(Self { models: Models::new(model, SUBSTEPS), walker, parts, hands, ball, obstacle_ends: Vec::new() })
+    }
+
+    /// With obstacles that end at these places, m along the corridor.
+    pub(crate) fn with_obstacles(self, obstacle_ends: Vec<f64>) -> Self {
+        Self { obstacle_ends, ..self }
     }
 }
 

@@ -3,13 +3,13 @@
 use std::sync::Arc;
 
 use comic_experiment::{WallSide, Walls};
-use mujoco_rs::prelude::*;
 use rand::Rng as _;
 use rand_pcg::Pcg64;
 
 use super::corridor::{CorridorRules, Obstacles};
 use super::environment::RuledTask;
 use super::poses::Poses;
+use super::stage::Arena;
 use crate::arenas::corridor::{self, Block, Extent, X_PADDING};
 use crate::build_task::{BuildTask, Context};
 use crate::environment::Task;
@@ -24,9 +24,10 @@ impl BuildTask for Walls {
 }
 
 impl Obstacles for Walls {
-    fn draw(&self, extent: Extent, random: &mut Pcg64) -> Result<MjModel, Error> {
+    fn draw(&self, extent: Extent, random: &mut Pcg64) -> Result<Arena, Error> {
         let walls = walls(self, extent, random);
-        humanoid::build_in(|directory| corridor::with_walls(directory, extent, &walls))
+        let model = humanoid::build_in(|directory| corridor::with_walls(directory, extent, &walls))?;
+        Ok(Arena::new(model)?.with_obstacles(corridor::wall_ends(&walls)))
     }
 }
 

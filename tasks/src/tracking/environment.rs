@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
-use comic_clips::pose_to_action;
 use comic_clips::spatial::subtract;
+use comic_clips::{JOINT_RANGES, pose_to_action};
 use comic_experiment::{TaskSpec, Tracking};
 use mujoco_rs::prelude::MjModel;
 use rand::SeedableRng;
+use rand_distr::{Distribution as _, StandardNormal};
 use rand_pcg::Pcg64;
 
 use super::gradient::differentiate;
@@ -14,12 +15,20 @@ use super::observation::{Observation, View};
 use super::reference::Reference;
 use super::reward;
 use super::task::TrackingTask;
+use crate::achievement::Achievement;
 use crate::build_task::{BuildTask, Context};
 use crate::environment::{ClipStarts, Environment, Episode, Outcome, Scenery, Simulated, Step, Task, control};
 use crate::error::Error;
 use crate::gradient::GradientTape;
 use crate::humanoid::observation::Body;
+use crate::humanoid::walker::ROOT_COORDINATES;
 use crate::physics::{Data, Simulation, is_healthy};
+
+/// Standard deviations of the noise of a start, at `start_noise` 1 (D): joint angles, rad; the root's velocity, m/s; angular
+/// velocities of root and joints, rad/s.
+const START_JOINTS: f64 = 0.1;
+const START_VELOCITY: f64 = 0.3;
+const START_ANGULAR_VELOCITY: f64 = 0.5;
 
 impl BuildTask for Tracking {
     fn build(&self, context: &Context<'_>) -> Result<Arc<dyn Task>, Error> {
@@ -68,6 +77,8 @@ pub struct TrackingEnvironment {
     /// Coordinates of the root and the joints one control step ago.
     previous: [f64; 63],
     error: f64,
+    /// Whether the episode lasted to the clip's end, or to the time limit.
+    lasted: bool,
     diverged: bool,
     /// Records steps for the derivative of the reward, if somebody wants it.
     tape: Option<GradientTape>,
@@ -86,6 +97,7 @@ impl TrackingEnvironment {
             frame: 0,
             previous: [0.0; 63],
             error: 0.0,
+            lasted: false,
             diverged: false,
             tape: None,
         };
@@ -114,7 +126,27 @@ impl TrackingEnvironment {
         self.error
     }
 
-    fn place(&mut self, clip: usize, frame: usize) {
+    /// The generalised positions and velocities of a start of training.
+    fn draw_state(&mut self, clip: usize, frame: usize) -> ([f64; 63], [f64; 62]) {
+        let (task, random) = (&self.task, &mut self.random);
+        let (mut qpos, mut qvel) = (task.references[clip].qpos(frame), task.references[clip].qvel(frame));
+        let noise = task.config.start_noise;
+        if noise > 0.0 {
+            let mut normal = |deviation: f64| {
+                let draw: f64 = StandardNormal.sample(random);
+                noise * deviation * draw
+            };
+            for (joint, [low, high]) in qpos[ROOT_COORDINATES..].iter_mut().zip(JOINT_RANGES) {
+                *joint = (*joint + normal(START_JOINTS)).clamp(low, high);
+            }
+            for (index, velocity) in qvel.iter_mut().enumerate() {
+                *velocity += normal(if index < 3 { START_VELOCITY } else { START_ANGULAR_VELOCITY });
+            }
+        }
+        (qpos, qvel)
+    }
+
+    fn place(&mut self, clip: usize, frame: usize, [qpos, qvel]: [&[f64]; 2]) {
         if let Some(tape) = &mut self.tape {
             tape.end_episode();
         }
@@ -122,10 +154,11 @@ impl TrackingEnvironment {
         let reference = &task.references[clip];
         let preset = task.config.preset_actuators.then(|| pose_to_action(reference.joints(frame)));
         let activation = preset.as_ref().map(<[f64; 56]>::as_slice).filter(|_| task.walker.activations == 56);
-        task.models.place(data, &reference.qpos(frame), &reference.qvel(frame), activation);
+        task.models.place(data, qpos, qvel, activation);
         self.error = reward::termination_error(task.config.termination_error, &task.walker, data, reference, frame);
         self.previous.copy_from_slice(data.qpos());
-        (self.clip, self.start, self.frame, self.diverged) = (clip, frame, frame, false);
+        (self.clip, self.start, self.frame) = (clip, frame, frame);
+        (self.lasted, self.diverged) = (false, false);
     }
 
     /// `began` says whether the step was recorded.
@@ -158,7 +191,9 @@ impl Environment for TrackingEnvironment {
     fn reset(&mut self) {
         let (clip, start) = self.task.starts.draw(&mut self.random);
         let first = self.task.references[clip].first;
-        self.place(clip, start.saturating_sub(first));
+        let frame = start.saturating_sub(first);
+        let (qpos, qvel) = self.draw_state(clip, frame);
+        self.place(clip, frame, [&qpos, &qvel]);
     }
 
     fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error> {
@@ -169,7 +204,9 @@ impl Environment for TrackingEnvironment {
             .map_or((0, 0), |reference| (reference.first, reference.last_step(self.task.look_ahead)));
         match start.checked_sub(first) {
             Some(frame) if frame < frames => {
-                self.place(clip, frame);
+                let reference = &self.task.references[clip];
+                let (qpos, qvel) = (reference.qpos(frame), reference.qvel(frame));
+                self.place(clip, frame, [&qpos, &qvel]);
                 Ok(())
             }
             _ => Err(Error::Start { clip, start, first, frames }),
@@ -229,6 +266,10 @@ impl Environment for TrackingEnvironment {
         errors.extend(bodies.iter().zip(targets).map(|(body, target)| subtract(*body, *target)));
     }
 
+    fn achievement(&self) -> Achievement {
+        Achievement::new(self.lasted && !self.diverged)
+    }
+
     fn servo_action(&self, action: &mut [f32]) {
         let target = pose_to_action(self.reference().joints(self.frame + 1));
         for (place, value) in action.iter_mut().zip(target) {
@@ -267,6 +308,7 @@ impl Simulated for TrackingEnvironment {
         } else {
             Outcome::Running
         };
+        self.lasted = outcome == Outcome::Truncated;
         if let Some(tape) = tape {
             let reward = differentiate(&task.walker, data, reference, *frame, self.error, config);
             tape.end_step(reward, outcome != Outcome::Running);

@@ -20,7 +20,7 @@ pub(crate) struct Options {
 
 /// A command for a program that gets SIGTERM when the thread that starts it ends, also when this process is killed. So start
 /// it from a thread that outlives it. The command starts this program as [`run`], which becomes the other one.
-pub(super) fn command(program: &Path) -> Command {
+pub(crate) fn command(program: &Path) -> Command {
     // This name works also while a newer build of this program has replaced the file.
     let mut command = Command::new("/proc/self/exe");
     command.arg("child").arg(getpid().as_raw_nonzero().to_string()).arg(program);

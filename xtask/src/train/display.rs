@@ -45,7 +45,7 @@ const TICKS: f64 = 1000.0;
 
 impl Display {
     /// For a run that has the terminal for itself.
-    pub(super) fn new(budget: &Budget) -> Self {
+    pub(crate) fn new(budget: &Budget) -> Self {
         let panel = || {
             let panel = ProgressBar::with_draw_target(Some(TICKS as u64), ProgressDrawTarget::stderr());
             if let Ok(style) = ProgressStyle::with_template("{msg}\n{elapsed_precise} {wide_bar} {percent:>3} %") {
@@ -78,7 +78,7 @@ impl Display {
     }
 
     /// Shows an event with its facts.
-    pub(super) fn event(&mut self, event: &str, facts: &[(&str, String)]) {
+    pub(crate) fn event(&mut self, event: &str, facts: &[(&str, String)]) {
         match &self.output {
             Output::Panel(panel) => panel.println(event_text(event, facts)),
             Output::Text => eprintln!("{}", event_text(event, facts)),
@@ -166,7 +166,7 @@ impl Display {
     }
 
     /// Leaves the panel as it is; later events are lines below it.
-    pub(super) fn finish(&mut self) {
+    pub(crate) fn finish(&mut self) {
         if let Output::Panel(panel) = &self.output {
             panel.abandon();
             self.output = Output::Text;

@@ -63,7 +63,7 @@ fn evaluate(checkpoint: &Path, episodes: Option<u32>, stderr: Stdio) -> Result<E
 }
 
 /// A block of rows for each clip, a column for each policy.
-pub(super) fn table(columns: &[(String, Evaluation)]) -> String {
+pub(crate) fn table(columns: &[(String, Evaluation)]) -> String {
     let mut text = String::from("\nEvaluation (policies without noise)\n");
     let Some((_, first)) = columns.first() else { return text };
     // For one clip the overall block would be the same.
@@ -90,6 +90,9 @@ pub(super) fn table(columns: &[(String, Evaluation)]) -> String {
         row("reward per step / most", &|clip| Some(clip.reward_per_step));
         row("fraction survived", &|clip| Some(clip.fraction_survived));
         row("success rate", &|clip| clip.success_rate);
+        for measure in clip.measures.keys() {
+            row(&format!("{measure}, per episode"), &|clip| clip.measures.get(measure).copied());
+        }
         row("position error, mm", &|clip| clip.tracking_error.map(|error| error.position_mm));
         row("the same from the root, mm", &|clip| clip.tracking_error.map(|error| error.local_position_mm));
         row("velocity error, mm/step", &|clip| clip.tracking_error.map(|error| error.velocity_mm_per_step));
@@ -115,6 +118,7 @@ mod tests {
             reward_per_step: 0.5,
             fraction_survived: 0.25,
             success_rate: Some(0.5),
+            measures: [("targets".to_owned(), 1.5)].into(),
             tracking_error: None,
             head_height: Some(1.5),
             reward_terms: [("com".to_owned(), 0.01)].into(),
@@ -136,6 +140,7 @@ mod tests {
         let table = table(&columns.map(|(name, reward)| (name.to_owned(), evaluation(&["CMU_007_01"], reward))));
         assert!(table.contains("CMU_007_01                       untrained       trained\n"), "{table}");
         assert!(table.contains("  normalised reward                  0.030         0.410\n"), "{table}");
+        assert!(table.contains("  targets, per episode               1.500         1.500\n"), "{table}");
         assert!(table.contains("  com, per step                      0.010         0.010\n"), "{table}");
         assert!(!table.contains("overall"), "one clip is all clips: {table}");
     }

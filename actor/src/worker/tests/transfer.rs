@@ -1,7 +1,7 @@
 //! A frozen low level between the policy's action and the simulator.
 
 use super::*;
-use crate::forward_pass::LowLevelShape;
+use crate::forward_pass::{Actuated, LowLevelShape};
 
 /// Entries of a command: fewer than those of an action.
 const COMMANDS: usize = 1;
@@ -12,6 +12,8 @@ struct WithLowLevel {
     policy: Plain,
     /// The actions of each pass.
     actions: Vec<Vec<f32>>,
+    /// What it was asked the derivatives of.
+    actuated: Vec<Actuated>,
 }
 
 impl ForwardPass for WithLowLevel {
@@ -32,6 +34,12 @@ impl ForwardPass for WithLowLevel {
         }
         Ok(())
     }
+    fn action_derivatives(&mut self, actuated: Actuated) -> Result<Vec<f32>, Error> {
+        let found = actuated.derivatives.chunks(56).map(|row| if row[0] == 5.0 { 1e9 } else { 10.0 * row[0] });
+        let found = found.flat_map(|value| [value; 3]).collect();
+        self.actuated.push(actuated);
+        Ok(found)
+    }
 }
 
 #[test]
@@ -47,6 +55,30 @@ fn the_simulator_gets_the_low_levels_command_and_the_unroll_the_policys_action()
         let (_, step) = rows.place(t);
         assert_eq!(rows.one(Field::Task, t + 1), (step + 1) as f32 / 100.0, "row {t}");
     }
+}
+
+#[test]
+fn the_low_level_gets_the_derivatives_with_what_it_read_at_each_transition() {
+    let shape = UnrollShape { action_gradient: 3, ..*layout(6).shape() };
+    let layout = Arc::new(UnrollLayout::new(shape));
+    // Two transitions, the first episode's last observation, and three transitions.
+    let environment = Counter { derivatives: 5, ..Counter::new(&[2, 9]) };
+    let mut worker = Worker::new(vec![environment], WithLowLevel::default(), Arc::clone(&layout), 0, 3).unwrap();
+    worker.adopt(&directive(0)).unwrap();
+    let unrolls = worker.unroll(&|| false, &Progress::default()).unwrap().unwrap();
+    let rows = Rows { layout: &layout, payload: &unrolls[0].payload };
+    let Actuated { steps, action, proprioception, low_level_state, derivatives } = &worker.forward.actuated[0];
+    let transitions = [0, 1, 3, 4, 5];
+    assert_eq!(*steps, 5);
+    assert_eq!(*action, transitions.map(|t| rows.row(Field::Action, t)).concat());
+    assert_eq!(*proprioception, transitions.map(|t| rows.row(Field::Proprioception, t)).concat());
+    // Steps since the episode began, before the low level acts.
+    assert_eq!(*low_level_state, [0.0, 1.0, 0.0, 1.0, 2.0]);
+    let first: Vec<f32> = derivatives.chunks(56).map(|row| row[0]).collect();
+    assert_eq!(first, [1.0, 2.0, 3.0, 4.0, 5.0]);
+    // Ten times the command's, and nothing where that is more than the wire takes.
+    let written: Vec<f32> = (0..6).map(|t| rows.one(Field::ActionGradient, t)).collect();
+    assert_eq!(written, [10.0, 20.0, 0.0, 30.0, 40.0, 0.0]);
 }
 
 #[test]

@@ -5,7 +5,7 @@ use rand::SeedableRng as _;
 
 use super::super::environment::RuledEnvironment;
 use super::*;
-use crate::environment::{Environment as _, Simulated as _};
+use crate::environment::{Environment as _, Outcome, Simulated as _};
 use crate::gradient::tests::moved;
 
 fn rules(config: &GetUp) -> GetUpRules {
@@ -51,7 +51,7 @@ fn the_rewards_derivative_equals_finite_differences() {
     let (mut qpos, qvel) = (stage.data.qpos().to_vec(), stage.data.qvel().to_vec());
     qpos[2] -= 0.5;
     stage.place(&qpos, &qvel);
-    let found = rules.differentiate(&stage);
+    let found = rules.differentiate(&stage, &State);
     let mut at = |index: usize, change: f64| {
         let (qpos, qvel) = moved(&qpos, &qvel, index, change);
         stage.place(&qpos, &qvel);
@@ -133,7 +133,6 @@ fn every_step_has_a_derivative_and_a_step_along_it_lifts_the_head() {
 
 #[test]
 fn only_episodes_of_training_have_its_time_limit() {
-    use crate::environment::Outcome;
     let config = GetUp { time_limit: 0.3, training_time_limit: 0.12, ..GetUp::default() };
     let task: Arc<dyn Task> = Arc::new(RuledTask::new(rules(&config), comic_experiment::TaskSpec::default()));
     let mut environment = task.environment(3).unwrap();
@@ -211,4 +210,32 @@ fn still() -> GetUp {
         start_pose: StartPose::Upright,
         ..GetUp::default()
     }
+}
+
+#[test]
+fn an_episode_that_ends_low_or_diverges_is_no_success() {
+    let rules = rules(&GetUp::default());
+    let mut stage = rules.stage(&mut Pcg64::seed_from_u64(1)).unwrap();
+    // 0.9 of the target height is 0.18 m below it.
+    for (below, success) in [(0.0, true), (0.17, true), (0.19, false), (1.0, false)] {
+        let mut pose = Pose::upright();
+        pose.position_mut()[2] -= below;
+        stage.place(&pose.qpos, &pose.qvel);
+        assert_eq!(rules.achievement(&stage, &State, false), Achievement::new(success), "{below} m below");
+    }
+
+    let mut environment = RuledEnvironment::at(rules, &Pose::upright(), State).unwrap();
+    assert!(environment.achievement().success, "it stands");
+    let outcome = environment.step_control(&[f64::NAN; 56]).outcome;
+    assert_eq!((outcome, environment.achievement().success), (Outcome::Diverged, false));
+}
+
+#[test]
+fn success_is_decided_at_the_end_and_a_body_that_has_fallen_by_then_has_none() {
+    let config = GetUp { lying_share: 0.0, time_limit: 3.0, ..GetUp::default() };
+    let mut environment = RuledEnvironment::at(rules(&config), &Pose::upright(), State).unwrap();
+    environment.reset_to(0, 7).unwrap();
+    assert!(environment.achievement().success, "it begins above the ground");
+    while environment.step_control(&[0.0; 56]).outcome == Outcome::Running {}
+    assert!(!environment.achievement().success);
 }
