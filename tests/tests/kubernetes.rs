@@ -388,9 +388,11 @@ async fn the_programs_accept_the_arguments_of_the_manifests() -> Result<()> {
     let mut certs = std::process::Command::new(program("comic-learner")?);
     certs.args(["certs", "--token", "--name", "comic-learner", "localhost", "--out"]).arg(access.path());
     ensure!(certs.output()?.status.success(), "no certificates");
-    let place = |word: &str| match word.strip_prefix("/access/") {
-        Some(file) => access.path().join(file).display().to_string(),
-        None => word.to_owned(),
+    // The low level that the overlay `transfer` has on a volume is here the built-in one's file.
+    let data = root().join("networks/data");
+    let place = |word: &str| {
+        let access = word.strip_prefix("/access/").map(|file| access.path().join(file).display().to_string());
+        access.unwrap_or_else(|| word.replace("=/low-level/", &format!("={}/", data.display())))
     };
     for directory in applicable()? {
         let cluster = Cluster::read(render(&directory)?)?;
