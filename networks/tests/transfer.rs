@@ -5,8 +5,8 @@
 use std::collections::{BTreeMap, HashMap};
 
 use comic_experiment::{Experiment, LowLevelName, TaskSpec, Transfer, TransferPrior, resolve};
-use comic_networks::export::{Exported, KEY, Source};
-use comic_networks::{Error, Policy, RecurrentState, Routing, new_policy, to_safetensors};
+use comic_networks::export::{Exported, FittedPrior, KEY, Source};
+use comic_networks::{Error, Policy, RecurrentState, Routing, StatePrior, new_policy, to_safetensors};
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest as _, Sha256};
@@ -158,6 +158,16 @@ fn a_learned_prior_is_the_one_that_acting_used() {
     let deviation = random(3, 4);
     let (expected, _) =
         file.freeze(&transfer(TransferPrior::Standard)).unwrap().act(&prior.sample(&deviation), &proprioception, &none);
+    let (found, _) = file.freeze(&transfer(TransferPrior::State)).unwrap().act(&deviation, &proprioception, &none);
+    assert!(difference(&found, &expected) < 1e-6);
+
+    let store = nn::VarStore::new(Device::Cpu);
+    let fitted = StatePrior::new(&(store.root() / "prior"), spec.proprioception, &experiment.network, &[5]);
+    let entry = FittedPrior { hidden: vec![5], latents: 9, nats: Some(0.0), standard_nats: Some(0.0) };
+    let file = Exported::read(file.with_prior(entry, &store).unwrap().bytes).unwrap();
+    let standard = file.freeze(&transfer(TransferPrior::Standard)).unwrap();
+    let latent = fitted.forward(&standard.normalise(&proprioception)).sample(&deviation);
+    let (expected, _) = standard.act(&latent, &proprioception, &none);
     let (found, _) = file.freeze(&transfer(TransferPrior::State)).unwrap().act(&deviation, &proprioception, &none);
     assert!(difference(&found, &expected) < 1e-6);
 }

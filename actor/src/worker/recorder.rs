@@ -35,7 +35,7 @@ struct OpenUnroll {
     /// Noise of this environment only, so that other environments cannot change it.
     rng: Pcg64,
     buffer: UnrollBuffer,
-    /// The recurrent state that a frozen low level read in each row, `[T, S]`.
+    /// The recurrent state that a frozen low level read in each row, `[T, S]`; empty if no derivative goes through it.
     low_level_states: Vec<f32>,
     /// The task of the unroll: that of its first row. An episode of another task waits for the next unroll.
     task: usize,
@@ -59,7 +59,9 @@ impl UnrollRecorder {
         numbers: impl Iterator<Item = u32>,
         seed: u64,
     ) -> Self {
-        let states = layout.shape().length * low_level.map_or(0, |shape| shape.state);
+        let shape = layout.shape();
+        let goes_back = shape.action_gradient > 0;
+        let states = low_level.filter(|_| goes_back).map_or(0, |low_level| shape.length * low_level.state);
         let open = |number| OpenUnroll {
             rng: Pcg64::seed_from_u64(EnvironmentSeeds::new(seed, number).noise),
             buffer: UnrollBuffer::new(&layout),
@@ -101,6 +103,10 @@ impl UnrollRecorder {
             derivatives: gradients.as_flattened().to_vec(),
         };
         let found = forward.action_derivatives(actuated)?;
+        if found.len() != transitions.len() * shape.action_gradient {
+            let derivatives = found.len() / shape.action_gradient.max(1);
+            return Err(Error::Derivatives { transitions: transitions.len(), derivatives });
+        }
         for (t, row) in transitions.into_iter().zip(found.chunks_exact(shape.action_gradient.max(1))) {
             // A low level can make a derivative larger than the wire takes.
             if row.iter().all(|entry| entry.abs() <= LARGEST_ACTION_GRADIENT) {
@@ -150,8 +156,10 @@ impl<E: Environment> Recorder<E> for UnrollRecorder {
         if rollout.episode.task == unroll.task && !rollout.ended {
             row.sample(&mut unroll.rng);
             // The low level replaces it when it acts.
-            let state = row.low_level_state.len();
-            unroll.low_level_states[self.t * state..][..state].copy_from_slice(row.low_level_state);
+            if !unroll.low_level_states.is_empty() {
+                let state = row.low_level_state.len();
+                unroll.low_level_states[self.t * state..][..state].copy_from_slice(row.low_level_state);
+            }
         }
     }
 

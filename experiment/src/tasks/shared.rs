@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::fault::{Fault, Section, not_negative};
+use crate::fault::{Fault, Section};
 
 /// The pose in which an episode begins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -41,9 +41,11 @@ impl GradientOfSpeed {
         let Self { decay, speed, upright } = *self;
         let field = |name: &str| format!("{within}gradient.{name}");
         section.ensure(&field("decay"), decay, (0.0..=1.0).contains(&decay), "must be in [0, 1]")?;
-        let holds = not_negative(speed);
-        section.ensure(&field("speed"), speed, holds, "must be 0, which is the task's own, or positive")?;
-        section.ensure(&field("upright"), upright, not_negative(upright), "must be 0 or more")
+        // Slopes of 1/speed and of upright/0.3 m: larger ones make derivatives that the wire does not take.
+        let holds = speed == 0.0 || (0.1..=100.0).contains(&speed);
+        section.ensure(&field("speed"), speed, holds, "must be 0, which is the task's own, or from 0.1 to 100 m/s")?;
+        let holds = (0.0..=100.0).contains(&upright);
+        section.ensure(&field("upright"), upright, holds, "must be in [0, 100]")
     }
 }
 

@@ -56,7 +56,7 @@ impl<O: Obstacles> CorridorRules<O> {
     }
 
     /// Whether an episode came far enough, which is to the corridor's end, or [`Corridor::SUCCESS_SHARE`] of the way at the
-    /// target velocity without a failure. After the corridor's end there is nothing to run on.
+    /// target velocity without a failure. A wall is 2 m after the corridor's end.
     fn is_success(&self, farthest: f64, failed: bool) -> bool {
         let Corridor { length, target_velocity, time_limit, .. } = self.config;
         let enough = START + Corridor::SUCCESS_SHARE * target_velocity * time_limit;
