@@ -139,7 +139,8 @@ async fn a_low_level_that_cannot_be_used_ends_the_learner_with_2_and_says_why() 
     export(&tracking.run(), "low-level", &file("whole.safetensors"))?;
     let whole = fs::read(file("whole.safetensors"))?;
     fs::write(file("cut.safetensors"), &whole[..whole.len() / 2])?;
-    low_level(directory.path(), "mixture.safetensors", &["network.low_level=mixture"]).await?;
+    let mixture = ["network.low_level=mixture", "vmpo.control_variate=0"];
+    low_level(directory.path(), "mixture.safetensors", &mixture).await?;
     let zeros = format!("transfer.sha256={}", "0".repeat(64));
     for (name, field, reason) in [
         ("absent.safetensors", "seed=1", "No such file"),
