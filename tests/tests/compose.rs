@@ -12,6 +12,8 @@ use serde_json::Value;
 
 /// Long enough for two slow cores. A step ends as soon as its condition holds.
 const LIMIT: Duration = Duration::from_secs(180);
+/// One actor with half a core makes every unroll.
+const HUNDREDS_OF_UPDATES: Duration = Duration::from_secs(600);
 /// Docker waits longer and longer between two starts, in all for two minutes, and without a network a name is looked up slowly.
 const ELEVEN_STARTS: Duration = Duration::from_secs(900);
 /// More unrolls than removed containers can have in flight.
@@ -217,14 +219,15 @@ async fn containers_end_when_the_run_is_over() -> Result<()> {
 async fn containers_end_when_they_missed_the_end_of_the_run() -> Result<()> {
     let mut project = Project::new("missed", &["compose.yaml"]);
     project.patience = 1;
-    project.tell("--set budget.updates=1000");
+    // An update takes one actor a tenth of a second on a slow machine: time enough to cut the network before the end.
+    project.tell("--set budget.updates=400");
     project.up(1)?;
     let [learner, actor] = [project.container("learner")?, project.container("actor")?];
     actor.until_log_holds("joined the learner", LIMIT).await?;
     docker(&["network", "disconnect", &project.network(), &actor.inspect(".Id")?])?;
     // A second actor brings the run to its end.
     project.up(2)?;
-    learner.until_is(".State.Status", "exited", LIMIT).await?;
+    learner.until_is(".State.Status", "exited", HUNDREDS_OF_UPDATES).await?;
     ensure!(learner.inspect(".State.ExitCode")? == "0", "{}", learner.log()?);
     // Docker starts it again ten times.
     actor.until_is(".RestartCount", "10", ELEVEN_STARTS).await?;
