@@ -159,6 +159,9 @@ pub trait Simulated: Environment {
     /// until the next reset.
     fn step_control(&mut self, control: &[f64; 56]) -> Step;
 
+    /// All random numbers from now on are those of `seed`. The episodes that later resets begin depend on it alone.
+    fn reseed(&mut self, seed: u64);
+
     /// The compiled model. Other simulations may share it.
     fn model(&self) -> Arc<MjModel>;
 

@@ -167,6 +167,13 @@ impl Simulated for JointEnvironment {
         in_one_term(self.environment_mut().step_control(control))
     }
 
+    fn reseed(&mut self, seed: u64) {
+        self.random = Pcg64::seed_from_u64(seed);
+        for environment in &mut self.environments {
+            environment.reseed(self.random.random());
+        }
+    }
+
     fn model(&self) -> Arc<MjModel> {
         self.environment().model()
     }

@@ -117,6 +117,20 @@ fn opengl_a_film_in_the_same_thread_does_not_change_the_camera_image_and_arenas_
     }
 }
 
+/// A context has the textures of one task's arenas.
+#[test]
+fn opengl_two_tasks_in_one_thread_have_the_images_that_each_has_alone() {
+    let image = |task: &str| {
+        let mut image = vec![0; IMAGE_BYTES];
+        environment(task, &[]).draw(&mut image).unwrap_or_else(|error| panic!("{error}"));
+        image
+    };
+    let alone = |task: &'static str| std::thread::scope(|scope| scope.spawn(|| image(task)).join().unwrap());
+    for task in ["walls", "gaps", "walls"] {
+        assert_eq!(image(task), alone(task), "{task}");
+    }
+}
+
 #[test]
 fn sizes_are_read_and_bounded() {
     let size: Size = "640x480".parse().unwrap();

@@ -1,7 +1,7 @@
 //! The camera images of the policy: MuJoCo draws the humanoid's egocentric camera (`cmu_humanoid.py`, `egocentric_camera`).
 //!
 //! Drawing needs OpenGL through EGL, and no display. An OpenGL context belongs to the thread that made it and takes long to
-//! make. Each thread makes one when it first draws, and uses it for all its environments.
+//! make. Each thread makes one when it first draws the arenas of a task, and uses it for all its environments of that task.
 
 use std::cell::RefCell;
 
@@ -21,28 +21,35 @@ const CAMERA: &str = "egocentric";
 const INVISIBLE_GROUP: usize = 1;
 
 thread_local! {
-    /// The camera of this thread and its quality.
-    static CAMERA_OF_THREAD: RefCell<Option<(Vision, Camera)>> = const { RefCell::new(None) };
+    /// The cameras of this thread, each with its quality and its task. A context has the textures of the model that it was
+    /// made for, which another task's arenas do not have.
+    static CAMERAS_OF_THREAD: RefCell<Vec<(Vision, &'static str, Camera)>> = const { RefCell::new(Vec::new()) };
 }
 
-/// Draws the camera image of `simulation` into `image`, which has [`IMAGE_BYTES`] bytes. [`Vision::Off`] does nothing.
+/// Draws the camera image of `simulation`, in an arena of `task`, into `image`, which has [`IMAGE_BYTES`] bytes.
+/// [`Vision::Off`] does nothing.
 ///
 /// # Errors
 /// [`Error::Graphics`]: there is no OpenGL.
-pub(crate) fn draw(vision: Vision, simulation: &mut Simulation, image: &mut [u8]) -> Result<(), Error> {
+pub(crate) fn draw(
+    vision: Vision,
+    task: &'static str,
+    simulation: &mut Simulation,
+    image: &mut [u8],
+) -> Result<(), Error> {
     if vision == Vision::Off {
         return Ok(());
     }
-    CAMERA_OF_THREAD.with_borrow_mut(|kept| {
-        let camera = match kept {
-            Some((kind, camera)) if *kind == vision => camera,
-            _ => {
-                // The old context must end before the new one begins: both would be current in this thread.
-                *kept = None;
-                &mut kept.insert((vision, Camera::new(simulation.model(), vision)?)).1
+    CAMERAS_OF_THREAD.with_borrow_mut(|cameras| {
+        let known = cameras.iter().position(|(quality, owner, _)| (*quality, *owner) == (vision, task));
+        let index = match known {
+            Some(index) => index,
+            None => {
+                cameras.push((vision, task, Camera::new(simulation.model(), vision)?));
+                cameras.len() - 1
             }
         };
-        camera.draw(simulation, image)
+        cameras[index].2.draw(simulation, image)
     })
 }
 

@@ -25,7 +25,11 @@ type Named = Vec<(&'static str, Vec<f64>)>;
 
 /// A replay of a recorded episode.
 #[derive(Debug)]
-pub struct Replay(Box<dyn Replayed>);
+pub struct Replay {
+    environment: Box<dyn Replayed>,
+    /// The name of its arena, for the camera.
+    arena: &'static str,
+}
 
 trait Replayed: Simulated {
     fn dictionary(&self) -> Named;
@@ -52,7 +56,7 @@ impl<R: Recorded> Replayed for RuledEnvironment<R> {
 impl Replay {
     /// One control step.
     pub fn step_control(&mut self, control: &[f64; 56]) -> Step {
-        self.0.step_control(control)
+        self.environment.step_control(control)
     }
 
     /// Draws the camera image as dm_control does (`full`) or as training does; [`vision::IMAGE_BYTES`] bytes.
@@ -61,27 +65,27 @@ impl Replay {
     /// [`Error::Graphics`]: there is no OpenGL.
     pub fn draw(&mut self, full: bool, image: &mut [u8]) -> Result<(), Error> {
         let vision = if full { Vision::Full } else { Vision::Fast };
-        vision::draw(vision, self.0.simulation_mut(), image)
+        vision::draw(vision, self.arena, self.environment.simulation_mut(), image)
     }
 
     /// dm_control's observation dictionary without the camera, in its order.
     pub fn dictionary(&self) -> Vec<(&'static str, Vec<f64>)> {
-        self.0.dictionary()
+        self.environment.dictionary()
     }
 
     /// The task's quantities besides its observations: targets, counters, velocities.
     pub fn quantities(&self) -> Vec<(&'static str, Vec<f64>)> {
-        self.0.quantities()
+        self.environment.quantities()
     }
 
     /// The simulation.
     pub fn simulation(&self) -> &Simulation {
-        self.0.simulation()
+        self.environment.simulation()
     }
 
     /// The environment that is replayed.
     pub fn environment(&self) -> &dyn Simulated {
-        self.0.as_environment()
+        self.environment.as_environment()
     }
 }
 
@@ -96,7 +100,7 @@ pub fn replay_go_to_target(spawn: [f64; 2], rotation: f64, targets: &[[f64; 2]])
     let mut script: Vec<[f64; 2]> = targets.iter().rev().copied().collect();
     let state = GoToTargetState { target: script.pop().unwrap_or_default(), script, ..Default::default() };
     let pose = Pose::upright().turned(UP, rotation).moved(spawn[0], spawn[1]);
-    Ok(Replay(Box::new(RuledEnvironment::at(rules, &pose, state)?)))
+    Ok(Replay { environment: Box::new(RuledEnvironment::at(rules, &pose, state)?), arena: "recorded floor" })
 }
 
 /// Replays a corridor with this length and width (m). It has these platforms, or these walls if there are no platforms.
@@ -104,11 +108,12 @@ pub fn replay_go_to_target(spawn: [f64; 2], rotation: f64, targets: &[[f64; 2]])
 /// # Errors
 /// The arena cannot be built.
 pub fn replay_corridor(length: f64, width: f64, platforms: &[Block], walls: &[Block]) -> Result<Replay, Error> {
+    let arena = if platforms.is_empty() { "recorded walls" } else { "recorded gaps" };
     let obstacles = RecordedObstacles { platforms: platforms.to_vec(), walls: walls.to_vec() };
     let config = Corridor { length, width, ..Corridor::default() };
     let rules = CorridorRules::new(&config, Poses::upright(), obstacles);
     let pose = Pose::upright().moved(START, 0.0);
-    Ok(Replay(Box::new(RuledEnvironment::at(rules, &pose, CorridorState::default())?)))
+    Ok(Replay { environment: Box::new(RuledEnvironment::at(rules, &pose, CorridorState::default())?), arena })
 }
 
 /// The model of such a corridor.

@@ -146,9 +146,7 @@ impl<R: Rules> Environment for RuledEnvironment<R> {
         if clip != 0 || !frames.contains(&start) {
             return Err(Error::Start { clip, start, first: frames.start, frames: frames.len() });
         }
-        self.random = Pcg64::seed_from_u64(start as u64);
-        // The last episode must not change this one.
-        self.state = R::State::default();
+        self.reseed(start as u64);
         self.start = start;
         self.begin(self.task.rules.time_limit());
         Ok(())
@@ -173,7 +171,7 @@ impl<R: Rules> Environment for RuledEnvironment<R> {
             image.fill(0);
             return Ok(());
         }
-        vision::draw(self.task.rules.vision(), &mut self.stage.data, image)
+        vision::draw(self.task.rules.vision(), std::any::type_name::<R>(), &mut self.stage.data, image)
     }
 
     fn episode(&self) -> Episode {
@@ -238,6 +236,12 @@ impl<R: Rules> Simulated for RuledEnvironment<R> {
         }
         let discount = if failed { 0.0 } else { 1.0 };
         Step { reward_terms, discount, outcome, head_height: self.stage.head_height() }
+    }
+
+    fn reseed(&mut self, seed: u64) {
+        self.random = Pcg64::seed_from_u64(seed);
+        // The last episode must not change the next one.
+        self.state = R::State::default();
     }
 
     fn model(&self) -> Arc<MjModel> {

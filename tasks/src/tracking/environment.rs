@@ -317,6 +317,10 @@ impl Simulated for TrackingEnvironment {
         Step { reward_terms, discount, outcome, head_height: task.walker.head_height(data) }
     }
 
+    fn reseed(&mut self, seed: u64) {
+        self.random = Pcg64::seed_from_u64(seed);
+    }
+
     fn model(&self) -> Arc<MjModel> {
         self.task.models.shared()
     }
