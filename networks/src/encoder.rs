@@ -1,7 +1,7 @@
 //! The reference encoder.
 
 use comic_experiment::{Network, TaskSpec};
-use tch::{Kind, Tensor, nn};
+use tch::{Tensor, nn};
 
 use crate::gaussian::DiagonalGaussian;
 use crate::layers::{GaussianHeadConfig, Mlp, Torso, gaussian, linear};
@@ -75,7 +75,7 @@ impl Encoder {
                 Encoded { intent: latent.shallow_clone(), latent, posterior: Some(posterior) }
             }
             Head::Weights => {
-                let latent = Tensor::zeros([input.size()[0], 0], (Kind::Float, input.device()));
+                let latent = input.narrow(1, 0, 0);
                 Encoded { intent: output, latent, posterior: None }
             }
         }

@@ -61,12 +61,14 @@ impl ResNet {
 
     /// From pixels `[.., 64·64·3]`, uint8, red, green and blue, row by row, to features `[.., F]`, at least 0.
     pub(crate) fn forward(&self, image: &Tensor) -> Tensor {
-        let mut leading = image.size();
-        leading.pop();
+        let mut shape = image.size();
+        shape.pop();
+        shape.push(self.features);
+        // The trace of an exported policy must not contain the number of images.
+        shape[0] = -1;
         let pixels = image.reshape([-1, SIZE, SIZE, 3]).permute([0, 3, 1, 2]).to_kind(Kind::Float) / 255.0 - 0.5;
         let channels = self.sections.iter().fold(pixels, |input, section| section.forward(&input));
-        leading.push(self.features);
-        channels.relu().flatten(1, -1).apply(&self.output).relu().reshape(leading)
+        channels.relu().flatten(1, -1).apply(&self.output).relu().reshape(shape)
     }
 }
 

@@ -189,6 +189,13 @@ fn torch_script_acts_like_the_policy_with_every_low_level() {
             input_state = output.narrow(1, spec.action as i64, (latent + state) as i64);
             previous = (acting.latent, acting.state);
         }
+        let batch = [spec.proprioception, spec.task, latent + state]
+            .map(|size| Tensor::cat(&[random(size), random(size), random(size)], 0));
+        let together = module.forward_ts(&batch).unwrap();
+        for row in 0..3 {
+            let alone = module.forward_ts(&batch.each_ref().map(|input| input.narrow(0, row, 1))).unwrap();
+            assert!(together.narrow(0, row, 1).allclose(&alone, 1e-5, 1e-6, false), "{name}, row {row} of three");
+        }
     }
 }
 

@@ -19,8 +19,8 @@ use crate::routing::Routing;
 
 impl Exported {
     /// Writes the policy of one task as TorchScript to `path`. The method `forward` of the module takes the inputs of
-    /// the [`Spec`](super::spec::Spec), `[1, size]` each, with an image last. It returns the outputs in one tensor `[1,
-    /// A + M]`, where M is the size of the recurrent state. The module has the description as the extra file
+    /// the [`Spec`](super::spec::Spec), `[N, size]` each, with an image last. It returns the outputs in one tensor `[N,
+    /// A + M]`, where M is the size of the recurrent state. N is any number of environments. The module has the description as the extra file
     /// `comic.json`.
     ///
     /// # Errors

@@ -35,8 +35,10 @@ pub(super) fn layers(sizes: &Sizes<'_>) -> Vec<Layer> {
 impl LowLevel for LstmLowLevel {
     fn act(&self, input: &Input<'_>) -> Output {
         let joined = Tensor::cat(&[input.intent, input.proprioception], 1);
-        let unrolls = input.recurrent.state.size()[0];
-        let (hidden, state) = self.stack.forward(&joined.reshape([unrolls, -1, joined.size()[1]]), input.recurrent);
+        // The number of unrolls is not written down: the trace of an exported policy must not contain it.
+        let steps = joined.size()[0] / input.recurrent.state.size()[0].max(1);
+        let (hidden, state) =
+            self.stack.forward(&joined.reshape([-1, steps.max(1), joined.size()[1]]), input.recurrent);
         let hidden = hidden.flatten(0, 1);
         Output { action: ActionDistribution::Gaussian(self.head.forward(&hidden)), state }
     }
