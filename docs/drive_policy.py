@@ -5,7 +5,7 @@
     python docs/drive_policy.py policy.pt walk.h5 0 24
 
 The numbers are frames of each clip at which an episode starts. The script prints one line of JSON a step. It needs the packages in
-tests/python/requirements-export.txt.
+tests/python/requirements-tests.txt.
 """
 
 import itertools

@@ -1,6 +1,6 @@
 """What TensorBoard reads in a run's directory: python read_events.py RUN/tensorboard
 
-Prints one JSON object, {tag: [[step, value], ...]}. Needs requirements-export.txt.
+Prints one JSON object, {tag: [[step, value], ...]}. Needs requirements-tests.txt.
 """
 
 import json

@@ -95,7 +95,7 @@ pub fn help(name: &str, command: &[&str]) -> Result<String> {
 /// # Errors
 /// When it does not exist, with the command that makes it.
 pub fn python() -> Result<PathBuf> {
-    let path = root().join(".deps/python/requirements-export/bin/python");
+    let path = root().join(".deps/python/requirements-tests/bin/python");
     ensure!(path.exists(), "no file {}; `cargo xtask test` makes it", path.display());
     Ok(path)
 }

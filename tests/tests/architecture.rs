@@ -33,6 +33,12 @@ fn tasks_depend_on_neither_libtorch_nor_grpc() -> Result<()> {
     does_not_depend_on("comic-tasks", &[&LIBTORCH, &GRPC])
 }
 
+/// A wheel of 4 MB, which finds its only native library in another package.
+#[test]
+fn the_python_package_depends_on_neither_libtorch_nor_grpc() -> Result<()> {
+    does_not_depend_on("comic-python", &[&LIBTORCH, &GRPC])
+}
+
 #[test]
 fn networks_depend_on_neither_simulator_nor_grpc() -> Result<()> {
     does_not_depend_on("comic-networks", &[&MUJOCO, &GRPC])

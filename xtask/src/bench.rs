@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail};
 use comic_experiment::LowLevelName;
 use serde::{Deserialize, Serialize};
 
-use crate::{python, setup, workspace};
+use crate::{python, setup, wheel, workspace};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -36,6 +36,8 @@ enum Side {
     Publish,
     /// 4000 actors for 20 minutes
     Swarm,
+    /// Environments stepped from Python, and dm_control's own loop, against `actor.env`
+    Python,
 }
 
 /// One figure; ratio = value / floor.
@@ -84,7 +86,38 @@ pub(crate) fn run(options: &Options) -> Result<()> {
         Side::Ingest => printing("ingest", arguments),
         Side::Publish => printing("publish", arguments),
         Side::Swarm => printing("swarm", arguments),
+        Side::Python => python_environments(arguments),
     }
+}
+
+/// Environments stepped from Python, and a thread of the actor's. They take turns.
+fn python_environments(arguments: &[String]) -> Result<()> {
+    #[derive(Deserialize)]
+    struct Measured {
+        figure: String,
+        value: f64,
+        unit: String,
+    }
+    python::prepare_tests()?;
+    python::install_for_tests(&wheel::build()?)?;
+    let mut rounds = Vec::new();
+    for _ in 0..ROUNDS {
+        let mut bench = Command::new(workspace::program("comic-bench-actor")?);
+        let bare = figures(bench.args(["--seconds", "5", "env"]))?;
+        let floor = bare.first().context("comic-bench-actor printed no figure")?.value;
+        let mut script = python::script_command("python_environments.py", python::TESTS)?;
+        let text = output(script.args(arguments))?;
+        let against_actor = |line: &str| -> Result<Figure> {
+            let Measured { figure, value, unit } =
+                serde_json::from_str(line).with_context(|| format!("unreadable figure: {line}"))?;
+            Ok(Figure { figure, value, unit, floor, ratio: value / floor, rest: serde_json::Map::new() })
+        };
+        rounds.push(text.lines().map(against_actor).collect::<Result<Vec<_>>>()?);
+    }
+    medians(&rounds).iter().try_for_each(|figure| {
+        println!("{}", serde_json::to_string(figure)?);
+        Ok(())
+    })
 }
 
 fn actor(arguments: &[String]) -> Result<()> {

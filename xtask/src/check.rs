@@ -7,7 +7,7 @@ use anyhow::Result;
 
 use crate::durations::Durations;
 use crate::workspace::{answers, cargo, cargo_has, run};
-use crate::{images, python, setup, workspace};
+use crate::{images, python, setup, wheel, workspace};
 
 #[derive(clap::Args)]
 pub(crate) struct TestOptions {
@@ -17,6 +17,9 @@ pub(crate) struct TestOptions {
     /// Test the update on XLA instead, on the device that PJRT_DEVICE names or on a CPU; needs torch_xla
     #[arg(long, conflicts_with = "docker")]
     xla: bool,
+    /// Run the long tests of the Python package instead: an algorithm learns on it, the notebooks run; 15 minutes
+    #[arg(long, conflicts_with_all = ["docker", "xla"])]
+    python_full: bool,
     /// Arguments for the test runner, for instance a part of a test's name
     #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
     arguments: Vec<String>,
@@ -37,6 +40,9 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
     if options.xla {
         return test_xla(&options.arguments);
     }
+    if options.python_full {
+        return test_python(&options.arguments);
+    }
     let mut durations = Durations::default();
     durations.of("set-up", || {
         setup::run(&setup::Options::default())?;
@@ -46,6 +52,7 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
     })?;
     // The whole-system tests start the programs.
     durations.of("build", workspace::build_with_tests)?;
+    durations.of("wheel", || python::install_for_tests(&wheel::build()?))?;
     if options.docker {
         durations.of("images", images::build)?;
     }
@@ -57,7 +64,7 @@ pub(crate) fn test(options: &TestOptions) -> Result<()> {
         eprintln!("cargo-nextest is not installed: running the tests with `cargo test`");
         command.arg("test");
     }
-    command.args(["--release", "--workspace"]).args(&options.arguments);
+    command.arg("--release").args(workspace::CRATES).args(&options.arguments);
     let mut left_out = demanding(options);
     left_out.retain(|tests| !tests.possible);
     for Demanding { prefix, what, .. } in &left_out {
@@ -101,6 +108,21 @@ fn test_xla(arguments: &[String]) -> Result<()> {
     }
     eprintln!("running `{}`", workspace::describe(&command));
     run(&mut command)
+}
+
+/// The long tests of the Python package.
+fn test_python(arguments: &[String]) -> Result<()> {
+    setup::run(&setup::Options::default())?;
+    python::prepare_tests()?;
+    workspace::build()?;
+    python::install_for_tests(&wheel::build()?)?;
+    let mut pytest = python::tool("pytest", python::TESTS)?;
+    // Beside python/comic, which has no native module.
+    pytest
+        .args(["-m", "full", "--capture", "no", "."])
+        .args(arguments)
+        .current_dir(workspace::root().join("python/tests"));
+    run(pytest.env("COMIC_BIN", workspace::program("comic-learner")?.with_file_name("")))
 }
 
 fn demanding(options: &TestOptions) -> Vec<Demanding> {

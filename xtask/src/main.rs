@@ -9,6 +9,7 @@
 //! - [`train`] runs one learner and its actors on this machine and shows their progress.
 //! - [`sweep`] trains with varied fields of an experiment, and compares the runs.
 //! - [`mod@bench`] measures; [`python`] runs other people's code for comparison.
+//! - [`wheel`] builds the Python package.
 //! - [`plot`] draws learning curves; [`metrics`] and [`evaluations`] read the files that it draws.
 //! - [`film`] makes the film of the README, and [`low_level`] the built-in low level.
 //!
@@ -29,6 +30,7 @@ mod python;
 mod setup;
 mod sweep;
 mod train;
+mod wheel;
 mod workspace;
 
 use std::path::PathBuf;
@@ -83,6 +85,8 @@ enum Command {
     Film(film::Options),
     /// Set up, build, and make the built-in low level again: train, fit its prior, measure it, and write it with its card
     LowLevel(low_level::Options),
+    /// Set up, and build the Python package as a wheel in target/wheels
+    Wheel,
     /// Make the tests' fixtures again with the scripts in tests/python
     Fixtures(python::FixtureOptions),
     /// Become a program that gets SIGTERM when the process PARENT ends
@@ -103,6 +107,7 @@ fn main() -> ExitCode {
         Command::Plot { metrics, quantities, seeds, out } => plot::run(&metrics, &quantities, seeds, &out),
         Command::Film(options) => film::run(&options),
         Command::LowLevel(options) => low_level::run(options),
+        Command::Wheel => wheel::build().map(|wheel| println!("{}", wheel.display())),
         Command::Fixtures(options) => python::fixtures(&options),
         Command::Child(options) => train::child::run(&options),
     };

@@ -41,23 +41,44 @@ pub(crate) fn fixtures(options: &FixtureOptions) -> Result<()> {
     Ok(())
 }
 
+/// The environment of the tests, which also gets the wheel of our own package.
+pub(crate) const TESTS: &str = "requirements-tests.txt";
+
 /// Makes the environments in which tests run dm_control, torch and TensorBoard, and kubectl. Takes less than a second if
 /// they exist.
 pub(crate) fn prepare_tests() -> Result<()> {
-    let directory = workspace::root().join("tests/python");
-    ["requirements-export.txt", "requirements-kubectl.txt"]
-        .iter()
-        .try_for_each(|name| environment(&directory.join(name)).map(drop))
+    [TESTS, "requirements-kubectl.txt"].iter().try_for_each(|name| python_of(name).map(drop))
+}
+
+/// Installs a wheel in the environment of the tests. Its dependencies are there.
+pub(crate) fn install_for_tests(wheel: &Path) -> Result<()> {
+    let mut pip = Command::new(python_of(TESTS)?);
+    pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps", "--force-reinstall"]);
+    workspace::run(pip.arg(wheel))
+}
+
+/// A program of the environment for `tests/python/REQUIREMENTS`, which also finds the others.
+pub(crate) fn tool(name: &str, requirements: &str) -> Result<Command> {
+    let programs = python_of(requirements)?.with_file_name("");
+    let mut command = Command::new(programs.join(name));
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let path = std::env::join_paths([programs].into_iter().chain(std::env::split_paths(&path)))?;
+    command.env("PATH", path).current_dir(workspace::root());
+    Ok(command)
+}
+
+/// The Python of the environment for `tests/python/REQUIREMENTS`.
+fn python_of(requirements: &str) -> Result<PathBuf> {
+    environment(&workspace::root().join("tests/python").join(requirements))
 }
 
 /// A command that runs `tests/python/SCRIPT` with the packages of `tests/python/REQUIREMENTS`.
 pub(crate) fn script_command(script: &str, requirements: &str) -> Result<Command> {
-    let directory = workspace::root().join("tests/python");
-    let script = directory.join(script);
+    let script = workspace::root().join("tests/python").join(script);
     if !script.exists() {
         bail!("{} does not exist", script.display());
     }
-    let mut command = Command::new(environment(&directory.join(requirements))?);
+    let mut command = Command::new(python_of(requirements)?);
     command.arg(script).current_dir(workspace::root());
     Ok(command)
 }
@@ -88,12 +109,15 @@ fn install(python: &Path, directory: &Path, requirements: &str) -> Result<()> {
         let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"];
         workspace::run(Command::new(python).args(pip).args(arguments))
     };
+    let needs_torch = |line: &&str| line.starts_with("stable_baselines3==");
     let (torch, others): (Vec<&str>, Vec<&str>) = requirements.lines().partition(|line| line.starts_with("torch=="));
+    let (upon_torch, others): (Vec<&str>, Vec<&str>) = others.into_iter().partition(needs_torch);
     let list = directory.join("others.txt");
     fs::write(&list, others.join("\n")).with_context(|| format!("cannot write {}", list.display()))?;
     pip(&["--requirement", &list.to_string_lossy()])?;
     let [torch] = torch[..] else { return Ok(()) };
-    pip(&["--no-deps", torch, "nvidia-cuda-runtime-cu12==12.8.90", "nvidia-cuda-cupti-cu12==12.8.90"])?;
+    let nvidia = ["nvidia-cuda-runtime-cu12==12.8.90", "nvidia-cuda-cupti-cu12==12.8.90"];
+    pip(&[&["--no-deps", torch], &nvidia[..], &upon_torch].concat())?;
     pip(&["filelock", "typing_extensions", "sympy", "networkx", "jinja2", "fsspec"])?;
     workspace::run(Command::new(python).arg(workspace::root().join("tests/python/bare_torch.py")))
 }

@@ -51,16 +51,20 @@ pub(crate) fn describe(command: &Command) -> String {
     std::iter::once(program).chain(command.get_args()).map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
 }
 
+/// The crates that are built and tested together. The Python package is not among them: [`crate::wheel`] builds it, and without
+/// maturin its linker would look for a libpython, which not every Python has.
+pub(crate) const CRATES: [&str; 3] = ["--workspace", "--exclude", "comic-python"];
+
 /// Builds every program in the release profile. Building a part of them would compile crates again, since cargo chooses
 /// the features of shared dependencies for all crates of one build.
 pub(crate) fn build() -> Result<()> {
-    run(cargo().args(["build", "--release", "--workspace", "--bins"]))
+    run(cargo().args(["build", "--release", "--bins"]).args(CRATES))
 }
 
 /// Builds every program and every test at once. The tests' dependencies add features to shared crates, so a build of the
 /// programs alone would compile our crates a second time.
 pub(crate) fn build_with_tests() -> Result<()> {
-    run(cargo().args(["build", "--release", "--workspace", "--bins", "--tests"]))
+    run(cargo().args(["build", "--release", "--bins", "--tests"]).args(CRATES))
 }
 
 /// The path of a program of this workspace. All of them lie beside this one.

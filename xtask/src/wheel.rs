@@ -1,0 +1,68 @@
+//! `cargo xtask wheel`: the Python package as a wheel in `target/wheels`.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+
+use crate::{python, setup, workspace};
+
+const REQUIREMENTS: &str = "requirements-wheel.txt";
+/// What the wheel needs of dm_control.
+const HUMANOID: [&str; 3] = ["arena.xml", "humanoid_CMU_V2019.xml", "humanoid_CMU_V2020.xml"];
+
+/// Builds the wheel and returns its path. Its tag says the oldest libc that it runs with: the build machine decides.
+pub(crate) fn build() -> Result<PathBuf> {
+    setup::run(&setup::Options::default())?;
+    copy_humanoid()?;
+    let wheels = workspace::root().join("target/wheels");
+    let built = wheels.join("built");
+    for directory in [&wheels, &built] {
+        remove_wheels(directory)?;
+    }
+    let mut maturin = python::tool("maturin", REQUIREMENTS)?;
+    maturin.args(["build", "--release", "--locked", "--auditwheel", "skip", "--manifest-path", "python/Cargo.toml"]);
+    workspace::run(maturin.arg("--out").arg(&built))?;
+    // libmujoco comes from the package `mujoco`.
+    let mut auditwheel = python::tool("auditwheel", REQUIREMENTS)?;
+    auditwheel.args(["repair", "--exclude", "libmujoco.so*", "--wheel-dir"]).arg(&wheels);
+    workspace::run(auditwheel.arg(only_wheel(&built)?))?;
+    only_wheel(&wheels)
+}
+
+/// Puts dm_control's XML files and their licence into the package.
+fn copy_humanoid() -> Result<()> {
+    let (from, to) = (workspace::dependencies().join("dm_control"), workspace::root().join("python/comic/dm_control"));
+    fs::create_dir_all(&to).with_context(|| format!("cannot make {}", to.display()))?;
+    let files = HUMANOID.map(|name| (from.join(name), to.join(name)));
+    let licence = (workspace::root().join("LICENSE-APACHE"), to.join("LICENSE"));
+    for (from, to) in files.into_iter().chain([licence]) {
+        fs::copy(&from, &to).with_context(|| format!("cannot copy {} to {}", from.display(), to.display()))?;
+    }
+    Ok(())
+}
+
+fn wheels_in(directory: &Path) -> Result<Vec<PathBuf>> {
+    let entries = match fs::read_dir(directory) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(error) => return Err(error).with_context(|| format!("cannot read {}", directory.display())),
+    };
+    let paths = entries.map(|entry| Ok(entry?.path())).collect::<Result<Vec<_>>>()?;
+    Ok(paths.into_iter().filter(|path| path.extension().is_some_and(|extension| extension == "whl")).collect())
+}
+
+/// A wheel of another version would be taken for the new one.
+fn remove_wheels(directory: &Path) -> Result<()> {
+    wheels_in(directory)?
+        .iter()
+        .try_for_each(|path| fs::remove_file(path).with_context(|| format!("cannot remove {}", path.display())))
+}
+
+fn only_wheel(directory: &Path) -> Result<PathBuf> {
+    let mut wheels = wheels_in(directory)?;
+    match (wheels.pop(), wheels.is_empty()) {
+        (Some(wheel), true) => Ok(wheel),
+        _ => bail!("{} should have one wheel", directory.display()),
+    }
+}
