@@ -8,11 +8,13 @@ Prints one JSON line: control steps per second of this one process.
 import argparse
 import json
 import os
+import sys
 import time
 import warnings
 
 warnings.simplefilter('ignore')
-os.environ.setdefault('MUJOCO_GL', 'egl')
+# dm_control's EGL brings a system's libxml2 into the process, with which its lxml has crashed, so only the camera loads it.
+os.environ.setdefault('MUJOCO_GL', 'egl' if '--camera' in sys.argv else 'disable')
 
 import h5py  # noqa: E402
 import numpy as np  # noqa: E402
