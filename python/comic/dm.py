@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dm_env import specs
 
 from comic import _native
-from comic.environments import ACTIONS, IMAGE_SHAPE, fresh_seed, make_native, native_seed
+from comic.environments import ACTIONS, IMAGE_SHAPE, commands, fresh_seed, make_native, native_seed
 from comic.experiment import Clips, Preset
 
 __all__ = ["Environment"]
@@ -56,7 +56,7 @@ class Environment(dm_env.Environment):  # type: ignore[misc]
         """One control step; after an episode's end it begins a new episode."""
         if self._over:
             return self.reset()
-        answer = self._native.step(np.asarray(action, dtype=np.float64)[None])
+        answer = self._native.step(commands(action, (ACTIONS,))[None])
         observation, reward = self._observation(answer), answer["reward"][0].item()
         self._over = bool(answer["terminated"][0] or answer["truncated"][0])
         if answer["terminated"][0]:

@@ -135,7 +135,7 @@ class Environment(gymnasium.Env[Observation, Action]):
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control step. MuJoCo clips actions outside -1 ... 1."""
-        answer = self._native.step(np.asarray(action, dtype=np.float64)[None])
+        answer = self._native.step(commands(action, (ACTIONS,))[None])
         info = self._info(answer)
         info["reward_terms"] = dict(
             zip(self._native.reward_terms, answer["reward_terms"][0].tolist(), strict=True)
@@ -217,6 +217,14 @@ def observation_space(native: _native.Environments) -> spaces.Space[Any]:
 def action_space() -> spaces.Box:
     """The space of one environment's actions."""
     return spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
+
+
+def commands(action: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArray[np.float64]:
+    """An action in double precision, if it has the shape."""
+    numbers = np.asarray(action, dtype=np.float64)
+    if numbers.shape != shape:
+        raise _native.Error(f"action: its shape is {numbers.shape}; give {shape}")
+    return numbers
 
 
 def named_starts(native: _native.Environments) -> list[tuple[str, int, int, float]]:

@@ -33,6 +33,8 @@ class Table(Mapping[str, npt.NDArray[Any]]):
         self._length = len(lines)
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        if name not in self._columns:
+            raise KeyError(f"no column {name!r} in {self!r}")
         return self._columns[name]
 
     def __iter__(self) -> Iterator[str]:

@@ -30,6 +30,7 @@ def train(
     *,
     run: str | PathLike[str] | None = None,
     actors: int = 2,
+    evaluator: bool = True,
     minutes: float | None = None,
     clips: Clips | None = None,
     resume: bool = False,
@@ -48,6 +49,8 @@ def train(
         preset: A preset's name, an experiment's file or an experiment.
         run: The run's directory; by default the next free one of ``runs/PRESET-1``, ``-2`` and so on.
         actors: Number of actor processes.
+        evaluator: Starts a process that evaluates the newest checkpoint every two minutes, without noise, for
+            :attr:`comic.runs.Run.evaluations`.
         minutes: Minutes to train, instead of the experiment's budget.
         clips: Clips instead of the experiment's.
         resume: Goes on with the run in ``run``.
@@ -58,13 +61,15 @@ def train(
             an actor failed. The message has the end of its log.
     """
     # Everything that can be wrong at the start is refused before the first line is asked for.
+    if actors < 1:
+        raise _native.Error(f"actors: {actors}; at least one must train")
     if minutes is not None:
         fields["budget.minutes"] = float(minutes)
     resolved = experiment.resolve(preset, clips=clips, **fields)
     for name in ("comic-learner", "comic-actor"):
         programs.find(name)
     directory = _directory(resolved.fields["name"], run, resume)
-    return _train(resolved.toml, directory, actors, resolved.fields)
+    return _train(resolved.toml, directory, actors, evaluator, resolved.fields)
 
 
 def _directory(name: str, run: str | PathLike[str] | None, resume: bool) -> Path:
@@ -79,7 +84,9 @@ def _directory(name: str, run: str | PathLike[str] | None, resume: bool) -> Path
     return directory
 
 
-def _train(toml: str, directory: Path, actors: int, fields: dict[str, Any]) -> Generator[dict[str, Any], None, None]:
+def _train(
+    toml: str, directory: Path, actors: int, evaluator: bool, fields: dict[str, Any]
+) -> Generator[dict[str, Any], None, None]:
     directory.mkdir(parents=True, exist_ok=True)
     document = directory / "asked.toml"
     document.write_text(toml)
@@ -97,9 +104,13 @@ def _train(toml: str, directory: Path, actors: int, fields: dict[str, Any]) -> G
             # A batch waits for every environment, so the actors together must have all of them.
             environments = -(-fields["unroll"]["batch"] // (actors * fields["actor"]["threads"]))
             arguments += ["--environments", str(environments)]
-        names = [f"actor-{number}" for number in range(actors)]
+        names = [f"actor-{number}" for number in range(1, actors + 1)]
         workers = {name: programs.child("comic-actor", arguments, directory / f"{name}.log") for name in names}
         started.extend(workers.values())
+        if evaluator:
+            # Training goes on without it if it fails; its log says why.
+            arguments = ["evaluate", "--learner", url, "--watch"]
+            started.append(programs.child("comic-actor", arguments, directory / "evaluator.log"))
         while learner.poll() is None:
             yield from map(json.loads, metrics.lines())
             for name, worker in workers.items():

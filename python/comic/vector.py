@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from comic import _native
 from comic.environments import (
+    ACTIONS,
     Action,
     Camera,
     Ghost,
@@ -20,6 +21,7 @@ from comic.environments import (
     _parts,
     action_space,
     chosen_start,
+    commands,
     fresh_seed,
     make_film,
     make_native,
@@ -141,7 +143,7 @@ class VectorEnvironment(VectorEnv[Observation, Action, npt.NDArray[Any]]):
         self, actions: Action
     ) -> tuple[Observation, npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], dict[str, Any]]:
         """One control step of every environment."""
-        answer = self._native.step(np.asarray(actions, dtype=np.float64))
+        answer = self._native.step(commands(actions, (self.num_envs, ACTIONS)))
         terminated, truncated = answer["terminated"], answer["truncated"]
         ended = terminated | truncated
         info = self._episodes(answer, self._everywhere, "") | self._step(answer, self._everywhere)

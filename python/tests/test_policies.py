@@ -94,6 +94,8 @@ def test_evaluations_have_a_row_for_each_clip(tmp_path: Path) -> None:
     assert read.evaluations["clip"].tolist() == ["a", "overall"]
     assert read.evaluations["normalised_reward"].tolist() == [0.2, 0.3]
     assert read.evaluations["updates"].tolist() == [2, 2]
+    with pytest.raises(KeyError, match="no column 'reward' in .*2 rows: .*normalised_reward"):
+        read.evaluations["reward"]
     (tmp_path / "metrics.jsonl").write_text("{}\nnonsense\n")
     with pytest.raises(comic.Error, match="metrics.jsonl:2"):
         comic.runs.read(tmp_path)
@@ -103,6 +105,7 @@ def test_training_ends_with_its_iterator_and_goes_on_later(tmp_path: Path) -> No
     directory = tmp_path / "run"
     lines = comic.train(run=directory, actors=1, clips="builtin:walk", budget={"updates": 100000}, **SMALL)
     first = next(lines)
+    assert (directory / "evaluator.log").exists()
     lines.close()
     assert not subprocess.run(["pgrep", "--full", str(directory)], capture_output=True, check=False).stdout
     with pytest.raises(comic.Error, match="it has a run already"):
@@ -117,6 +120,8 @@ def test_training_ends_with_its_iterator_and_goes_on_later(tmp_path: Path) -> No
 def test_training_refuses_what_is_wrong_before_it_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(comic.Error, match="no_such"):
         comic.train(no_such=1)
+    with pytest.raises(comic.Error, match="at least one"):
+        comic.train(actors=0)
     with pytest.raises(comic.Error, match="no checkpoints"):
         comic.train(run=tmp_path, resume=True)
     monkeypatch.setenv("COMIC_BIN", str(tmp_path))

@@ -141,7 +141,7 @@ def test_a_wrong_argument_is_refused(arguments: dict[str, Any], message: str) ->
 def test_arrays_of_another_size_are_refused() -> None:
     environments = comic.make_vec(num_envs=2, clips="builtin:walk")
     environments.reset()
-    with pytest.raises(comic.Error, match=r"its shape is \[3, 56\]; give \[2, 56\]"):
+    with pytest.raises(comic.Error, match=r"its shape is \(3, 56\); give \(2, 56\)"):
         environments.step(np.zeros((3, 56)))
     with pytest.raises(comic.Error, match="there are 2 environments"):
         environments.reset(seed=[1])
