@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import secrets
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -201,7 +202,8 @@ def make_film(
         case None:
             return None
         case "rgb_array":
-            return _native.Film(size[0], size[1], camera, ghost)
+            width, height = (whole("render_size", side, 16, 2048) for side in size)
+            return _native.Film(width, height, camera, ghost)
     raise _native.Error(f"render_mode: no mode {render_mode!r}; give 'rgb_array' or None")
 
 
@@ -242,9 +244,10 @@ def chosen_start(native: _native.Environments, options: Mapping[str, Any] | None
         if clip not in native.clips:
             raise _native.Error(f"clip: no clip {clip!r}; the clips are {', '.join(native.clips)}")
         clip = native.clips.index(clip)
+    clip = whole("clip", clip, 0, len(native.clips) - 1)
     if "start" in chosen:
-        return int(clip), int(chosen["start"])
-    return int(clip), next((first for other, first, *_ in native.starts if other == clip), 0)
+        return clip, whole("start", chosen["start"], 0, 2**31)
+    return clip, next((first for other, first, *_ in native.starts if other == clip), 0)
 
 
 def fresh_seed() -> int:
@@ -254,7 +257,19 @@ def fresh_seed() -> int:
 
 def native_seed(seed: int | None) -> int | None:
     """A seed in the native range."""
-    return None if seed is None else seed % 2**64
+    return None if seed is None else whole("seed", seed, 0, None) % 2**64
+
+
+def whole(name: str, value: Any, least: int, largest: int | None) -> int:
+    """A whole number of this range."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or number < least or (largest is not None and number > largest):
+        bound = "" if largest is None else f" to {largest}"
+        raise _native.Error(f"{name}: {value!r}; give a whole number from {least}{bound}")
+    return number
 
 
 def _parts(native: _native.Environments) -> dict[str, slice]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+import warnings
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -136,9 +137,12 @@ def _read(path: Path) -> Policy:
 
     extra = {"comic.json": ""}
     try:
-        module: torch.jit.ScriptModule = torch.jit.load(  # type: ignore[no-untyped-call]
-            str(path), map_location="cpu", _extra_files=extra
-        )
+        with warnings.catch_warnings():
+            # Newer versions of torch recommend another format to those who write files.
+            warnings.simplefilter("ignore", FutureWarning)
+            module: torch.jit.ScriptModule = torch.jit.load(  # type: ignore[no-untyped-call]
+                str(path), map_location="cpu", _extra_files=extra
+            )
         description = json.loads(extra["comic.json"])
     except (RuntimeError, ValueError) as error:
         raise _native.Error(

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from comic import _native, experiment, programs
+from comic.environments import whole
 from comic.experiment import Clips, Preset
 
 __all__ = ["train"]
@@ -61,8 +62,7 @@ def train(
             an actor failed. The message has the end of its log.
     """
     # Everything that can be wrong at the start is refused before the first line is asked for.
-    if actors < 1:
-        raise _native.Error(f"actors: {actors}; at least one must train")
+    actors = whole("actors", actors, 1, 1024)
     if minutes is not None:
         fields["budget.minutes"] = float(minutes)
     resolved = experiment.resolve(preset, clips=clips, **fields)

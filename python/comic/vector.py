@@ -28,12 +28,13 @@ from comic.environments import (
     named_starts,
     native_seed,
     observation_space,
+    whole,
 )
 from comic.experiment import Clips, Preset
 
 __all__ = ["VectorEnvironment", "make_vec"]
 
-Seeds = int | Sequence[int | None]
+Seeds = int | Sequence[int | None] | npt.NDArray[np.integer[Any]]
 
 
 def make_vec(task: str = "tracking", num_envs: int = 1, **options: Any) -> VectorEnvironment:
@@ -77,12 +78,13 @@ class VectorEnvironment(VectorEnv[Observation, Action, npt.NDArray[Any]]):
         **fields: Any,
     ) -> None:
         mode = AutoresetMode(autoreset_mode)
+        num_envs = whole("num_envs", num_envs, 1, 2**20)
         self._native = make_native(
             task,
             [fresh_seed() for _ in range(num_envs)],
             preset=preset,
             clips=clips,
-            threads=len(os.sched_getaffinity(0)) if threads is None else threads,
+            threads=len(os.sched_getaffinity(0)) if threads is None else whole("threads", threads, 1, 2**20),
             autoreset=mode.value,
             record_gradients=record_gradients,
             **fields,
@@ -124,15 +126,15 @@ class VectorEnvironment(VectorEnv[Observation, Action, npt.NDArray[Any]]):
             options: ``reset_mask``, bool ``[N]``, chooses the environments; ``clip`` and ``start`` are as in
                 :meth:`comic.Environment.reset`, for all of them.
         """
-        super().reset(seed=seed if isinstance(seed, int) else None)
         seeds: list[int | None]
-        match seed:
-            case None:
-                seeds = [None] * self.num_envs
-            case int():
-                seeds = [native_seed(seed + index) for index in range(self.num_envs)]
-            case _:
-                seeds = [native_seed(each) for each in seed]
+        if seed is None:
+            seeds = [None] * self.num_envs
+        elif isinstance(seed, (Sequence, np.ndarray)):
+            seeds = [native_seed(each) for each in seed]
+        else:
+            first = whole("seed", seed, 0, None)
+            super().reset(seed=first)
+            seeds = [native_seed(first + index) for index in range(self.num_envs)]
         mask = self._everywhere if options is None else np.asarray(options.get("reset_mask", self._everywhere))
         if mask.dtype != np.bool_:
             raise _native.Error(f"reset_mask: its type is {mask.dtype}; give an array of bool")

@@ -54,6 +54,8 @@ pub(crate) struct Environments {
     places: Mutex<Vec<Place>>,
     /// The threads; without them the caller's thread steps.
     pool: Option<rayon::ThreadPool>,
+    /// The process that made the threads. A fork of it does not have them.
+    process: u32,
     autoreset: Autoreset,
     records_gradients: bool,
     observation_names: Vec<(String, usize)>,
@@ -100,7 +102,8 @@ impl Environments {
             let places = for_each(pool.as_ref(), seeds, place).map_err(refuse)?;
             let observation_names = observation_names(&experiment, task.as_ref());
             let (places, records_gradients) = (Mutex::new(places), record_gradients);
-            Ok(Self { task, places, pool, autoreset, records_gradients, observation_names })
+            let process = std::process::id();
+            Ok(Self { task, places, pool, process, autoreset, records_gradients, observation_names })
         })
     }
 
@@ -150,6 +153,7 @@ impl Environments {
         seeds: Vec<Option<u64>>,
         start: Option<(usize, usize)>,
     ) -> PyResult<Bound<'py, PyDict>> {
+        self.check_process()?;
         let (rows, buffers) = python.detach(|| {
             let mut places = self.places.lock();
             if chosen.len() != places.len() || seeds.len() != places.len() {
@@ -173,6 +177,7 @@ impl Environments {
     fn step<'py>(&self, python: Python<'py>, actions: PyReadonlyArray2<'py, f64>) -> PyResult<Bound<'py, PyDict>> {
         let shape = actions.shape().to_vec();
         let actions = actions.to_vec()?;
+        self.check_process()?;
         let (rows, buffers) = python.detach(|| {
             let mut places = self.places.lock();
             if shape != [places.len(), ACTION_SIZE] {
@@ -204,6 +209,7 @@ impl Environments {
                 "action_gradient: nothing was recorded; make the environment with record_gradients=True",
             ));
         }
+        self.check_process()?;
         let (gradients, shape) = python.detach(|| {
             let mut places = self.places.lock();
             let shape = [places.len(), recorded_steps(&places), ACTION_SIZE];
@@ -229,6 +235,15 @@ impl Environments {
         let mut places = self.places.lock();
         place(&places, index)?;
         draw(places[index].environment.as_mut())
+    }
+
+    fn check_process(&self) -> PyResult<()> {
+        if self.pool.is_some() && self.process != std::process::id() {
+            return Err(PyRuntimeError::new_err(
+                "the threads of these environments are in the process that made them; make the environments after the fork, or with threads=1",
+            ));
+        }
+        Ok(())
     }
 
     fn for_each<J: Send, R: Send>(

@@ -114,6 +114,8 @@ def test_an_episode_begins_where_the_options_say() -> None:
         environment.reset(options={"clip": clip, "start": 10_000})
     with pytest.raises(comic.Error, match="no clip 'no_such'; the clips are CMU_007_01, CMU_013_39"):
         environment.reset(options={"clip": "no_such"})
+    with pytest.raises(comic.Error, match="start: -1; give a whole number from 0"):
+        environment.reset(options={"start": -1})
 
 
 def test_the_last_step_says_what_the_episode_achieved() -> None:

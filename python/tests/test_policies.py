@@ -120,7 +120,7 @@ def test_training_ends_with_its_iterator_and_goes_on_later(tmp_path: Path) -> No
 def test_training_refuses_what_is_wrong_before_it_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(comic.Error, match="no_such"):
         comic.train(no_such=1)
-    with pytest.raises(comic.Error, match="at least one"):
+    with pytest.raises(comic.Error, match="actors: 0; give a whole number from 1 to 1024"):
         comic.train(actors=0)
     with pytest.raises(comic.Error, match="no checkpoints"):
         comic.train(run=tmp_path, resume=True)

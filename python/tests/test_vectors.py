@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import os
+import signal
 import threading
 import time
 from typing import Any
@@ -128,8 +130,8 @@ def test_gymnasium_makes_a_vector_by_its_name() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_envs": 0}, "at least 1"),
-        ({"threads": 0}, "at least 1"),
+        ({"num_envs": 0}, "num_envs: 0; give a whole number from 1"),
+        ({"threads": 0.5}, "threads: 0.5; give a whole number from 1"),
         ({"autoreset_mode": "Never"}, "Never"),
     ],
 )
@@ -145,5 +147,21 @@ def test_arrays_of_another_size_are_refused() -> None:
         environments.step(np.zeros((3, 56)))
     with pytest.raises(comic.Error, match="there are 2 environments"):
         environments.reset(seed=[1])
+    with pytest.raises(comic.Error, match="seed: -1; give a whole number from 0"):
+        environments.reset(seed=[1, -1])
     with pytest.raises(comic.Error, match="give an array of bool"):
         environments.reset(options={"reset_mask": np.ones(2)})
+
+
+def test_a_fork_is_told_that_it_has_no_threads() -> None:
+    environments = comic.make_vec(num_envs=2, threads=2, clips="builtin:walk")
+    child = os.fork()
+    if child == 0:
+        # Without an answer the alarm ends the child.
+        signal.alarm(10)
+        try:
+            environments.reset()
+        except RuntimeError as error:
+            os._exit(0 if "after the fork" in str(error) else 2)
+        os._exit(1)
+    assert os.waitpid(child, 0)[1] == 0
