@@ -9,7 +9,7 @@ use numpy::{PyArray2, PyReadonlyArray2, PyUntypedArrayMethods as _};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::refuse;
+use crate::{refuse, row_by_row};
 
 fn open(sources: &[String]) -> PyResult<Catalogue> {
     let sources: Vec<ClipSource> = sources.iter().map(|source| ClipSource::parse(source)).collect();
@@ -120,7 +120,8 @@ pub(crate) fn poses_to_actions<'py>(
     let &[_, ACTION_SIZE] = joints.shape() else {
         return Err(refuse(format!("joints: their shape is {:?}; give [T, {ACTION_SIZE}]", joints.shape())));
     };
-    let (poses, _) = joints.as_slice()?.as_chunks::<ACTION_SIZE>();
+    let joints = row_by_row(&joints);
+    let (poses, _) = joints.as_chunks::<ACTION_SIZE>();
     let actions: Vec<[f64; ACTION_SIZE]> = poses.iter().map(pose_to_action).collect();
     Ok(array(python, &actions))
 }

@@ -18,7 +18,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rayon::prelude::*;
 
-use crate::{experiment, refuse};
+use crate::{experiment, refuse, row_by_row};
 use buffers::{Buffers, Slot};
 use rows::{Row, Rows};
 
@@ -176,7 +176,7 @@ impl Environments {
     /// One control step of every environment. `actions` is `[N, 56]`.
     fn step<'py>(&self, python: Python<'py>, actions: PyReadonlyArray2<'py, f64>) -> PyResult<Bound<'py, PyDict>> {
         let shape = actions.shape().to_vec();
-        let actions = actions.to_vec()?;
+        let actions = row_by_row(&actions);
         self.check_process()?;
         let (rows, buffers) = python.detach(|| {
             let mut places = self.places.lock();

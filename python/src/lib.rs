@@ -28,6 +28,11 @@ fn refuse(error: impl std::fmt::Display) -> pyo3::PyErr {
     Error::new_err(error.to_string())
 }
 
+/// The entries row by row, whatever their order in memory: numpy also has arrays by columns, and arrays with gaps.
+fn row_by_row(array: &numpy::PyReadonlyArray2<'_, f64>) -> Vec<f64> {
+    array.as_array().iter().copied().collect()
+}
+
 /// What Python imports as `comic._native`.
 #[pyo3::pymodule]
 mod _native {

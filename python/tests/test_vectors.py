@@ -153,6 +153,16 @@ def test_arrays_of_another_size_are_refused() -> None:
         environments.reset(options={"reset_mask": np.ones(2)})
 
 
+def test_the_order_of_actions_in_memory_does_not_matter() -> None:
+    environments = comic.make_vec(num_envs=3, clips="builtin:walk")
+    rows = np.random.default_rng(2).uniform(-1, 1, (3, 56))
+    rewards = []
+    for action in [rows, np.asfortranarray(rows), np.repeat(rows, 2, axis=1)[:, ::2], rows.astype(">f8"), rows.tolist()]:
+        environments.reset(seed=1)
+        rewards.append(environments.step(action)[1])
+    assert (rewards == rewards[0]).all()
+
+
 def test_a_fork_is_told_that_it_has_no_threads() -> None:
     environments = comic.make_vec(num_envs=2, threads=2, clips="builtin:walk")
     child = os.fork()
