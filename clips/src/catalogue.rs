@@ -5,7 +5,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use comic_experiment::ClipSource;
+use comic_experiment::{CONTROL_TIMESTEP, ClipSource, Experiment, TaskName};
 use sha2::{Digest, Sha256};
 
 use crate::builtin;
@@ -84,6 +84,23 @@ impl Catalogue {
     /// All clips. The index of a clip is its index in this slice.
     pub fn entries(&self) -> &[Entry] {
         &self.entries
+    }
+
+    /// Checks that the other tasks of joint training can be trained with these clips: a step of all tasks is equally long.
+    ///
+    /// # Errors
+    /// [`Error::JointTimestep`].
+    pub fn check_joint(&self, experiment: &Experiment) -> Result<(), Error> {
+        let tracks = experiment.tasks().iter().any(|(task, _)| *task == TaskName::Tracking);
+        if experiment.joint.is_empty() || !tracks {
+            return Ok(());
+        }
+        match self.entries.iter().find(|entry| !entry.steps_every(CONTROL_TIMESTEP)) {
+            None => Ok(()),
+            Some(entry) => {
+                Err(Error::JointTimestep { name: entry.name.clone(), dt: entry.dt, expected: CONTROL_TIMESTEP })
+            }
+        }
     }
 
     /// Reads all frames of one clip. The frames in use are [`Entry::frames`].

@@ -60,9 +60,7 @@ impl Entry {
         if self.model != expected {
             return Err(Error::WrongModel { name: self.name.clone(), has: self.model, expected });
         }
-        // The comparison refuses NaN.
-        let same = (self.dt - control_dt).abs() < TIMESTEP_TOLERANCE;
-        if !same {
+        if !self.steps_every(control_dt) {
             return Err(Error::WrongTimestep { name: self.name.clone(), dt: self.dt, expected: control_dt });
         }
         if self.starts(look_ahead, min_steps).is_empty() {
@@ -78,6 +76,11 @@ impl Entry {
             });
         }
         Ok(())
+    }
+
+    /// Whether the time step is `dt` seconds; never if one of them is no number.
+    pub(crate) fn steps_every(&self, dt: f64) -> bool {
+        (self.dt - dt).abs() < TIMESTEP_TOLERANCE
     }
 
     /// Checks that the sub-range lies within the clip.

@@ -154,6 +154,19 @@ pub enum Error {
         /// The control time step, s.
         expected: f64,
     },
+    /// The time step of the clip is not that of the other tasks of joint training.
+    #[error(
+        "clip `{name}` has dt = {dt} s, but a step of the other tasks in `joint` takes {expected} s, and one policy acts in all \
+         of them; leave the clip out of `clips`, or train on it without `joint`"
+    )]
+    JointTimestep {
+        /// The clip.
+        name: String,
+        /// Time step of the clip, s.
+        dt: f64,
+        /// The control time step of the other tasks, s.
+        expected: f64,
+    },
     /// No frame of the clip can be the start of an episode.
     #[error(
         "clip `{name}` is too short: frames {first} to {last} are {frames} frames, but {min_steps} steps that look {look_ahead} frames ahead need {needed}; lower tracking.reference_steps or tracking.min_steps, or remove the clip"

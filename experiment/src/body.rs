@@ -1,5 +1,7 @@
 //! The humanoid's sizes: what it does, feels and sees at every step.
 
+/// Length of a control step of the tasks without a reference, s (S). Tracking has that of its clips.
+pub const CONTROL_TIMESTEP: f64 = 0.03;
 /// Hinges of the CMU humanoid. Each has one actuator.
 pub const ACTION_SIZE: usize = 56;
 /// Tracking bodies of the V2020 humanoid; `face` is one of them.

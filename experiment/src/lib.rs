@@ -39,7 +39,7 @@ mod transfer;
 mod vocabulary;
 
 pub use algorithms::{AlgorithmName, Svg0, Vmpo};
-pub use body::{ACTION_SIZE, IMAGE_SIZE, PROPRIOCEPTION, PROPRIOCEPTION_SIZE};
+pub use body::{ACTION_SIZE, CONTROL_TIMESTEP, IMAGE_SIZE, PROPRIOCEPTION, PROPRIOCEPTION_SIZE};
 pub use clips::{ClipSource, SUBSETS};
 pub use device::{DeviceName, MatmulPrecision};
 pub use document::{Complement, Experiment};

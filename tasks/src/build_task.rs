@@ -44,6 +44,7 @@ pub fn build(experiment: &Experiment, catalogue: &Catalogue) -> Result<Arc<dyn T
     if experiment.joint.is_empty() {
         return one(experiment.task);
     }
+    catalogue.check_joint(experiment)?;
     let spec = TaskSpec::new(experiment, clip_names(catalogue)).map_err(unknown_observation)?;
     let tasks = experiment.tasks().into_iter().map(|(task, probability)| Ok((one(task)?, probability)));
     Ok(Arc::new(JointTask::new(spec, tasks.collect::<Result<_, Error>>()?)))

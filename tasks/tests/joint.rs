@@ -3,8 +3,8 @@
 
 use std::sync::Arc;
 
-use comic_clips::Catalogue;
-use comic_experiment::{Experiment, resolve};
+use comic_clips::{Catalogue, Clip, ClipWriter};
+use comic_experiment::{ClipSource, Experiment, resolve};
 use comic_tasks::{MAX_REWARD_TERMS, Outcome, Simulated, Task};
 use mujoco_rs::prelude::MjtObjBase;
 
@@ -14,6 +14,24 @@ fn experiment(joint: &str) -> Experiment {
 
 fn build(experiment: &Experiment) -> Arc<dyn Task> {
     comic_tasks::build(experiment, &Catalogue::open(&experiment.clips).unwrap()).unwrap()
+}
+
+/// dm_control's own file has clips of 50 ms, too.
+#[test]
+fn clips_with_other_steps_than_the_other_tasks_are_refused_with_the_reason() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("slow.h5");
+    let walk = Catalogue::open(&experiment(BOTH).clips).unwrap().load(0).unwrap();
+    let mut writer = ClipWriter::create(&path, false).unwrap();
+    writer.add(&Clip { name: "slow".into(), dt: 0.05, ..walk }).unwrap();
+    writer.finish().unwrap();
+    let joint = Experiment { clips: vec![ClipSource::whole(path.to_str().unwrap())], ..experiment(BOTH) };
+    let catalogue = Catalogue::open(&joint.clips).unwrap();
+    let refused = comic_tasks::build(&joint, &catalogue).unwrap_err().to_string();
+    for part in ["`slow`", "0.05 s", "0.03 s", "`joint`"] {
+        assert!(refused.contains(part), "no {part} in {refused}");
+    }
+    assert!(comic_tasks::build(&Experiment { joint: Vec::new(), ..joint }, &catalogue).is_ok(), "tracking alone");
 }
 
 const BOTH: &str = r#"[{task="get-up", probability=0.1}, {task="ball-catch", probability=0.2}]"#;

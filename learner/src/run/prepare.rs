@@ -32,6 +32,7 @@ pub(super) fn prepare(
     }
     let low_level = LowLevel::find(&mut experiment, newest.as_ref().map(|(_, snapshot)| snapshot))?;
     let catalogue = Catalogue::open(&experiment.clips)?;
+    catalogue.check_joint(&experiment)?;
     let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
     let spec = TaskSpec::new(&experiment, names).map_err(|name| {
         Error::configuration(format!("tracking.observations: the tracking task has no observation `{name}`"))

@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
-use comic_experiment::TaskSpec;
+use comic_experiment::{CONTROL_TIMESTEP, TaskSpec};
 use mujoco_rs::prelude::MjModel;
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
 
 use super::interface::{Rules, Verdict};
 use super::poses::Pose;
-use super::stage::{CONTROL_TIMESTEP, Stage};
+use super::stage::Stage;
 use crate::achievement::Achievement;
 use crate::environment::{ClipStarts, Environment, Episode, Outcome, Scenery, Simulated, Step, Task, control};
 use crate::error::Error;

@@ -17,7 +17,7 @@ use std::sync::Arc;
 
 use comic_clips::spatial::normalize;
 use comic_clips::{Catalogue, JOINT_RANGES};
-use comic_experiment::{GetUp, GradientOfStanding, LyingPose};
+use comic_experiment::{CONTROL_TIMESTEP, GetUp, GradientOfStanding, LyingPose};
 use rand::Rng as _;
 use rand_distr::{Distribution as _, StandardNormal};
 use rand_pcg::Pcg64;
@@ -25,7 +25,7 @@ use rand_pcg::Pcg64;
 use super::environment::RuledTask;
 use super::interface::{Rules, Verdict};
 use super::poses::{Pose, Poses, UP};
-use super::stage::{Arena, CONTROL_TIMESTEP, Part, Stage};
+use super::stage::{Arena, Part, Stage};
 use crate::achievement::Achievement;
 use crate::arenas::floor;
 use crate::build_task::{BuildTask, Context};

@@ -13,10 +13,8 @@ use crate::humanoid::observation::Body;
 use crate::humanoid::walker::Walker;
 use crate::physics::{Data, Models};
 
-/// Physics steps in a control step (S: 0.03 s).
+/// Physics steps in a control step of `CONTROL_TIMESTEP`.
 pub(crate) const SUBSTEPS: usize = 6;
-/// Length of a control step, s.
-pub(crate) const CONTROL_TIMESTEP: f64 = 0.03;
 
 /// The kind of a geom, for the rules.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
