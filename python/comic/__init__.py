@@ -10,9 +10,6 @@ environments are native code and step without Python's lock.
 """
 
 import importlib.metadata
-import importlib.util
-import os
-from pathlib import Path
 
 # The native module finds libmujoco because this import has loaded it already.
 import mujoco
@@ -24,9 +21,6 @@ if mujoco.__version__ != _MUJOCO:
     raise ImportError(
         f"comic {__version__} needs mujoco {_MUJOCO}, and {mujoco.__version__} is installed: pip install mujoco=={_MUJOCO}"
     )
-# dm_control's XML of the humanoid. A user's own value has precedence.
-_HUMANOID = str(Path(__file__).parent / "dm_control")
-os.environ.setdefault("COMIC_DM_CONTROL_DIR", _HUMANOID)
 
 from comic import clips, experiment, runs  # noqa: E402
 from comic._native import Error  # noqa: E402

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import comic
 
-__all__ = ["child", "environment", "find", "run"]
+__all__ = ["child", "find", "run"]
 
 # Asks Linux for SIGTERM at the parent's end, and becomes the program.
 _CHILD = """
@@ -46,7 +46,7 @@ def run(name: str, arguments: Sequence[str]) -> str:
     Raises:
         comic.Error: The program fails. The message is the program's.
     """
-    ended = subprocess.run([find(name), *arguments], env=environment(), capture_output=True, text=True, check=False)
+    ended = subprocess.run([find(name), *arguments], capture_output=True, text=True, check=False)
     if ended.returncode != 0:
         raise comic.Error(ended.stderr.strip() or f"{name} ended with {ended.returncode}")
     return ended.stdout
@@ -57,11 +57,5 @@ def child(name: str, arguments: Sequence[str], log: Path) -> subprocess.Popen[by
     command = [sys.executable, "-c", _CHILD, str(os.getpid()), str(find(name)), *arguments]
     with log.open("ab") as output:
         return subprocess.Popen(
-            command, env=environment(), stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
+            command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
         )
-
-
-def environment() -> dict[str, str]:
-    """The variables of a program: this process's, without the directory of this package's humanoid."""
-    humanoid = ("COMIC_DM_CONTROL_DIR", comic._HUMANOID)
-    return {name: value for name, value in os.environ.items() if (name, value) != humanoid}

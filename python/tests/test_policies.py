@@ -9,7 +9,6 @@ import comic
 import numpy as np
 import pytest
 from conftest import SMALL
-from comic import programs
 
 
 def test_a_batch_gives_the_actions_of_its_rows(run: Path) -> None:
@@ -135,7 +134,3 @@ def test_a_learner_that_fails_says_why(tmp_path: Path) -> None:
         list(comic.train(run=tmp_path / "run", clips=str(tmp_path / "no_such.h5")))
 
 
-def test_programs_do_not_get_the_packages_humanoid(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "COMIC_DM_CONTROL_DIR" not in programs.environment()
-    monkeypatch.setenv("COMIC_DM_CONTROL_DIR", "/mine")
-    assert programs.environment()["COMIC_DM_CONTROL_DIR"] == "/mine"

@@ -1,36 +1,16 @@
-//! Finds dm_control's XML files.
+//! dm_control's XML files (Apache License 2.0, see NOTICE). They are part of the program, so an actor needs no file beside it.
+//!
+//! `cargo xtask setup` takes them from dm_control's wheel, and `.cargo/config.toml` sets the variable at build time.
 
-use std::path::{Path, PathBuf};
-
-use crate::error::Error;
-
-const VARIABLE: &str = "COMIC_DM_CONTROL_DIR";
-
-/// The directory of dm_control's XML files. It is the value of the environment variable `COMIC_DM_CONTROL_DIR` now, else
-/// its value when the program was built, else `.deps/dm_control`.
-pub(crate) fn directory() -> Result<PathBuf, Error> {
-    let candidates = [
-        std::env::var_os(VARIABLE).map(PathBuf::from),
-        option_env!("COMIC_DM_CONTROL_DIR").map(PathBuf::from),
-        Some(PathBuf::from(".deps/dm_control")),
-    ];
-    let mut tried = Vec::new();
-    for candidate in candidates.into_iter().flatten() {
-        if candidate.join("arena.xml").is_file() {
-            return Ok(candidate);
-        }
-        tried.push(candidate.display().to_string());
-    }
-    tried.dedup();
-    Err(Error::Asset { file: "arena.xml".into(), tried: tried.join(", ") })
+macro_rules! file {
+    ($name:literal) => {
+        include_str!(concat!(env!("COMIC_DM_CONTROL_DIR"), "/", $name))
+    };
 }
 
-/// The path of a file in this directory.
-pub(crate) fn file(directory: &Path, name: &str) -> Result<PathBuf, Error> {
-    let path = directory.join(name);
-    if path.is_file() {
-        Ok(path)
-    } else {
-        Err(Error::Asset { file: name.into(), tried: directory.display().to_string() })
-    }
-}
+/// The composer's arena.
+pub(crate) const ARENA: &str = file!("arena.xml");
+/// The humanoid of `CMUHumanoidPositionControlled`.
+pub(crate) const HUMANOID_2019: &str = file!("humanoid_CMU_V2019.xml");
+/// The humanoid of `CMUHumanoidPositionControlledV2020`.
+pub(crate) const HUMANOID_2020: &str = file!("humanoid_CMU_V2020.xml");

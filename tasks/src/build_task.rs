@@ -38,7 +38,7 @@ impl Context<'_> {
 /// the clips.
 ///
 /// # Errors
-/// [`Error`]: clips that are missing or cannot be used, or dm_control's XML is missing.
+/// [`Error`]: clips that are missing or cannot be used.
 pub fn build(experiment: &Experiment, catalogue: &Catalogue) -> Result<Arc<dyn Task>, Error> {
     let one = |task| build_one(&Context { experiment, catalogue, task });
     if experiment.joint.is_empty() {

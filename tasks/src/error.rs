@@ -7,14 +7,6 @@ use mujoco_rs::prelude::MjEditError;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// One of dm_control's XML files is missing.
-    #[error("{file}: not found in {tried}; run `cargo xtask setup`, or set COMIC_DM_CONTROL_DIR to its directory")]
-    Asset {
-        /// The file's name.
-        file: String,
-        /// The directories that were searched.
-        tried: String,
-    },
     /// MuJoCo refused the humanoid.
     #[error("{doing}: {reason}; the XML must be that of dm_control 1.0.49, run `cargo xtask setup`")]
     Model {

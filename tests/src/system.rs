@@ -73,10 +73,10 @@ pub fn program(name: &str) -> Result<PathBuf> {
     Ok(path)
 }
 
-/// Removes the user's settings, which would change how the programs reach the learner. Where the humanoid lies stays.
+/// Removes the user's settings, which would change how the programs reach the learner.
 fn without_settings(command: &mut Command) {
     let settings = std::env::vars_os().map(|(name, _)| name.to_string_lossy().into_owned());
-    for name in settings.filter(|name| name.starts_with("COMIC_") && name != "COMIC_DM_CONTROL_DIR") {
+    for name in settings.filter(|name| name.starts_with("COMIC_")) {
         command.env_remove(name);
     }
 }

@@ -13,8 +13,6 @@ fn run(name: &str, directory: &str, arguments: &[&str]) -> Result<()> {
     let mut command = Command::new(python()?.with_file_name(name));
     // The package's own folder is not on the path of modules here: the installed wheel is tested.
     command.args(arguments).current_dir(root().join(directory)).env("COMIC_BIN", programs);
-    // Where the repository's humanoid lies. The wheel has its own.
-    command.env_remove("COMIC_DM_CONTROL_DIR");
     succeeds(&mut command)
 }
 

@@ -8,13 +8,10 @@ use anyhow::{Context, Result, bail};
 use crate::{python, setup, workspace};
 
 const REQUIREMENTS: &str = "requirements-wheel.txt";
-/// What the wheel needs of dm_control.
-const HUMANOID: [&str; 3] = ["arena.xml", "humanoid_CMU_V2019.xml", "humanoid_CMU_V2020.xml"];
 
 /// Builds the wheel and returns its path. Its tag says the oldest libc that it runs with: the build machine decides.
 pub(crate) fn build() -> Result<PathBuf> {
     setup::run(&setup::Options::default())?;
-    copy_humanoid()?;
     let wheels = workspace::root().join("target/wheels");
     let built = wheels.join("built");
     for directory in [&wheels, &built] {
@@ -28,18 +25,6 @@ pub(crate) fn build() -> Result<PathBuf> {
     auditwheel.args(["repair", "--exclude", "libmujoco.so*", "--wheel-dir"]).arg(&wheels);
     workspace::run(auditwheel.arg(only_wheel(&built)?))?;
     only_wheel(&wheels)
-}
-
-/// Puts dm_control's XML files and their licence into the package.
-fn copy_humanoid() -> Result<()> {
-    let (from, to) = (workspace::dependencies().join("dm_control"), workspace::root().join("python/comic/dm_control"));
-    fs::create_dir_all(&to).with_context(|| format!("cannot make {}", to.display()))?;
-    let files = HUMANOID.map(|name| (from.join(name), to.join(name)));
-    let licence = (workspace::root().join("LICENSE-APACHE"), to.join("LICENSE"));
-    for (from, to) in files.into_iter().chain([licence]) {
-        fs::copy(&from, &to).with_context(|| format!("cannot copy {} to {}", from.display(), to.display()))?;
-    }
-    Ok(())
 }
 
 fn wheels_in(directory: &Path) -> Result<Vec<PathBuf>> {

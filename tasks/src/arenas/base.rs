@@ -1,20 +1,18 @@
 //! What all arenas have: dm_control's `composer/arena.xml`, the physics options and the light.
 
-use std::path::Path;
-
 use mujoco_rs::prelude::*;
 
-use crate::assets;
 use crate::error::{Error, refused};
 use crate::physics::PHYSICS_TIMESTEP;
+use crate::{assets, silence};
 
 /// `<size njmax nconmax>` of the humanoid's XML, which dm_control merges into the arena's.
 const MAX_CONSTRAINTS: i32 = 500;
 
 /// An arena with this name and nothing in it.
-pub(super) fn base(directory: &Path, name: &str) -> Result<MjSpec, Error> {
-    let path = assets::file(directory, "arena.xml")?;
-    let mut spec = MjSpec::from_xml(path).map_err(refused("reading arena.xml"))?;
+pub(super) fn base(name: &str) -> Result<MjSpec, Error> {
+    silence::install();
+    let mut spec = MjSpec::from_xml_string(assets::ARENA).map_err(refused("reading arena.xml"))?;
     spec.set_modelname(name);
     spec.option_mut().timestep = PHYSICS_TIMESTEP;
     let headlight = &mut spec.visual_mut().headlight;

@@ -1,7 +1,5 @@
 //! The corridors (`locomotion/arenas/corridors.py`): with gaps in the floor, or with walls.
 
-use std::path::Path;
-
 use mujoco_rs::prelude::*;
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjsGeom, MjtBuiltin};
 
@@ -106,8 +104,8 @@ pub(crate) fn wall(index: usize, x: f64, [width, height]: [f64; 2], left: bool, 
 ///
 /// `spare` more boxes are far below the first platform, where nothing touches or shows them. Arenas with the same number of
 /// boxes have the same memory layout, so a simulation and a renderer can change from one to the next.
-pub(crate) fn with_gaps(directory: &Path, extent: Extent, platforms: &[Block], spare: usize) -> Result<MjSpec, Error> {
-    let mut spec = empty(directory, "gaps_corridor", extent, Some(GAP_DEPTH), 0)?;
+pub(crate) fn with_gaps(extent: Extent, platforms: &[Block], spare: usize) -> Result<MjSpec, Error> {
+    let mut spec = empty("gaps_corridor", extent, Some(GAP_DEPTH), 0)?;
     let ground = spec.world_body_mut().add_body();
     ground.set_name(GROUND).map_err(refused("adding the platforms"))?;
     for platform in platforms {
@@ -127,8 +125,8 @@ pub(crate) fn with_gaps(directory: &Path, extent: Extent, platforms: &[Block], s
 }
 
 /// The corridor with walls.
-pub(crate) fn with_walls(directory: &Path, extent: Extent, walls: &[Block]) -> Result<MjSpec, Error> {
-    let mut spec = empty(directory, "walls_corridor", extent, None, walls.len())?;
+pub(crate) fn with_walls(extent: Extent, walls: &[Block]) -> Result<MjSpec, Error> {
+    let mut spec = empty("walls_corridor", extent, None, walls.len())?;
     let body = spec.body_mut(WALLS).ok_or_else(|| missing("body", WALLS))?;
     for wall in walls {
         add_block(body, wall)?;
@@ -148,8 +146,8 @@ fn add_block<'a>(body: &'a mut MjsBody, block: &Block) -> Result<&'a mut MjsGeom
 
 /// `EmptyCorridor`: the ground, invisible planes at the sides and ends, and a sky. With `depth` the ground is invisible and
 /// this far below (m). dm_control names unnamed geoms by their place among all geoms; `first` geoms come before these.
-fn empty(directory: &Path, name: &str, extent: Extent, depth: Option<f64>, first: usize) -> Result<MjSpec, Error> {
-    let mut spec = base(directory, name)?;
+fn empty(name: &str, extent: Extent, depth: Option<f64>, first: usize) -> Result<MjSpec, Error> {
+    let mut spec = base(name)?;
     let map = &mut spec.visual_mut().map;
     (map.znear, map.zfar) = (NEAR, FAR);
 

@@ -1,7 +1,5 @@
 //! The floor (`locomotion/arenas/floors.py`), with a target's mark or a ball.
 
-use std::path::Path;
-
 use mujoco_rs::prelude::*;
 use mujoco_rs::wrappers::mj_editing::{MjtBuiltin, MjtMark};
 
@@ -26,8 +24,8 @@ const BALL_COLOUR: [f32; 4] = [0.9, 0.5, 0.1, 1.0];
 pub(crate) const BALL: &str = "ball";
 
 /// The empty floor.
-pub(crate) fn floor(directory: &Path) -> Result<MjSpec, Error> {
-    let mut spec = base(directory, "floor")?;
+pub(crate) fn floor() -> Result<MjSpec, Error> {
+    let mut spec = base("floor")?;
 
     let texture = spec.add_texture();
     texture.set_name("groundplane").map_err(refused("adding the floor's texture"))?;
@@ -62,8 +60,8 @@ pub(crate) fn floor(directory: &Path) -> Result<MjSpec, Error> {
 }
 
 /// The floor with a target's mark, which has no contacts.
-pub(crate) fn with_target(directory: &Path) -> Result<MjSpec, Error> {
-    let mut spec = floor(directory)?;
+pub(crate) fn with_target() -> Result<MjSpec, Error> {
+    let mut spec = floor()?;
     let site = spec.world_body_mut().add_site();
     site.set_name(TARGET).map_err(refused("adding the target"))?;
     site.set_type(MjtGeomBase::mjGEOM_SPHERE);

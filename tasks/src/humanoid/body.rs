@@ -1,15 +1,13 @@
 //! The specification of the humanoid: `CMUHumanoidPositionControlledV2020` and `CMUHumanoidPositionControlled`.
 
-use std::path::Path;
-
 use comic_clips::WalkerModel;
 use mujoco_rs::prelude::*;
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjtLimited};
 
 use super::names::END_EFFECTORS;
 use super::servos::{self, FILTER_TIME_CONSTANT, Servo};
-use crate::assets;
 use crate::error::{Error, missing, refused};
+use crate::{assets, silence};
 
 /// Lengths and sizes of the V2020 body relative to its XML, and its mass in kg (`rescale_humanoid(self, 1.2, 1.2, 70)`).
 const SCALE: f64 = 1.2;
@@ -18,12 +16,13 @@ const MASS: f64 = 70.0;
 const DENSITY: f64 = 1000.0;
 
 /// The humanoid alone, without prefix and without floor.
-pub(super) fn humanoid(directory: &Path, model: WalkerModel) -> Result<MjSpec, Error> {
-    let (file, servos) = match model {
-        WalkerModel::Cmu2019 => ("humanoid_CMU_V2019.xml", &servos::V2019),
-        WalkerModel::Cmu2020 => ("humanoid_CMU_V2020.xml", &servos::V2020),
+pub(super) fn humanoid(model: WalkerModel) -> Result<MjSpec, Error> {
+    let (xml, servos) = match model {
+        WalkerModel::Cmu2019 => (assets::HUMANOID_2019, &servos::V2019),
+        WalkerModel::Cmu2020 => (assets::HUMANOID_2020, &servos::V2020),
     };
-    let mut spec = MjSpec::from_xml(assets::file(directory, file)?).map_err(refused("reading the humanoid's XML"))?;
+    silence::install();
+    let mut spec = MjSpec::from_xml_string(xml).map_err(refused("reading the humanoid's XML"))?;
     spec.set_modelname("walker");
     if model == WalkerModel::Cmu2020 {
         add_face(&mut spec)?;

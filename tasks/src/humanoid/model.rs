@@ -6,7 +6,6 @@
 //! is stored.
 
 use std::cell::RefCell;
-use std::path::Path;
 
 use comic_clips::WalkerModel;
 use mujoco_rs::prelude::*;
@@ -15,17 +14,14 @@ use super::body::humanoid;
 use super::names::PREFIX;
 use crate::arenas::floor;
 use crate::error::{Error, refused};
-use crate::{assets, silence};
 
 /// Builds the humanoid on the floor. Body `walker/` has a free joint and is at the origin. It contains the whole humanoid,
 /// whose names begin with [`PREFIX`].
 ///
 /// # Errors
-/// [`Error::Asset`]: dm_control's XML is missing. [`Error::Model`]: MuJoCo refuses the XML.
+/// [`Error::Model`]: MuJoCo refuses the XML.
 pub fn build(model: WalkerModel) -> Result<MjModel, Error> {
-    silence::install();
-    let directory = assets::directory()?;
-    compile(&humanoid(&directory, model)?, floor::floor(&directory)?, |_| Ok(()))
+    compile(&humanoid(model)?, floor::floor()?, |_| Ok(()))
 }
 
 thread_local! {
@@ -34,23 +30,17 @@ thread_local! {
     static HUMANOID: RefCell<Option<MjSpec>> = const { RefCell::new(None) };
 }
 
-/// Builds the V2020 humanoid in another arena. `arena` gets the folder of dm_control's XML files.
-pub(crate) fn build_in(arena: impl FnOnce(&Path) -> Result<MjSpec, Error>) -> Result<MjModel, Error> {
+/// Builds the V2020 humanoid in another arena.
+pub(crate) fn build_in(arena: MjSpec) -> Result<MjModel, Error> {
     build_with(arena, |_| Ok(()))
 }
 
 /// Builds the V2020 humanoid in another arena and adds something after the humanoid.
-pub(crate) fn build_with(
-    arena: impl FnOnce(&Path) -> Result<MjSpec, Error>,
-    add: impl FnOnce(&mut MjSpec) -> Result<(), Error>,
-) -> Result<MjModel, Error> {
-    silence::install();
-    let directory = assets::directory()?;
-    let arena = arena(&directory)?;
+pub(crate) fn build_with(arena: MjSpec, add: impl FnOnce(&mut MjSpec) -> Result<(), Error>) -> Result<MjModel, Error> {
     HUMANOID.with_borrow_mut(|kept| {
         let walker = match kept {
             Some(walker) => walker,
-            None => kept.insert(humanoid(&directory, WalkerModel::Cmu2020)?),
+            None => kept.insert(humanoid(WalkerModel::Cmu2020)?),
         };
         compile(walker, arena, add)
     })

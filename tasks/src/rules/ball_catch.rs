@@ -87,7 +87,7 @@ impl BallCatchRules {
         let mut ball = || {
             let radius = uniform(config.radius, random);
             let mass = uniform(config.mass, random);
-            let model = humanoid::build_with(floor::with_target, |arena| floor::add_ball(arena, radius, mass))?;
+            let model = humanoid::build_with(floor::with_target()?, |arena| floor::add_ball(arena, radius, mass))?;
             Ok(Ball { arena: Arc::new(Arena::new(model)?), radius })
         };
         let balls = (0..config.balls.max(1)).map(|_| ball()).collect::<Result<_, Error>>()?;

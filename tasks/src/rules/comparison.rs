@@ -129,7 +129,7 @@ pub fn corridor_model(length: f64, width: f64, platforms: &[Block], walls: &[Blo
 /// # Errors
 /// The arena cannot be built.
 pub fn go_to_target_model() -> Result<MjModel, Error> {
-    humanoid::build_in(floor::with_target)
+    humanoid::build_in(floor::with_target()?)
 }
 
 /// Recorded obstacles.
@@ -141,12 +141,10 @@ struct RecordedObstacles {
 
 impl RecordedObstacles {
     fn build(&self, extent: Extent) -> Result<MjModel, Error> {
-        humanoid::build_in(|directory| {
-            if self.platforms.is_empty() {
-                corridor::with_walls(directory, extent, &self.walls)
-            } else {
-                corridor::with_gaps(directory, extent, &self.platforms, 0)
-            }
+        humanoid::build_in(if self.platforms.is_empty() {
+            corridor::with_walls(extent, &self.walls)?
+        } else {
+            corridor::with_gaps(extent, &self.platforms, 0)?
         })
     }
 }

@@ -280,9 +280,8 @@ mod tests {
         let one = crate::arenas::corridor::platform(0, 6.0, 2.0, extent);
         let blocks = [crate::arenas::corridor::first_platform(extent), one];
         let heights = [0, 7].map(|spare| {
-            let model = crate::humanoid::build_in(|directory| {
-                crate::arenas::corridor::with_gaps(directory, extent, &blocks, spare)
-            });
+            let arena = crate::arenas::corridor::with_gaps(extent, &blocks, spare).unwrap();
+            let model = crate::humanoid::build_in(arena);
             let mut stage = Stage::new(Arc::new(Arena::new(model.unwrap()).unwrap()));
             let pose = Poses::upright().draw(&mut Pcg64::seed_from_u64(1)).moved(config.corridor.width / 2.0, 0.0);
             stage.place(&pose.qpos, &pose.qvel);

@@ -27,9 +27,8 @@ impl Obstacles for Gaps {
     fn draw(&self, extent: Extent, random: &mut Pcg64) -> Result<Arena, Error> {
         let platforms = platforms(self, extent, random);
         let most = most_platforms(self, extent);
-        let model = humanoid::build_in(|directory| {
-            corridor::with_gaps(directory, extent, &platforms, most.saturating_sub(platforms.len()))
-        })?;
+        let spare = most.saturating_sub(platforms.len());
+        let model = humanoid::build_in(corridor::with_gaps(extent, &platforms, spare)?)?;
         Ok(Arena::new(model)?.with_obstacles(corridor::gap_ends(&platforms)))
     }
 }

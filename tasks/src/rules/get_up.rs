@@ -70,7 +70,7 @@ impl GetUpRules {
             LyingPose::Simulated => None,
             LyingPose::Clips => Some(Poses::of_clips(catalogue, 1)?),
         };
-        let arena = Arc::new(Arena::new(humanoid::build_in(floor::floor)?)?);
+        let arena = Arc::new(Arena::new(humanoid::build_in(floor::floor()?)?)?);
         Ok(Self { config: config.clone(), standing: Poses::new(config.start_pose, catalogue)?, lying, arena })
     }
 

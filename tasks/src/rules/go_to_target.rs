@@ -60,7 +60,7 @@ impl BuildTask for GoToTarget {
 
 impl GoToTargetRules {
     pub(crate) fn new(config: &GoToTarget, poses: Poses) -> Result<Self, Error> {
-        let arena = Arc::new(Arena::new(humanoid::build_in(floor::with_target)?)?);
+        let arena = Arc::new(Arena::new(humanoid::build_in(floor::with_target()?)?)?);
         Ok(Self { config: config.clone(), poses, arena })
     }
 

@@ -26,7 +26,7 @@ impl BuildTask for Walls {
 impl Obstacles for Walls {
     fn draw(&self, extent: Extent, random: &mut Pcg64) -> Result<Arena, Error> {
         let walls = walls(self, extent, random);
-        let model = humanoid::build_in(|directory| corridor::with_walls(directory, extent, &walls))?;
+        let model = humanoid::build_in(corridor::with_walls(extent, &walls)?)?;
         Ok(Arena::new(model)?.with_obstacles(corridor::wall_ends(&walls)))
     }
 }
