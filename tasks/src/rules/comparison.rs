@@ -34,6 +34,7 @@ pub struct Replay {
 trait Replayed: Simulated {
     fn dictionary(&self) -> Named;
     fn quantities(&self) -> Named;
+    fn begin_at(&mut self, qpos: &[f64; 63]);
     fn as_environment(&self) -> &dyn Simulated;
 }
 
@@ -48,12 +49,21 @@ impl<R: Recorded> Replayed for RuledEnvironment<R> {
         self.rules().quantities(self.stage(), self.state())
     }
 
+    fn begin_at(&mut self, qpos: &[f64; 63]) {
+        RuledEnvironment::begin_at(self, qpos);
+    }
+
     fn as_environment(&self) -> &dyn Simulated {
         self
     }
 }
 
 impl Replay {
+    /// Moves the first state to these coordinates; before the first step.
+    pub fn begin_at(&mut self, qpos: &[f64; 63]) {
+        self.environment.begin_at(qpos);
+    }
+
     /// One control step.
     pub fn step_control(&mut self, control: &[f64; 56]) -> Step {
         self.environment.step_control(control)

@@ -98,6 +98,12 @@ impl<R: Rules> RuledEnvironment<R> {
         Self { task, stage, state, random, start, steps, max_steps, failed, diverged, tape }
     }
 
+    /// Moves the first state to these coordinates. The velocities stay.
+    pub(crate) fn begin_at(&mut self, qpos: &[f64; 63]) {
+        let qvel = self.stage.data.qvel().to_vec();
+        self.stage.place(qpos, &qvel);
+    }
+
     pub(crate) fn stage(&self) -> &Stage {
         &self.stage
     }

@@ -6,6 +6,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
+mod first_pose;
 mod model;
 mod model_arrays;
 mod npz;
@@ -137,17 +138,28 @@ fn parity_fails_when_any_observation_is_altered() {
 
 #[test]
 fn parity_fails_when_names_are_altered() {
-    for rollout in all_rollouts().into_iter().take(1) {
-        let rollout = rollout.head(1);
-        for (name, from, to) in
-            [("clip_id", "_", "-"), ("obs_layout", "height", "hight"), ("reward_channels", "a", "b")]
-        {
+    let all = all_rollouts();
+    for kind in KINDS {
+        let Some(rollout) = all.iter().find(|rollout| rollout.file.starts_with(kind.prefix)) else { continue };
+        let rollout = rollout.clone().head(1);
+        compare(&rollout).unwrap();
+        // Each rollout names its observations; one of tracking also its clip and its reward terms.
+        let is_text = |name: &&String| matches!(rollout.arrays[*name].values, Values::Text(_));
+        let names: Vec<&String> = rollout.arrays.keys().filter(is_text).collect();
+        assert!(!names.is_empty(), "{}: no names", rollout.file);
+        for name in names {
             let mut copy = rollout.clone();
-            if let Some(Array { values: Values::Text(text), .. }) = copy.arrays.get_mut(name) {
-                assert!(text[0].contains(from));
-                text[0] = text[0].replacen(from, to, 1);
-            }
-            assert!(compare(&copy).is_err(), "a change of {name} was not detected");
+            let Some(Array { values: Values::Text(text), .. }) = copy.arrays.get_mut(name) else { unreachable!() };
+            text[0] = renamed(&text[0]);
+            assert!(compare(&copy).is_err(), "{}: a change of {name} was not detected", rollout.file);
         }
     }
+}
+
+/// The text with its first letter in the other case.
+fn renamed(text: &str) -> String {
+    let place = text.find(|letter: char| letter.is_ascii_alphabetic()).unwrap();
+    let letter = text[place..=place].chars().next().unwrap();
+    let other = if letter.is_ascii_uppercase() { letter.to_ascii_lowercase() } else { letter.to_ascii_uppercase() };
+    format!("{}{other}{}", &text[..place], &text[place + 1..])
 }

@@ -16,8 +16,13 @@ pub(crate) fn folder() -> PathBuf {
     match std::env::var_os("COMIC_GOLDEN_DIR") {
         // A relative path starts at the workspace, where the user gave the command.
         Some(folder) => workspace().join(folder),
-        None => workspace().join("tests/fixtures/golden"),
+        None => committed(),
     }
+}
+
+/// The rollouts of this repository.
+pub(crate) fn committed() -> PathBuf {
+    workspace().join("tests/fixtures/golden")
 }
 
 /// The folder of dm_control's compiled models, and of the pictures that its cameras took.
