@@ -45,6 +45,12 @@ impl ImageEncoder {
         }
     }
 
+    /// The number of weights of an encoder with so many features.
+    pub(crate) fn weights(features: usize) -> u64 {
+        let [first, second] = [(3 * 8 * 8, 16), (16 * 4 * 4, 32)].map(|(input, output)| input * output);
+        first + second + SECOND.cast_unsigned() * features as u64
+    }
+
     /// F, the number of features.
     pub(crate) fn output(&self) -> i64 {
         self.features

@@ -77,7 +77,7 @@ pub(crate) trait Builder {
     fn weights(&self, spec: &TaskSpec, experiment: &Experiment) -> Weights;
 }
 
-/// Entries of the matrices of a policy, without those of the image encoder.
+/// Entries of the matrices of a policy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Weights {
     /// Of a low level of its own.

@@ -54,6 +54,16 @@ impl ResNet {
         Self { sections, output: linear(&(path / "output"), flat, features, 1.0), features }
     }
 
+    /// The number of weights of a network with so many features.
+    pub(crate) fn weights(features: usize) -> u64 {
+        let [first, second, third] = CHANNELS.map(i64::cast_unsigned);
+        // Each section has a convolution of its input, and two blocks of two.
+        let sections = [(3, first), (first, second), (second, third)];
+        let convolutions: u64 = sections.iter().map(|(input, output)| 9 * output * (input + 4 * output)).sum();
+        let flat = third * (LAST * LAST).cast_unsigned();
+        convolutions + flat * features as u64
+    }
+
     /// F, the number of features.
     pub(crate) fn output(&self) -> i64 {
         self.features

@@ -109,7 +109,9 @@ impl policy::Builder for Builder {
 
     fn weights(&self, spec: &TaskSpec, experiment: &Experiment) -> Weights {
         let Svg0 { encoder, core, policy, .. } = &experiment.svg0;
-        let (mut weights, mut width) = (0, image_features(spec, &experiment.network) as u64);
+        let features = image_features(spec, &experiment.network);
+        let image = if spec.image > 0 { ResNet::weights(features) } else { 0 };
+        let (mut weights, mut width) = (image, features as u64);
         for input in [spec.proprioception, spec.task].into_iter().filter(|input| *input > 0) {
             let (own, output) = hidden(input as u64, encoder);
             (weights, width) = (weights + own, width + output);

@@ -60,13 +60,15 @@ impl policy::Builder for Builder {
 
     fn weights(&self, spec: &TaskSpec, experiment: &Experiment) -> Weights {
         let network = &experiment.network;
+        let image = if spec.image > 0 { ImageEncoder::weights(network.image_features) } else { 0 };
         if experiment.transfer.is_on() {
-            return Weights { low_level: 0, prior: 0, rest: high_level_weights(spec, network) };
+            return Weights { low_level: 0, prior: 0, rest: image + high_level_weights(spec, network) };
         }
+        let encoders: u64 = spec.tasks.iter().map(|task| encoder_weights(spec, task.observation, network)).sum();
         let sizes = Sizes { proprioception: spec.proprioception, actions: spec.action, network };
         Weights {
             low_level: low_level_layers(&sizes).into_iter().map(Layer::weights).sum(),
-            rest: spec.tasks.iter().map(|task| encoder_weights(spec, task.observation, network)).sum(),
+            rest: image + encoders,
             prior: match &network.latent.prior {
                 Prior::State { hidden } => weights::prior(spec, network, hidden),
                 Prior::Standard | Prior::Ar1 { .. } => 0,

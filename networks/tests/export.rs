@@ -232,7 +232,15 @@ fn altered(
     description: impl FnOnce(&mut Value),
     tensors: impl FnOnce(&mut HashMap<String, (Vec<usize>, Vec<u8>)>),
 ) -> Vec<u8> {
-    let file = exported("policy", &small("tracking-mlp", &[])).unwrap();
+    altered_part("policy", description, tensors)
+}
+
+fn altered_part(
+    part: &str,
+    description: impl FnOnce(&mut Value),
+    tensors: impl FnOnce(&mut HashMap<String, (Vec<usize>, Vec<u8>)>),
+) -> Vec<u8> {
+    let file = exported(part, &small("tracking-mlp", &[])).unwrap();
     let mut spec = serde_json::to_value(&file.spec).unwrap();
     description(&mut spec);
     let document = SafeTensors::deserialize(&file.bytes).unwrap();
@@ -272,13 +280,36 @@ fn a_wrong_description_is_refused_with_the_name_of_the_field() {
 
 #[test]
 fn a_description_of_larger_networks_than_the_file_is_refused() {
-    let grow = |spec: &mut Value| {
-        let experiment =
-            spec["experiment"].as_str().unwrap().replace("encoder = [8]", "encoder = [16384, 16384, 16384]");
-        spec["experiment"] = experiment.into();
-    };
-    let said = refused(altered(grow, |_| ()));
-    assert!(said.contains("`experiment`") && said.contains("weights, but the file has"), "{said}");
+    for (part, field) in
+        [("policy", "encoder"), ("policy", "hidden"), ("encoder:tracking", "encoder"), ("low-level", "hidden")]
+    {
+        let said = refused(altered_part(part, |spec| grow(spec, field), |_| ()));
+        assert!(said.contains("`experiment`") && said.contains("weights, but the file has"), "{part}: {said}");
+    }
+}
+
+/// The most memory that this process has had, MiB.
+#[cfg(target_os = "linux")]
+fn peak_memory() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
+    line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() / 1024
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_part_is_read_without_building_the_networks_that_it_does_not_hold() {
+    for (part, field) in [("low-level", "encoder"), ("encoder:tracking", "hidden")] {
+        Exported::read(altered_part(part, |_| (), |_| ())).unwrap();
+        let bytes = altered_part(part, |spec| grow(spec, field), |_| ());
+        let before = peak_memory();
+        let file = Exported::read(bytes).unwrap();
+        if part == "low-level" {
+            file.untrained(1).unwrap();
+        }
+        let more = peak_memory() - before;
+        assert!(more < 256, "{part}: {more} MiB for a file of {} KiB", file.bytes.len() / 1024);
+    }
 }
 
 #[test]
@@ -307,6 +338,14 @@ fn the_error_for_a_missing_description_names_the_command_that_writes_it() {
     let said = refused(to_safetensors(&store).unwrap());
     assert!(said.contains("`comic`") && said.contains("comic-learner export"), "{said}");
 }
+/// Makes a field of the described experiment an array of huge layers: 2 GiB.
+fn grow(spec: &mut Value, field: &str) {
+    let experiment = spec["experiment"].as_str().unwrap();
+    assert_eq!(experiment.matches(&format!("\n{field} = [8]\n")).count(), 1);
+    let grown = experiment.replace(&format!("\n{field} = [8]\n"), &format!("\n{field} = [16384, 16384, 16384]\n"));
+    spec["experiment"] = grown.into();
+}
+
 
 proptest! {
     #[test]

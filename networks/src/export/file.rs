@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::Read as _;
 use std::path::Path;
 
-use comic_experiment::{Experiment, Network, Prior, TaskSpec, Transfer, TransferPrior};
+use comic_experiment::{Experiment, Network, TaskSpec, Transfer, TransferPrior};
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use sha2::{Digest as _, Sha256};
@@ -278,14 +278,10 @@ impl Exported {
         parameters::set(&variables, &self.bytes, other)
     }
 
-    /// New networks of the experiment, and of the prior if the file has one.
+    /// New networks of the experiment, [alone](Part::alone), and of the prior if the file has one.
     pub(super) fn policy(&self, sizes: &TaskSpec) -> Result<(nn::VarStore, Box<dyn Policy>), Error> {
         let store = nn::VarStore::new(Device::Cpu);
-        let mut experiment = self.experiment.clone();
-        if self.spec.part == Part::LowLevel {
-            // The description has the sizes: a prior that was fitted afterwards may have replaced the one that was learned.
-            experiment.network.latent.prior = Prior::Standard;
-        }
+        let experiment = self.spec.part.alone(&self.experiment);
         let policy = new_policy(&store.root(), sizes, &experiment, &vec![0.0; sizes.action])?;
         if let Some(prior) = &self.spec.prior {
             StatePrior::new(&(store.root() / "prior"), sizes.proprioception, &self.experiment.network, &prior.hidden);

@@ -1,6 +1,6 @@
 //! The content of an exported file.
 
-use comic_experiment::{Experiment, TaskName};
+use comic_experiment::{Experiment, LowLevelName, Prior, TaskName};
 use serde::{Deserialize, Serialize};
 
 use crate::error::Error;
@@ -45,6 +45,25 @@ impl Part {
                 ["low_level.", "normaliser.proprioception_", "prior."].iter().any(|start| name.starts_with(start))
             }
         }
+    }
+
+    /// The experiment with the networks that this part does not hold as small as they can be. A file of the part describes
+    /// them, too, and a small file must not make its reader build huge ones.
+    pub(super) fn alone(self, experiment: &Experiment) -> Experiment {
+        let mut alone = experiment.clone();
+        let network = &mut alone.network;
+        match self {
+            Self::Policy(_) => {}
+            Self::Encoder(_) => {
+                (network.low_level, network.mlp.hidden) = (LowLevelName::Mlp, vec![1]);
+            }
+            Self::LowLevel => {
+                (network.encoder, network.encoder_linear_path, network.image_features) = (vec![1], false, 1);
+                // The description has the sizes: a prior that was fitted afterwards may have replaced the one that was learned.
+                network.latent.prior = Prior::Standard;
+            }
+        }
+        alone
     }
 
     /// The experiment of this part. For a part of one task, it is the experiment with only that task.

@@ -7,7 +7,7 @@ use crate::algorithms;
 use crate::policy::Weights;
 use crate::weights;
 
-/// Number of entries of the matrices of encoders and low level in `part`. A reader compares it with the content of a
+/// Number of entries of the matrices in `part`, without the normaliser's. A reader compares it with the content of a
 /// file, so that a small file cannot describe networks that need huge memory. `prior` has the hidden sizes of a prior. A
 /// transfer's frozen low level is a file of its own inside, which is counted when that file is read.
 pub(super) fn count(part: Part, prior: Option<&[usize]>, spec: &TaskSpec, experiment: &Experiment) -> u64 {
@@ -21,9 +21,7 @@ pub(super) fn count(part: Part, prior: Option<&[usize]>, spec: &TaskSpec, experi
 
 /// Whether [`count`] counts a tensor of this name and shape.
 pub(super) fn is_counted(name: &str, shape: &[usize]) -> bool {
-    let matrix = shape.len() > 1 && !name.ends_with("biases");
-    let parts = ["encoder.", "low_level.", "high_level.", "prior.", "core.", "latent_policy."];
-    matrix && parts.iter().any(|part| name.starts_with(part))
+    shape.len() > 1 && !name.ends_with("biases") && !name.starts_with("normaliser.")
 }
 
 #[cfg(test)]
@@ -46,7 +44,12 @@ mod tests {
                 let spec = task_spec(&experiment).unwrap();
                 let store = nn::VarStore::new(Device::Cpu);
                 new_policy(&store.root(), &spec, &experiment, &vec![0.0; spec.action]).unwrap();
-                for part in [Part::Policy(None), Part::LowLevel] {
+                // In joint training a file of one task's encoder describes that task alone.
+                let encoder = match &experiment.tasks()[..] {
+                    [(task, _)] if experiment.learns_low_level() => Some(Part::Encoder(*task)),
+                    _ => None,
+                };
+                for part in [Part::Policy(None), Part::LowLevel].into_iter().chain(encoder) {
                     let sizes =
                         |tensor: &tch::Tensor| tensor.size().iter().map(|size| *size as usize).collect::<Vec<_>>();
                     let built: usize = store
