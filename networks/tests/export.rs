@@ -200,6 +200,43 @@ fn torch_script_acts_like_the_policy_with_every_low_level() {
 }
 
 #[test]
+fn torch_script_takes_its_inputs_in_the_order_of_the_description_with_an_image_too() {
+    for preset in ["gaps", "go-to-target"] {
+        let experiment = small(preset, &["network.low_level=lstm", "network.image_features=7"]);
+        let file = exported("policy", &experiment).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("policy.pt");
+        let _guard = GENERATOR.lock().unwrap();
+        file.save_script(&path).unwrap();
+
+        let (_, policy, spec) = policy(&experiment);
+        let (proprioception, task, memory) = (random(spec.proprioception), random(spec.task), random(4 + 2 * (6 + 5)));
+        let pixels = Tensor::randint(256, [1, spec.image as i64], (Kind::Uint8, Device::Cpu));
+        let inputs: Vec<&Tensor> = file
+            .spec
+            .inputs
+            .iter()
+            .map(|input| match input.name.as_str() {
+                "proprioception" => &proprioception,
+                "recurrent_state" => &memory,
+                "image" => &pixels,
+                name => name.strip_prefix("observation:").map(|_| &task).unwrap(),
+            })
+            .collect();
+        assert_eq!(inputs.len(), if preset == "gaps" { 4 } else { 3 });
+        let output = CModule::load(&path).unwrap().forward_ts(&inputs).unwrap();
+
+        let image = (spec.image > 0).then_some(&pixels);
+        let observation = policy.normalise(&proprioception, &task, image, &Routing::single());
+        let (latent, state) = (memory.narrow(1, 0, 4), memory.narrow(1, 4, 22));
+        let recurrent = RecurrentState { state: &state, first: None };
+        let acting = tch::no_grad(|| policy.act(&observation, &latent, &latent.zeros_like(), recurrent));
+        let expected = Tensor::cat(&[acting.action.mode().clamp(-1.0, 1.0), acting.latent, acting.state], 1);
+        assert_eq!(output, expected, "{preset}");
+    }
+}
+
+#[test]
 fn a_mixture_without_noise_acts_with_its_most_likely_component_in_each_row() {
     let weights = Tensor::from_slice(&[0.2f32, 0.8, 0.7, 0.3]).log().reshape([2, 2]);
     let mean = Tensor::from_slice(&[1.0f32, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]).reshape([2, 4]);
@@ -227,7 +264,7 @@ fn the_error_for_a_task_that_was_not_learnt_names_the_learnt_tasks() {
     assert!(refused.contains("`ball-catch`") && refused.contains("tracking, get-up"), "{refused}");
 }
 
-/// A file whose description or tensors were altered.
+/// A policy's file whose description or tensors were altered.
 fn altered(
     description: impl FnOnce(&mut Value),
     tensors: impl FnOnce(&mut HashMap<String, (Vec<usize>, Vec<u8>)>),
@@ -276,6 +313,14 @@ fn a_wrong_description_is_refused_with_the_name_of_the_field() {
         let said = refused(altered(alter, |_| ()));
         assert!(said.contains(expected), "{expected}: {said}");
     }
+}
+
+/// Makes a field of the described experiment an array of huge layers: 2 GiB.
+fn grow(spec: &mut Value, field: &str) {
+    let experiment = spec["experiment"].as_str().unwrap();
+    assert_eq!(experiment.matches(&format!("\n{field} = [8]\n")).count(), 1);
+    let grown = experiment.replace(&format!("\n{field} = [8]\n"), &format!("\n{field} = [16384, 16384, 16384]\n"));
+    spec["experiment"] = grown.into();
 }
 
 #[test]
@@ -338,14 +383,6 @@ fn the_error_for_a_missing_description_names_the_command_that_writes_it() {
     let said = refused(to_safetensors(&store).unwrap());
     assert!(said.contains("`comic`") && said.contains("comic-learner export"), "{said}");
 }
-/// Makes a field of the described experiment an array of huge layers: 2 GiB.
-fn grow(spec: &mut Value, field: &str) {
-    let experiment = spec["experiment"].as_str().unwrap();
-    assert_eq!(experiment.matches(&format!("\n{field} = [8]\n")).count(), 1);
-    let grown = experiment.replace(&format!("\n{field} = [8]\n"), &format!("\n{field} = [16384, 16384, 16384]\n"));
-    spec["experiment"] = grown.into();
-}
-
 
 proptest! {
     #[test]

@@ -80,12 +80,13 @@ class Policy:
                 f"{self._proprioception + self._task}: make the environment with preset=policy.experiment"
             )
         memory = self._memory_of(len(rows), begins)
-        inputs = [rows[:, : self._proprioception], rows[:, self._proprioception :], memory]
+        inputs = [rows[:, : self._proprioception], rows[:, self._proprioception :]]
         if self._image:
             if not isinstance(observations, Mapping):
                 raise _native.Error("observations: this policy sees; give a dictionary of vector and image")
             image = np.ascontiguousarray(observations["image"], dtype=np.uint8)
             inputs.append(torch.as_tensor(image).reshape(len(rows), self._image))
+        inputs.append(memory)
         with torch.inference_mode():
             output = self._module(*inputs)
         actions, self._memory = output[:, : -self._memory_size or None], output[:, -self._memory_size :]

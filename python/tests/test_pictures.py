@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import comic
 import comic.dm
 import gymnasium
 import numpy as np
 import pytest
+from conftest import SMALL
 from gymnasium.utils.env_checker import check_env
 
 
@@ -55,3 +58,14 @@ def test_dm_envs_adapter_has_the_camera() -> None:
 def test_a_camera_needs_no_image_where_the_experiment_has_none() -> None:
     environment = comic.Environment("gaps", gaps={"corridor": {"vision": "off"}})
     assert environment.observation_space.shape == (environment.reset()[0].shape[0],)
+
+
+def test_a_policy_that_sees_acts_on_what_a_vector_observes(tmp_path: Path) -> None:
+    list(comic.train("gaps", run=tmp_path / "run", actors=1, budget={"updates": 1}, **SMALL))
+    policy = comic.load(tmp_path / "run")
+    batch = comic.make_vec("gaps", num_envs=2, preset=policy.experiment)
+    observations, _ = batch.reset(seed=5)
+    actions = policy(observations, begins=np.ones(2, dtype=bool))
+    batch.action_space.contains(actions) or pytest.fail("actions outside the space")
+    black = observations | {"image": np.zeros_like(observations["image"])}
+    assert np.abs(actions - policy(black, begins=np.ones(2, dtype=bool))).max() > 1e-6

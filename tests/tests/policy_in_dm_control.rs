@@ -1,5 +1,6 @@
 //! `comic-learner export` end to end: the exported policy acts in `comic-actor evaluate` as its checkpoint does, and gets
-//! the same rewards in dm_control's own environment, which a script of ten statements drives.
+//! the same rewards in dm_control's own environment, which a script of ten statements drives. A policy that sees acts in
+//! dm_control's own corridor.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -27,10 +28,10 @@ fn succeeds(command: &mut Command) -> Result<Output> {
     Ok(output)
 }
 
-/// A short run that has ended. Its parameters are always the same.
+/// A short run of tracking with this low level that has ended. Its parameters are always the same.
 async fn trained_run(low_level: &str) -> Result<System> {
     let low_level = format!("network.low_level={low_level}");
-    let more = [
+    run_to_the_end(&[
         low_level.as_str(),
         // A mixture has none.
         "vmpo.control_variate=0",
@@ -41,8 +42,13 @@ async fn trained_run(low_level: &str) -> Result<System> {
         // A policy after a few seconds of training falls at once; the comparison needs rewards for longer.
         "tracking.termination_threshold=100",
         UPDATES,
-    ];
-    let more = more.iter().flat_map(|field| ["--set", *field]);
+    ])
+    .await
+}
+
+/// A run in lockstep with these fields that has ended.
+async fn run_to_the_end(fields: &[&str]) -> Result<System> {
+    let more = fields.iter().flat_map(|field| ["--set", *field]);
     let mut system = System::new(&SMALL.into_iter().chain(["--lockstep"]).chain(more).collect::<Vec<_>>())?;
     system.start_learner(LIMIT).await?;
     let mut actor = system.start_actor_of(ENVIRONMENTS, &system.url())?;
@@ -145,6 +151,28 @@ async fn an_exported_mixture_gets_the_same_rewards_in_dm_control() -> Result<()>
 #[tokio::test]
 async fn an_exported_product_gets_the_same_rewards_in_dm_control() -> Result<()> {
     rewards_are_equal("product").await
+}
+
+/// The inputs of the policy are those of its description, by name and in that order.
+#[tokio::test]
+async fn opengl_an_exported_policy_sees_in_dm_controls_gaps() -> Result<()> {
+    let fields = ["task=gaps", "vmpo.action_gradient=0", "network.initial_pose=mid-range", "budget.updates=3"];
+    let system = run_to_the_end(&fields).await?;
+    let directory = tempfile::tempdir()?;
+    let script = directory.path().join("policy.pt");
+    export(&system.run(), "policy", &script)?;
+    let mut driver = Command::new(python()?);
+    driver.arg(root().join("tests/python/drive_gaps.py")).arg(&script).arg("3");
+    let lines = String::from_utf8(succeeds(&mut driver)?.stdout)?;
+    let steps: Vec<Value> = lines.lines().map(serde_json::from_str).collect::<Result<_, _>>()?;
+    ensure!(steps.len() == 3, "the episode is too short: {lines}");
+    for step in &steps {
+        let number = |name: &str| step[name].as_f64().with_context(|| format!("no {name}: {step}"));
+        ensure!((0.0..=1.0).contains(&number("reward")?), "{step}");
+        ensure!((1e-3..=1.0).contains(&number("largest_action")?), "{step}");
+        ensure!(number("change_when_blind")? > 1e-4, "the image has no influence: {step}");
+    }
+    Ok(())
 }
 
 #[tokio::test]

@@ -10,41 +10,48 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use super::file::{Exported, KEY};
 use super::part::Part;
-use super::spec::task_spec;
+use super::spec::{IMAGE, task_spec};
 use crate::error::Error;
 use crate::frozen::FrozenLowLevel;
 use crate::lstm::RecurrentState;
+use crate::normaliser::NormalisedObservation;
 use crate::policy::Policy;
 use crate::routing::Routing;
 
 impl Exported {
     /// Writes the policy of one task as TorchScript to `path`. The method `forward` of the module takes the inputs of
-    /// the [`Spec`](super::spec::Spec), `[N, size]` each, with an image last. It returns the outputs in one tensor `[N,
-    /// A + M]`, where M is the size of the recurrent state. N is any number of environments. The module has the description as the extra file
+    /// the [`Spec`](super::spec::Spec) in their order, `[N, size]` each. It returns the outputs in one tensor `[N, A + M]`, where
+    /// M is the size of the recurrent state. N is any number of environments. The module has the description as the extra file
     /// `comic.json`.
     ///
     /// # Errors
     /// [`Error::Script`] if the part is not a policy of one task; [`Error::Torch`]; [`Error::File`].
     pub fn save_script(&self, path: &Path) -> Result<(), Error> {
         let sizes = task_spec(&self.experiment)?;
-        if !matches!(self.spec.part, Part::Policy(_)) || sizes.tasks.len() != 1 {
+        let refused = || {
             let tasks: Vec<&str> = sizes.tasks.iter().map(|task| task.name.as_str()).collect();
-            return Err(Error::Script { part: self.spec.part.to_string(), tasks: tasks.join(", ") });
+            Error::Script { part: self.spec.part.to_string(), tasks: tasks.join(", ") }
+        };
+        if !matches!(self.spec.part, Part::Policy(_)) || sizes.tasks.len() != 1 {
+            return Err(refused());
         }
         let (mut store, policy) = self.policy(&sizes)?;
         self.load(&store)?;
         // A tensor that requires a gradient cannot be a constant of a trace.
         store.freeze();
         let frozen = self.frozen_low_level()?;
-        let own = &self.experiment;
-        let memory = [own.latent_size(), own.state_size(), own.frozen_state_size()].map(|size| size as i64);
-        let row = |size: i64, kind| Tensor::zeros([1, size], (kind, store.device()));
-        let widths = [sizes.proprioception as i64, sizes.task as i64, memory.iter().sum()];
-        let mut inputs: Vec<Tensor> = widths.into_iter().map(|width| row(width, Kind::Float)).collect();
-        if sizes.image > 0 {
-            inputs.push(row(sizes.image as i64, Kind::Uint8));
-        }
-        let mut forward = |inputs: &[Tensor]| vec![step(policy.as_ref(), frozen.as_ref(), inputs, memory)];
+        let inputs = self.spec.inputs.iter().map(|input| {
+            let kind = if input.name == IMAGE { Kind::Uint8 } else { Kind::Float };
+            Tensor::zeros([1, input.size as i64], (kind, store.device()))
+        });
+        let inputs: Vec<Tensor> = inputs.collect();
+        let mut forward = |inputs: &[Tensor]| match inputs {
+            [proprioception, task, image @ .., memory] => {
+                let observation = policy.normalise(proprioception, task, image.first(), &Routing::single());
+                vec![self.step(policy.as_ref(), frozen.as_ref(), proprioception, &observation, memory)]
+            }
+            _ => Vec::new(),
+        };
         let module = tch::no_grad(|| CModule::create_by_tracing("Policy", "forward", &inputs, &mut forward))?;
         module.save(path)?;
         self.enclose(path).map_err(Error::File)
@@ -62,21 +69,29 @@ impl Exported {
         archive.write_all(serde_json::to_string(&self.spec)?.as_bytes())?;
         archive.finish()?.sync_all()
     }
-}
 
-/// One step without noise: the action within its bounds, the latent, and the states. `memory` has the sizes of the latent, of
-/// the policy's state and of a frozen low level's.
-fn step(policy: &dyn Policy, frozen: Option<&FrozenLowLevel>, inputs: &[Tensor], memory: [i64; 3]) -> Tensor {
-    let observation = policy.normalise(&inputs[0], &inputs[1], inputs.get(3), &Routing::single());
-    let [latent, state, low_level] = memory;
-    let previous = inputs[2].narrow(1, 0, latent);
-    let [state, low_level] =
-        [(latent, state), (latent + state, low_level)].map(|(start, size)| inputs[2].narrow(1, start, size));
-    let acting =
-        policy.act(&observation, &previous, &previous.zeros_like(), RecurrentState { state: &state, first: None });
-    let (action, low_level) = match frozen {
-        Some(frozen) => frozen.act(&acting.action.mode(), &inputs[0], &low_level),
-        None => (acting.action.mode(), low_level),
-    };
-    Tensor::cat(&[action.clamp(-1.0, 1.0), acting.latent, acting.state, low_level], 1)
+    /// One step without noise: the action within its bounds, the latent, and the states. `memory` has the latent, the policy's
+    /// state and a frozen low level's.
+    fn step(
+        &self,
+        policy: &dyn Policy,
+        frozen: Option<&FrozenLowLevel>,
+        proprioception: &Tensor,
+        observation: &NormalisedObservation,
+        memory: &Tensor,
+    ) -> Tensor {
+        let own = &self.experiment;
+        let [latent, state, low_level] =
+            [own.latent_size(), own.state_size(), own.frozen_state_size()].map(|size| size as i64);
+        let previous = memory.narrow(1, 0, latent);
+        let [state, low_level] =
+            [(latent, state), (latent + state, low_level)].map(|(start, size)| memory.narrow(1, start, size));
+        let recurrent = RecurrentState { state: &state, first: None };
+        let acting = policy.act(observation, &previous, &previous.zeros_like(), recurrent);
+        let (action, low_level) = match frozen {
+            Some(frozen) => frozen.act(&acting.action.mode(), proprioception, &low_level),
+            None => (acting.action.mode(), low_level),
+        };
+        Tensor::cat(&[action.clamp(-1.0, 1.0), acting.latent, acting.state, low_level], 1)
+    }
 }

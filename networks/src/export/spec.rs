@@ -11,6 +11,8 @@ use crate::normaliser::NORMALISED_LIMIT;
 /// Version of the file format. It changes when the same tensors get another meaning, for example if an encoder reads
 /// its inputs in another order, or when fields of the experiment are renamed. Files of format 1 are read, too.
 pub const FORMAT: u32 = 2;
+/// Name of the input that is a camera image.
+pub(super) const IMAGE: &str = "image";
 
 /// The content of a file, its inputs and outputs, and its source.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -20,7 +22,7 @@ pub struct Spec {
     pub format: u32,
     /// The content of the file.
     pub part: Part,
-    /// The inputs, in order.
+    /// The inputs, in order. The module of a TorchScript file takes them in this order.
     pub inputs: Vec<Vector>,
     /// The outputs, in order.
     pub outputs: Vec<Vector>,
@@ -191,7 +193,7 @@ fn observations(experiment: &Experiment, sizes: &TaskSpec) -> Result<Vec<Vector>
     }
     if sizes.image > 0 {
         let meaning = "uint8: 64 rows of 64 pixels of red, green and blue, from the egocentric camera";
-        vectors.push(Vector::plain("image", sizes.image, meaning));
+        vectors.push(Vector::plain(IMAGE, sizes.image, meaning));
     }
     Ok(vectors)
 }
