@@ -10,7 +10,7 @@ mod fixture;
 
 use comic_learner::vmpo::{Evidence, KlLimits, Multipliers, policy_improvement, returns};
 use comic_networks::{ActionDistribution, DiagonalGaussian};
-use fixture::{Fixture, Folder};
+use fixture::{Fixture, Folder, agree};
 use tch::{Device, Kind, Tensor};
 
 const FOLDER: Folder = Folder {
@@ -19,6 +19,14 @@ const FOLDER: Folder = Folder {
     script: "make_vmpo_fixtures.py",
     kinds: &["vmpo_", "gaussian_", "returns_", "mixture_", "product_"],
 };
+
+/// PyTorch's numbers are float64. In that precision divergences of 1e-7 are compared to five digits, too. Training computes in
+/// float32, where rounding leaves little of them.
+const PRECISIONS: [Kind; 2] = [Kind::Double, Kind::Float];
+
+/// The size of the terms in the divergences that are differences, per dimension ½ (σ_old² / σ² − 1) − ln(σ_old / σ). Where the
+/// distributions are near, these terms are much larger than their sum.
+const TERMS: f64 = 1.0;
 
 #[test]
 fn losses_and_gradients_equal_rlax() {
@@ -51,30 +59,38 @@ fn losses_and_gradients_equal_rlax() {
         };
         let improvement = policy_improvement(&evidence, &multipliers, &limits);
         fixture.compare("policy_loss", &improvement.policy);
-        fixture.compare("temperature_loss", &improvement.temperature);
+        // η ln(mean of exp(A / η)), and its derivative, which is the difference of this and of the mean of A / η.
+        let largest = advantage.abs().max().double_value(&[]);
+        fixture.compare_difference("temperature_loss", &improvement.temperature, largest);
         fixture.compare("alpha_loss", &improvement.alpha);
         let inputs = [log_prob, kl_mean, kl_std, multipliers.parameter()];
         let gradients = Tensor::run_backward(&[improvement.total()], &inputs, false, false);
         for (name, gradient) in ["grad_log_prob", "grad_kl_mean", "grad_kl_std"].into_iter().zip(&gradients) {
             fixture.compare(name, gradient);
         }
-        for (index, name) in ["grad_temperature", "grad_alpha_mean", "grad_alpha_std"].into_iter().enumerate() {
-            fixture.compare(name, &gradients[3].select(0, index as i64));
+        let multipliers = [
+            ("grad_temperature", largest / f64::from(temperature)),
+            // ε − the mean KL.
+            ("grad_alpha_mean", limits.epsilon_mean),
+            ("grad_alpha_std", limits.epsilon_std),
+        ];
+        for (index, (name, terms)) in multipliers.into_iter().enumerate() {
+            fixture.compare_difference(name, &gradients[3].select(0, index as i64), terms);
         }
     }
 }
 
 #[test]
 fn gaussians_equal_pytorchs_distributions() {
-    for mut fixture in FOLDER.fixtures("gaussian_") {
+    for mut fixture in PRECISIONS.into_iter().flat_map(|precision| FOLDER.fixtures_in(precision, "gaussian_")) {
         let policy = DiagonalGaussian { mean: fixture.array("mean"), std: fixture.array("std") };
         let behaviour = DiagonalGaussian { mean: fixture.array("other_mean"), std: fixture.array("other_std") };
         let action = fixture.array("action");
         fixture.compare("log_prob", &policy.log_prob(&action));
         fixture.compare("entropy", &policy.entropy());
-        fixture.compare("kl", &behaviour.kl(&policy));
+        fixture.compare_difference("kl", &behaviour.kl(&policy), TERMS);
         fixture.compare("kl_mean", &policy.kl_mean(&behaviour));
-        fixture.compare("kl_std", &policy.kl_std(&behaviour));
+        fixture.compare_difference("kl_std", &policy.kl_std(&behaviour), TERMS);
         fixture.compare("kl_standard", &policy.kl_to_standard_normal());
         if let Some(previous) = fixture.find("previous") {
             let alpha = fixture.scalar("alpha");
@@ -110,7 +126,7 @@ fn compare_gradients(fixture: &mut Fixture, total: &Tensor, learnt: &[Tensor; 3]
 
 #[test]
 fn mixtures_equal_pytorchs_distributions() {
-    for mut fixture in FOLDER.fixtures("mixture_") {
+    for mut fixture in PRECISIONS.into_iter().flat_map(|precision| FOLDER.fixtures_in(precision, "mixture_")) {
         let learnt = LEARNT.map(|name| fixture.array(name).set_requires_grad(true));
         let [logits, mean, std] = &learnt;
         let components = DiagonalGaussian { mean: mean.shallow_clone(), std: std.shallow_clone() };
@@ -123,17 +139,19 @@ fn mixtures_equal_pytorchs_distributions() {
         let kl_weights = policy.kl_weights(&behaviour).unwrap();
         fixture.compare("log_prob", &log_prob);
         fixture.compare("kl_mean", &kl_mean);
-        fixture.compare("kl_std", &kl_std);
-        fixture.compare("kl_weights", &kl_weights);
+        fixture.compare_difference("kl_std", &kl_std, TERMS);
+        // The sum of w_old (ln w_old − ln w), where each ln w is rounded as its logit is.
+        let [logit, old_logit] = ["logits", "old_logits"].map(|name| fixture.array(name).abs().max().double_value(&[]));
+        fixture.compare_difference("kl_weights", &kl_weights, logit.max(old_logit));
         fixture.compare("expectation", &policy.mean());
-        let total = (log_prob + kl_mean + kl_std + kl_weights).sum(Kind::Float);
+        let total = (log_prob + kl_mean + kl_std + kl_weights).sum(None::<Kind>);
         compare_gradients(&mut fixture, &total, &learnt);
     }
 }
 
 #[test]
 fn products_equal_gaussian_distributions_computed_by_hand() {
-    for mut fixture in FOLDER.fixtures("product_") {
+    for mut fixture in PRECISIONS.into_iter().flat_map(|precision| FOLDER.fixtures_in(precision, "product_")) {
         let learnt = LEARNT.map(|name| fixture.array(name).set_requires_grad(true));
         let [logits, mean, std] = &learnt;
         let primitives = DiagonalGaussian { mean: mean.shallow_clone(), std: std.shallow_clone() };
@@ -146,8 +164,51 @@ fn products_equal_gaussian_distributions_computed_by_hand() {
         let (kl_mean, kl_std) = (product.kl_mean(&behaviour), product.kl_std(&behaviour));
         fixture.compare("log_prob", &log_prob);
         fixture.compare("kl_mean", &kl_mean);
-        fixture.compare("kl_std", &kl_std);
-        let total = (log_prob + kl_mean + kl_std).sum(Kind::Float);
+        fixture.compare_difference("kl_std", &kl_std, TERMS);
+        let total = (log_prob + kl_mean + kl_std).sum(None::<Kind>);
         compare_gradients(&mut fixture, &total, &learnt);
+    }
+}
+
+/// Numbers of a gradient: float32, of both signs, and zeros.
+fn gradient(scale: f64) -> Tensor {
+    (Tensor::from_slice(&[1.0, -0.7, 0.3, 0.0, 1e-3]) * scale).to_kind(Kind::Float)
+}
+
+/// From the smallest gradients of the fixtures to the largest losses. `terms` 0 is the comparison of a sum, 1 that of a difference.
+const CASES: [(f64, f64); 7] = [(1e-8, 0.0), (1e-8, 1.0), (1e-5, 0.0), (1e-5, 1.0), (1.0, 0.0), (1.0, 1.0), (1e3, 0.0)];
+
+#[test]
+fn the_comparison_detects_zeros_and_a_wrong_sign_at_every_scale() {
+    for (scale, terms) in CASES {
+        let expected = gradient(scale);
+        agree(&expected, &expected, terms).unwrap();
+        for wrong in [expected.zeros_like(), -&expected, &expected * f64::NAN, expected.select(0, 0)] {
+            assert!(agree(&expected, &wrong, terms).is_err(), "{wrong} for {expected}, terms of {terms}");
+        }
+    }
+}
+
+#[test]
+fn the_comparison_detects_one_wrong_number_at_every_scale() {
+    for (scale, _) in CASES {
+        let expected = gradient(scale);
+        for (index, wrong) in [(0, 1.0001), (1, -0.7001), (2, 0.0), (2, -0.3), (3, 1e-5), (4, 0.0), (4, -1e-3)] {
+            let found = expected.copy();
+            let _ = found.select(0, index).fill_(wrong * scale);
+            assert!(agree(&expected, &found, 0.0).is_err(), "{found} for {expected}");
+        }
+    }
+}
+
+#[test]
+fn the_comparison_allows_what_float32_rounds() {
+    for (scale, _) in CASES {
+        let expected = gradient(scale);
+        let epsilon = f64::from(f32::EPSILON);
+        agree(&expected, &(&expected * (1.0 + 4.0 * epsilon)), 0.0).unwrap();
+        // A sum of terms as large as the largest number, and a small one of terms a thousand times its size.
+        agree(&expected, &(&expected + 2.0 * epsilon * scale), 0.0).unwrap();
+        agree(&expected, &(&expected + 2.0 * epsilon * 1e3 * scale), 1e3 * scale).unwrap();
     }
 }

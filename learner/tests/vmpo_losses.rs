@@ -36,7 +36,7 @@ impl Case {
             log_prob: learnt(&numbers * 0.5 - 1.0),
             advantage: learnt(Tensor::from_slice(advantage)),
             kl_mean: learnt(&numbers * 0.1),
-            kl_std: learnt(&numbers * 0.2),
+            kl_std: learnt(&numbers * 0.3),
             valid: Tensor::ones([steps], (Kind::Float, Device::Cpu)),
             multipliers: Multipliers::new(&[1.0], &[2.0, 3.0], Device::Cpu),
         }
@@ -116,9 +116,9 @@ fn alpha_learns_only_from_its_constraint_and_the_policy_only_from_the_penalty() 
     let case = Case::new(&[2.0, 0.0, 1.0, -3.0]);
     let losses = case.losses();
     let multipliers = case.gradient(&losses.alpha, case.multipliers.parameter());
-    // Mean KLs are 0.15 and 0.3: dL/dα = ε − KL, without the penalty's + KL.
+    // Mean KLs are 0.15 and 0.45, one below its limit and one above: dL/dα = ε − KL, without the penalty's + KL.
     assert_close(multipliers[1], 0.2 - 0.15);
-    assert_close(multipliers[2], 0.3 - 0.3);
+    assert_close(multipliers[2], 0.3 - 0.45);
     // dL/dKL = α / N, without the constraint's − α / N.
     case.gradient(&losses.alpha, &case.kl_mean).into_iter().for_each(|gradient| assert_close(gradient, 2.0 / 4.0));
     case.gradient(&losses.alpha, &case.kl_std).into_iter().for_each(|gradient| assert_close(gradient, 3.0 / 4.0));
