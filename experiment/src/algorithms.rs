@@ -96,6 +96,10 @@ pub(crate) trait AlgorithmParameters {
     /// Size of the policy's recurrent state. A frozen low level's state is not part of it.
     fn state_size(&self, rest: &Rest<'_>) -> usize;
 
+    /// How many published versions take so many updates, rounded up: the most by which an unroll may be late. `None` if
+    /// unrolls of every age are learned from.
+    fn versions_in(&self, updates: u64) -> Option<u64>;
+
     /// Whether it learns from the simulator's derivative of the rewards with respect to the actions.
     fn reads_action_gradient(&self) -> bool {
         false

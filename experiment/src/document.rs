@@ -157,6 +157,14 @@ impl Experiment {
         self.algorithm_parameters().reads_action_gradient()
     }
 
+    /// Most published versions by which an unroll may be late: `unroll.max_staleness` in versions, and none in lockstep.
+    pub fn max_versions_late(&self) -> u64 {
+        match self.unroll.lockstep {
+            true => 0,
+            false => self.algorithm_parameters().versions_in(self.unroll.max_staleness).unwrap_or(u64::MAX),
+        }
+    }
+
     /// Length of the latent that the policy samples itself.
     pub fn latent_size(&self) -> usize {
         if self.learns_low_level() { self.network.latent.size } else { 0 }

@@ -42,8 +42,8 @@ pub struct Network {
     pub policy_head_scale: f64,
     /// The policy's mean before learning (D).
     pub initial_pose: InitialPose,
-    /// Steps whose mean and standard deviation normalise the observations: the first ones of the run. 0 is no
-    /// normalisation (D).
+    /// Steps whose mean and standard deviation normalise the observations: the first ones of the run. While they are collected,
+    /// learner and actors get the newest mean and deviation with each published version. 0 is no normalisation (D).
     pub normaliser_steps: u64,
 }
 

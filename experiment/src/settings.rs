@@ -53,7 +53,10 @@ pub struct Unroll {
     pub length: usize,
     /// B: unrolls in a batch (S).
     pub batch: usize,
-    /// Largest age of an unroll's parameters, in published versions. An older unroll is refused as stale (D).
+    /// Most updates since newer parameters than an unroll's were published. An older unroll is dropped as stale. Counted in
+    /// whole versions, rounded up: V-MPO publishes one every `vmpo.target_period` updates. 400 are four versions of the paper's,
+    /// one more than 99 % of the unrolls were late with 4000 actors (D; docs/capacity.md). SVG(0) learns from a replay and has no
+    /// limit.
     pub max_staleness: u64,
     /// Batches that are assembled while the learner trains on one: 1 keeps the device busy (D), 0 keeps the experience new.
     pub ahead: usize,
@@ -65,7 +68,7 @@ pub struct Unroll {
 
 impl Default for Unroll {
     fn default() -> Self {
-        Self { length: 32, batch: 128, max_staleness: 1000, ahead: 1, lockstep: false }
+        Self { length: 32, batch: 128, max_staleness: 400, ahead: 1, lockstep: false }
     }
 }
 

@@ -25,6 +25,7 @@ fn a_field_that_the_algorithm_does_not_read_is_refused_with_the_reason() {
         ("svg0", "network.initial_pose=reference-mean"),
         ("svg0", "network.mlp.hidden=[32]"),
         ("svg0", "optimiser.multiplier_learning_rate=0.1"),
+        ("svg0", "unroll.max_staleness=9"),
         ("svg0", r#"joint=[{task="get-up", probability=0.1}]"#),
     ] {
         let chosen = format!("algorithm={algorithm}");
@@ -83,4 +84,18 @@ fn the_replay_is_refused_where_neither_side_could_move() {
     // 100 sequences, a tenth of them, sampled 4 times each.
     assert_eq!((replay.min_sequences(32, 8), replay.error_buffer(32, 8)), (100, 40.0));
     assert_eq!(with("replay.min_size=0").unwrap().replay.error_buffer(32, 8), 8.0);
+}
+
+#[test]
+fn an_unroll_may_be_late_by_the_updates_of_max_staleness_in_whole_versions_and_in_lockstep_by_none() {
+    for (staleness, period, versions) in [(400, 100, 4), (401, 100, 5), (1, 100, 1), (0, 100, 0), (32, 1, 32)] {
+        let overrides = [format!("unroll.max_staleness={staleness}"), format!("vmpo.target_period={period}")];
+        let overrides = [&overrides[0], overrides[1].as_str()];
+        assert_eq!(set("tracking-mlp", &overrides).unwrap().max_versions_late(), versions, "{overrides:?}");
+        let lockstep = [&overrides[..], &["unroll.lockstep=true", "unroll.ahead=0", "budget.minutes=0"]].concat();
+        assert_eq!(set("tracking-mlp", &lockstep).unwrap().max_versions_late(), 0, "{overrides:?}");
+    }
+    let lockstep = ["algorithm=svg0", "unroll.lockstep=true", "unroll.ahead=0"];
+    assert_eq!(set("transfer-paper", &lockstep[..1]).unwrap().max_versions_late(), u64::MAX);
+    assert_eq!(set("transfer-paper", &lockstep).unwrap().max_versions_late(), 0);
 }

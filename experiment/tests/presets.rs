@@ -80,3 +80,18 @@ fn every_preset_is_in_the_list_of_the_documentation() {
         presets::ALL.iter().map(|(name, _)| name).filter(|name| !list.contains(&format!("`{name}`"))).collect();
     assert!(missing.is_empty(), "docs/experiments.md lacks {missing:?}");
 }
+
+/// docs/capacity.md, "How old an unroll may be", has the measured ages.
+#[test]
+fn every_preset_drops_what_is_older_than_any_unroll_of_a_healthy_run_and_nothing_younger() {
+    for (name, _) in presets::ALL {
+        let preset = preset(name);
+        let (updates, versions) = match (preset.algorithm, preset.vmpo.target_period) {
+            (AlgorithmName::Vmpo, 1) => (32, 32),
+            (AlgorithmName::Vmpo, 100) => (400, 4),
+            (AlgorithmName::Svg0, _) => (400, u64::MAX),
+            other => panic!("{name}: no age was measured for {other:?}"),
+        };
+        assert_eq!((preset.unroll.max_staleness, preset.max_versions_late()), (updates, versions), "{name}");
+    }
+}

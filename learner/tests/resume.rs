@@ -44,7 +44,8 @@ fn experiment(preset: &str, updates: u64) -> Experiment {
     let mut overrides: Vec<String> = [
         "network.encoder=[16]",
         "network.value=[16]",
-        "network.normaliser_steps=100",
+        // More than there are rows in half of the updates: where the run is resumed, statistics wait for the next publication.
+        "network.normaliser_steps=200",
         "vmpo.target_period=2",
         "vmpo.gradient_steps=3",
         "vmpo.minibatch_unrolls=4",

@@ -34,7 +34,7 @@ pub(super) fn wire(subject: &Subject) -> Result<Figure> {
     let phase = Phase { epoch: 1, version: 1, oldest: 0 };
     let config = Config {
         unrolls: experiment.unroll.batch,
-        max_staleness: experiment.unroll.max_staleness,
+        max_staleness: experiment.max_versions_late(),
         ahead: experiment.unroll.ahead,
         order: BatchOrder::Arrival,
     };

@@ -65,8 +65,8 @@ impl Default for Svg0 {
     }
 }
 
-/// What SVG(0) does not read: it has networks of its own.
-const UNREAD: [&str; 15] = [
+/// What SVG(0) does not read: it has networks of its own, and it learns from unrolls of every age.
+const UNREAD: [&str; 16] = [
     "joint",
     "network.encoder",
     "network.encoder_linear_path",
@@ -82,6 +82,7 @@ const UNREAD: [&str; 15] = [
     "network.min_std",
     "network.initial_pose",
     "optimiser.multiplier_learning_rate",
+    "unroll.max_staleness",
 ];
 
 /// What it does not read either where no frozen low level acts. With one, these fields describe it.
@@ -121,6 +122,11 @@ impl AlgorithmParameters for Svg0 {
 
     fn has_low_level(&self) -> bool {
         false
+    }
+
+    /// The replay holds older unrolls anyway, and Retrace corrects for the policy that made them.
+    fn versions_in(&self, _: u64) -> Option<u64> {
+        None
     }
 
     /// Hidden and cell state of the core's LSTM, then of the policy's.

@@ -33,7 +33,7 @@ pub struct Vmpo {
     /// In joint training each task has its own temperature and its own best steps, because advantages of different tasks
     /// have different scales (D). Without this, one E-step ranks the steps of all tasks.
     pub temperature_per_task: bool,
-    /// Gradient steps between two updates of the target network. Actors act with the target network (V).
+    /// Updates, each on one batch, between two renewals of the target network. Actors act with the target network (V).
     pub target_period: u64,
     /// Gradient steps on each batch (V: 1).
     pub gradient_steps: usize,
@@ -144,6 +144,11 @@ impl AlgorithmParameters for Vmpo {
 
     fn state_size(&self, rest: &Rest<'_>) -> usize {
         if rest.transfers { 0 } else { rest.network.state_size() }
+    }
+
+    fn versions_in(&self, updates: u64) -> Option<u64> {
+        // A check of the document refuses a period of 0.
+        Some(updates.div_ceil(self.target_period.max(1)))
     }
 
     fn reads_action_gradient(&self) -> bool {

@@ -55,7 +55,7 @@ pub(super) fn prepare(
     };
     let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| task.name.clone()));
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
-    let config = batches(&experiment.unroll);
+    let config = batches(&experiment);
     let batcher = Batcher::new(layout, config, Phase::begin(epoch), ledger);
     let publisher = Publisher::new(epoch);
     let mut assets = catalogue.assets()?;
@@ -115,11 +115,10 @@ fn accounting(snapshot: &Snapshot) -> Result<Ledger> {
 }
 
 /// How the batcher makes batches.
-fn batches(unroll: &Unroll) -> Config {
-    let Unroll { batch, max_staleness, ahead, lockstep, .. } = *unroll;
-    let (order, max_staleness) =
-        if lockstep { (BatchOrder::Environment, 0) } else { (BatchOrder::Arrival, max_staleness) };
-    Config { unrolls: batch, max_staleness, ahead, order }
+fn batches(experiment: &Experiment) -> Config {
+    let Unroll { batch, ahead, lockstep, .. } = experiment.unroll;
+    let order = if lockstep { BatchOrder::Environment } else { BatchOrder::Arrival };
+    Config { unrolls: batch, max_staleness: experiment.max_versions_late(), ahead, order }
 }
 
 /// Checks that a run is resumed with the experiment that it had, unless it is `allowed` to change. The budget, the intervals

@@ -17,7 +17,8 @@ use crate::train::statistics::ObservationStatistics;
 #[derive(Debug)]
 pub(super) struct State {
     pub(super) algorithm: Box<dyn Algorithm>,
-    /// Of the observations, for the normaliser.
+    /// Of the observations that were collected. The normaliser gets them with each publication, so until then it may have
+    /// older ones.
     pub(super) statistics: ObservationStatistics,
     pub(super) progress: Progress,
     /// The parameters that actors act with, as published.
@@ -50,12 +51,16 @@ impl State {
         Ok(Self { algorithm, statistics: ObservationStatistics::new(spec), progress, target, low_level })
     }
 
-    /// Normalises by the statistics of the observations seen so far.
+    /// Normalises by the statistics collected so far, if there are any. If it were called between two publications, the learner
+    /// would normalise otherwise than the actors, and the KL to their policy would be more than what was learned.
     ///
     /// # Errors
     /// When libtorch refuses.
     pub(super) fn set_normaliser(&mut self) -> Result<()> {
-        Ok(self.algorithm.set_normaliser(&self.statistics.to_normaliser()?)?)
+        if self.statistics.rows() > 0.0 {
+            self.algorithm.set_normaliser(&self.statistics.to_normaliser()?)?;
+        }
+        Ok(())
     }
 
     /// The state as a checkpoint, with the documents by which a resumed run is compared.

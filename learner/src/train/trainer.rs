@@ -151,7 +151,7 @@ impl Trainer {
     fn learn(&mut self, batch: Batch) -> Result<()> {
         let began = Instant::now();
         let _update = tracing::debug_span!("update", update = self.state.progress.updates + 1).entered();
-        if self.normalise_by(&batch)? {
+        if self.collect(&batch) {
             return self.skip_batch(batch);
         }
         let (steps, losses) = self.take_gradient_steps(&batch)?;
@@ -173,16 +173,15 @@ impl Trainer {
         self.after_update()
     }
 
-    /// Adds a batch to the statistics of the normaliser while that still learns them. Says whether the batch is the first
-    /// one of a task.
-    fn normalise_by(&mut self, batch: &Batch) -> Result<bool> {
+    /// Adds a batch to the statistics of the observations while they are still collected. They take effect with the next
+    /// publication. Says whether the batch is the first one of a task.
+    fn collect(&mut self, batch: &Batch) -> bool {
         let (wanted, seen) = (self.experiment.network.normaliser_steps as f64, self.state.statistics.rows());
         let first = wanted > 0.0 && self.state.statistics.lacks(&batch.tasks());
         if first || seen < wanted {
             self.state.statistics.absorb(batch);
-            self.state.set_normaliser()?;
         }
-        Ok(first)
+        first
     }
 
     /// The first batch of a task only sets the scale of its observations, because without it the networks would learn

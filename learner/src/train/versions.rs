@@ -22,12 +22,14 @@ impl Versions {
         Self { batcher, publisher, lockstep, oldest: 0 }
     }
 
-    /// Publishes the online policy as the next version. From now on it is the target network, with which actors act.
+    /// Publishes the online policy as the next version. From now on it is the target network, with which actors act. Statistics
+    /// of the observations that were collected since the last version take effect.
     ///
     /// # Errors
-    /// When the parameters cannot be read from the device.
+    /// When the device refuses.
     pub(super) fn publish(&self, state: &mut State) -> Result<()> {
         let _publish = tracing::debug_span!("publish", version = state.progress.version + 1).entered();
+        state.set_normaliser()?;
         state.target = Bytes::from(state.algorithm.policy_parameters()?);
         state.progress.version += 1;
         self.announce(state);
