@@ -3,7 +3,7 @@
 use std::fs;
 use std::process::Command;
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 
 use crate::durations::Durations;
 use crate::workspace::{answers, cargo, cargo_has, run};
@@ -167,19 +167,19 @@ fn can_make_namespaces() -> bool {
     answers("ip", &["netns", "add", &name]) && answers("ip", &["netns", "delete", &name])
 }
 
-/// Checks formatting, code, and the licences and sources of dependencies, each where its tool is installed.
+/// Checks formatting and code, and, where cargo-deny is installed, the licences and sources of dependencies.
+///
+/// # Errors
+/// What the tools find, and a toolchain without clippy or rustfmt: what was not checked must not pass.
 pub(crate) fn lint() -> Result<()> {
+    // By the names of the subcommand and of rustup's component.
+    let mut missing = vec![("clippy", "clippy"), ("fmt", "rustfmt")];
+    missing.retain(|(subcommand, _)| !cargo_has(subcommand));
+    let missing: Vec<_> = missing.into_iter().map(|(_, component)| component).collect();
+    ensure!(missing.is_empty(), "lint needs {}: `rustup component add clippy rustfmt`", missing.join(" and "));
     setup::run(&setup::Options::default())?;
-    if cargo_has("fmt") {
-        run(cargo().args(["fmt", "--all", "--check"]))?;
-    } else {
-        eprintln!("NOT RUN: the check of formatting: `rustup component add rustfmt`");
-    }
-    if cargo_has("clippy") {
-        run(cargo().args(["clippy", "--release", "--workspace", "--all-targets", "--", "--deny", "warnings"]))?;
-    } else {
-        eprintln!("NOT RUN: clippy: `rustup component add clippy`");
-    }
+    run(cargo().args(["fmt", "--all", "--check"]))?;
+    run(cargo().args(["clippy", "--release", "--workspace", "--all-targets", "--", "--deny", "warnings"]))?;
     if cargo_has("deny") {
         run(cargo().args(["deny", "check", "licenses", "bans", "sources"]))?;
     } else {
