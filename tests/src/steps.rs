@@ -46,6 +46,49 @@ pub async fn trains_on(system: &mut System, what: &str) -> Result<()> {
     system.until(what, LIMIT, |status| (accounting(status).trained >= before + BEYOND_WHAT_IS_LEFT).then_some(())).await
 }
 
+/// The learner's log level for [`trains_on_each`]: a line for every unroll that is trained on.
+pub const EVERY_UNROLL: &str = "info,comic_learner::train::reports=trace";
+
+/// Waits until the learner has trained on an unroll of each of these actors that was made with a version much newer than the
+/// newest one now. So every actor works and gets new parameters; totals would grow with one of them alone. The learner needs the
+/// log level [`EVERY_UNROLL`].
+///
+/// # Errors
+/// When this does not happen in time.
+pub async fn trains_on_each(system: &mut System, actors: &[Process], what: &str) -> Result<()> {
+    let wanted = metric(&now(system).await?, "version") + VERSIONS;
+    let actors = actors.iter().map(index).collect::<Result<Vec<_>>>()?;
+    let learner = system.learner.as_mut().context("no learner")?;
+    for actor in actors {
+        let what = format!("{what}: an unroll of actor {actor} of version {wanted} or newer is trained on");
+        learner
+            .until_log(&what, LIMIT, |log| newest_trained(log, actor).is_some_and(|newest| newest >= wanted))
+            .await?;
+    }
+    Ok(())
+}
+
+/// The number that the learner gave to an actor that has joined.
+fn index(actor: &Process) -> Result<u64> {
+    let log = actor.log();
+    let line = log.lines().rfind(|line| line.contains("joined the learner")).context("the actor has not joined")?;
+    Ok(field(line, "actor").with_context(|| format!("no number in {line}"))? as u64)
+}
+
+/// The version with which the newest trained unroll of an actor was made, from the learner's log.
+fn newest_trained(log: &str, actor: u64) -> Option<f64> {
+    let trained = format!("trained on actor={actor} ");
+    // The last line may be half written.
+    let (whole, _) = log.rsplit_once('\n')?;
+    field(whole.lines().rfind(|line| line.contains(&trained))?, "version")
+}
+
+/// A number that a line of a log names.
+fn field(line: &str, name: &str) -> Option<f64> {
+    let (_, rest) = line.rsplit_once(&format!(" {name}="))?;
+    rest.split(' ').next()?.parse().ok()
+}
+
 /// Waits for new versions and checks that trained unrolls are only a few versions old: actors used new parameters.
 ///
 /// # Errors

@@ -262,15 +262,22 @@ impl System {
         self.spawn(arguments.first().copied().unwrap_or(name), command)
     }
 
-    /// The metrics page, at the address that the learner logs.
+    /// Host and port of the metrics page, as the learner logs them.
+    ///
+    /// # Errors
+    /// When the learner logs no address.
+    pub fn metrics_address(&self) -> Result<String> {
+        let log = self.learner.as_ref().context("no learner")?.log();
+        let mut lines = log.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+        lines.find_map(|line| Some(line["metrics"].as_str()?.to_owned())).context("no address")
+    }
+
+    /// The metrics page.
     ///
     /// # Errors
     /// When the learner logs no address, or does not answer.
     pub fn metrics_page(&self) -> Result<String> {
-        let log = self.learner.as_ref().context("no learner")?.log();
-        let mut lines = log.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
-        let address = lines.find_map(|line| Some(line["metrics"].as_str()?.to_owned())).context("no address")?;
-        let mut stream = TcpStream::connect(address)?;
+        let mut stream = TcpStream::connect(self.metrics_address()?)?;
         stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: learner\r\n\r\n")?;
         let mut page = String::new();
         stream.read_to_string(&mut page)?;

@@ -1,13 +1,11 @@
 //! When the learner requires client certificates, an actor without one tries for three minutes, or for `--give-up-after` if
-//! that is shorter, and ends with exit code 2. The same holds for an actor that does not trust the learner's certificate.
-
-use std::time::Duration;
+//! that is shorter, and ends with exit code 2. The same holds for an actor that does not trust the learner's certificate. An
+//! actor with one joins, and the learner trains on its unrolls.
 
 use anyhow::{Result, ensure};
 use comic_tests::certificates::Authority;
+use comic_tests::steps::{LIMIT, leaves, the_accounting_balances_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
-
-const LIMIT: Duration = Duration::from_secs(120);
 
 #[tokio::test]
 async fn an_actor_without_an_accepted_certificate_ends_and_one_with_it_joins() -> Result<()> {
@@ -32,5 +30,8 @@ async fn an_actor_without_an_accepted_certificate_ends_and_one_with_it_joins() -
         ensure!(status.code() == Some(2), "{access:?}: {status}: {}", refused.log());
     }
     let mut actor = system.start_actor()?;
-    actor.until_log_holds("joined the learner", LIMIT).await
+    actor.until_log_holds("joined the learner", LIMIT).await?;
+    trains_on(&mut system, "unrolls come in by the client's certificate").await?;
+    leaves(actor).await?;
+    the_accounting_balances_at_the_end(system).await
 }

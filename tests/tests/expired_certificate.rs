@@ -1,12 +1,10 @@
-//! An expired certificate refuses actors only until it is renewed. Neither the learner nor the actor restarts.
-
-use std::time::Duration;
+//! An expired certificate refuses actors only until it is renewed; then the learner trains on their unrolls. Neither the learner
+//! nor the actor restarts.
 
 use anyhow::{Result, ensure};
 use comic_tests::certificates::Authority;
+use comic_tests::steps::{LIMIT, leaves, the_accounting_balances_at_the_end, trains_on};
 use comic_tests::system::{SMALL, System};
-
-const LIMIT: Duration = Duration::from_secs(120);
 
 #[tokio::test]
 async fn actors_wait_for_the_renewed_certificate() -> Result<()> {
@@ -28,5 +26,8 @@ async fn actors_wait_for_the_renewed_certificate() -> Result<()> {
     // Now the actor's certificate has expired.
     actor.until_log_holds("CertificateExpired", LIMIT).await?;
     authority.issue("client", 60)?;
-    actor.until_log_holds("joined the learner", LIMIT).await
+    actor.until_log_holds("joined the learner", LIMIT).await?;
+    trains_on(&mut system, "unrolls come in by the renewed certificates").await?;
+    leaves(actor).await?;
+    the_accounting_balances_at_the_end(system).await
 }

@@ -1,24 +1,26 @@
 //! One learner and two actors as real processes with real sockets, with every other low level and with two tasks. The
-//! learner trains on the unrolls of both actors, new parameters reach them, and a killed learner resumes from its
+//! learner trains on the unrolls of each actor, new parameters reach each of them, and a killed learner resumes from its
 //! checkpoint, whatever recurrent states are in flight.
 
 use anyhow::{Result, ensure};
 use comic_proto::v1::Status;
 use comic_tests::steps::{
-    LIMIT, kill_and_restart_the_learner, leaves, parameters_arrive, the_accounting_balances_at_the_end, trains_on,
+    EVERY_UNROLL, LIMIT, kill_and_restart_the_learner, leaves, the_accounting_balances_at_the_end, trains_on,
+    trains_on_each,
 };
 use comic_tests::system::{SMALL, System, balance_of_json};
 
 async fn two_actors_learn(overrides: &[&str], check: fn(&Status) -> Option<()>) -> Result<()> {
     let arguments = overrides.iter().flat_map(|field| ["--set", *field]);
     let mut system = System::new(&SMALL.into_iter().chain(arguments).collect::<Vec<_>>())?;
+    system.log_level = Some(EVERY_UNROLL.into());
     let begun = system.start_learner(LIMIT).await?;
     let mut actors = [system.start_actor()?, system.start_actor()?];
     for actor in &mut actors {
         actor.until_log_holds("joined the learner", LIMIT).await?;
     }
     trains_on(&mut system, "the actors' unrolls are trained on").await?;
-    parameters_arrive(&mut system, "the actors act with new parameters").await?;
+    trains_on_each(&mut system, &actors, "both act with new parameters").await?;
     system.until("the metrics say so", LIMIT, check).await?;
     let resumed = kill_and_restart_the_learner(&mut system).await?;
     ensure!(resumed.learner_epoch > begun.learner_epoch, "a restarted learner must begin a new epoch");
@@ -26,6 +28,7 @@ async fn two_actors_learn(overrides: &[&str], check: fn(&Status) -> Option<()>) 
         actor.until_log_holds(&format!("learner_epoch={}", resumed.learner_epoch), LIMIT).await?;
     }
     trains_on(&mut system, "training continues after the restart").await?;
+    trains_on_each(&mut system, &actors, "both act with the restarted learner's parameters").await?;
     system.until("the metrics say so again", LIMIT, check).await?;
     for actor in actors {
         leaves(actor).await?;

@@ -2,13 +2,11 @@
 //! An actor that had joined before waits for the renewed token.
 
 use std::fs;
-use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use comic_proto::Access;
+use comic_tests::steps::{LIMIT, trains_on};
 use comic_tests::system::{SMALL, System};
-
-const LIMIT: Duration = Duration::from_secs(120);
 
 #[tokio::test]
 async fn a_wrong_token_ends_an_actor_unless_it_is_renewed_in_time_or_it_had_joined_before() -> Result<()> {
@@ -36,6 +34,7 @@ async fn a_wrong_token_ends_an_actor_unless_it_is_renewed_in_time_or_it_had_join
     early.until_log_holds("does not accept this process", LIMIT).await?;
     fs::write(&wrong, "first-token\n")?;
     early.until_log_holds("joined the learner", LIMIT).await?;
+    trains_on(&mut system, "the unrolls of the actor with the renewed token are trained on").await?;
 
     let mut actor = system.start_actor()?;
     actor.until_log_holds("joined the learner", LIMIT).await?;
@@ -46,5 +45,6 @@ async fn a_wrong_token_ends_an_actor_unless_it_is_renewed_in_time_or_it_had_join
     let restarted = system.start_learner(LIMIT).await?;
     actor.until_log_holds("another token", LIMIT).await?;
     fs::write(&shown, "second-token\n")?;
-    actor.until_log_holds(&format!("learner_epoch={}", restarted.learner_epoch), LIMIT).await
+    actor.until_log_holds(&format!("learner_epoch={}", restarted.learner_epoch), LIMIT).await?;
+    trains_on(&mut system, "the unrolls of the actor with the second token are trained on").await
 }

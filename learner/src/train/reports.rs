@@ -68,8 +68,8 @@ impl Reports {
             environment_steps += rows.environment_steps;
             self.prometheus.count_rows(task, rows);
         }
-        for UnrollHeader { actor, incarnation, sequence, .. } in batch.headers() {
-            tracing::trace!(actor, incarnation = format_args!("{incarnation:016x}"), sequence, "trained on");
+        for UnrollHeader { actor, incarnation, sequence, version, .. } in batch.headers() {
+            tracing::trace!(actor, incarnation = format_args!("{incarnation:016x}"), sequence, version, "trained on");
         }
         let episodes = batch.headers().iter().flat_map(|header| &header.episodes);
         let diverged = episodes.filter(|episode| episode.end() == EpisodeEnd::Diverged).count();
@@ -147,15 +147,7 @@ impl Reports {
 
     /// Writes the evaluations that actors reported since the last time, and returns what they say of checkpoints.
     pub(super) fn take_evaluations(&mut self) -> Vec<Evaluated> {
-        let mut evaluations = self.service.take_evaluations();
-        let own = self.service.id();
-        evaluations.retain(|evaluation| {
-            let belongs = evaluation.run.is_none_or(|run| run == own);
-            if !belongs {
-                tracing::warn!(updates = evaluation.updates, "an evaluation of another run is ignored");
-            }
-            belongs
-        });
+        let evaluations = self.service.take_evaluations();
         evaluations.iter().for_each(|evaluation| self.metrics.keep_evaluation(evaluation));
         evaluations.iter().filter_map(|evaluation| evaluation.evaluated()).collect()
     }
