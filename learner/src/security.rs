@@ -19,7 +19,7 @@ use crate::error::{Error, Result};
 
 pub use limit_arguments::ConnectionLimits;
 pub use tls::Tls;
-pub use tokens::Tokens;
+pub use tokens::{Shown, Tokens};
 
 /// The arguments for security.
 #[derive(Clone, Debug, Default, Args)]

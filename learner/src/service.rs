@@ -4,7 +4,8 @@
 //! - `assembly` makes the parts of a [`Service`] from its [`Setup`], and a [`TrainerHandle`] of those that the trainer needs.
 //!   [`serve()`] runs the server until its end, `shutdown` is the state of that end, [`http2`] the protocol's settings, and
 //!   [`process`] the threads and file descriptors.
-//! - Every connection passes `connections`, and every call `authorisation`: they alone check TLS, tokens and limits.
+//! - Every connection passes `connections`, and every call `authorisation`: they alone check TLS, tokens and limits. `peer` is
+//!   what a call knows of its connection.
 //! - `calls` is the service that tonic decodes. `join` accepts actors, `assets` sends files, `offer` is the checkpoint that
 //!   evaluators fetch, `evaluations` keeps reports for the trainer, and `status` shows the learner's state.
 //! - `framing` is the two calls that carry bytes past tonic's codec; `intake` validates unrolls and puts them into batches,
@@ -28,6 +29,7 @@ mod intake;
 mod join;
 pub mod memory;
 pub mod offer;
+mod peer;
 pub mod process;
 pub mod quarantine;
 mod room;

@@ -10,7 +10,6 @@ use bytes::Bytes;
 use comic_experiment::{Experiment, TaskSpec, resolve};
 use comic_learner::checkpoint::{Snapshot, Store, find, read};
 use comic_learner::device::Backend;
-use comic_learner::observe::evaluation::Evaluation;
 use comic_learner::observe::probes::Probed as _;
 use comic_learner::publish::{Published, Publisher};
 use comic_learner::security::{ConnectionLimits, Security};
@@ -18,7 +17,7 @@ use comic_learner::service::quarantine::QuarantineArguments;
 use comic_learner::service::{self, Service};
 use comic_learner::train::parts::{Ending, TrainerParts};
 use comic_learner::train::trainer::Trainer;
-use comic_proto::v1::UnrollHeader;
+use comic_proto::v1::{EvaluationReport, UnrollHeader};
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Outcome, Phase};
 use rand::{Rng as _, SeedableRng as _};
@@ -126,7 +125,7 @@ fn live_evaluated(
     run: &Path,
     unrolls: u64,
     alter: fn(u64, &mut UnrollBuffer),
-    evaluations: &[Evaluation],
+    evaluations: &[EvaluationReport],
 ) -> Epoch {
     let experiment = experiment.clone();
     let spec = spec(&experiment);
@@ -154,7 +153,7 @@ fn live_evaluated(
         quarantine: QuarantineArguments::default(),
     })
     .unwrap();
-    assert!(evaluations.iter().all(|evaluation| service.evaluations().add(evaluation.clone())));
+    evaluations.iter().for_each(|report| service.evaluations().report(report.clone()).unwrap());
     let pose = vec![0.1; spec.action];
     let run = run.to_path_buf();
     let joined = batcher.join(INCARNATION, None).unwrap();
@@ -346,18 +345,16 @@ fn the_checkpoint_of_the_best_evaluation_outlives_the_newest_few() {
         let experiment = experiment("tracking-mlp", updates);
         // The first run of the learner is epoch 1.
         let number = Store::open(run.path(), 3).unwrap().run().unwrap();
-        let evaluation = Evaluation {
+        let evaluation = EvaluationReport {
             run: Some(number),
-            epoch: 1,
+            learner_epoch: 1,
             version: 2,
             updates: 1,
             json: report.into(),
-            ..Evaluation::default()
+            ..EvaluationReport::default()
         };
-        let json = r#"{"overall": {"normalised_reward": 0.9}}"#.into();
-        let of_another_run = Evaluation { run: Some(number ^ 1), json, ..evaluation.clone() };
         let unrolls = (updates + 1) * BATCH;
-        live_evaluated(&experiment, run.path(), unrolls, |_, _| {}, &[of_another_run, evaluation]).ended.unwrap();
+        live_evaluated(&experiment, run.path(), unrolls, |_, _| {}, &[evaluation]).ended.unwrap();
     };
     epoch(1, "[]");
     assert!(!checkpoints.join("best.json").exists(), "that report has no mean");

@@ -105,7 +105,7 @@ impl Batcher {
     }
 
     /// See [`Ledger::catch_up`].
-    pub fn catch_up(&self, actor: u64, sequence: u64) -> u64 {
+    pub fn catch_up(&self, actor: u64, sequence: u64) -> Option<u64> {
         self.lock().ledger.catch_up(actor, sequence)
     }
 

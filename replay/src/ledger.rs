@@ -8,6 +8,11 @@ use thiserror::Error;
 use crate::accounting::{Accounting, AccountingByTask, Reason, TaskAccounting};
 use crate::tasks::Tasks;
 
+/// Most unrolls of one actor that the learner can have lost with an earlier learner epoch. An actor makes at most some hundred a
+/// second, and this many in half a day; nobody resumes a run from so far back without starting its actors again. A larger
+/// number is a lie, and the sums would soon be at their end.
+pub const MOST_LOST: u64 = 1 << 24;
+
 /// The account of an actor that joined.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Joined {
@@ -139,16 +144,16 @@ impl Ledger {
     }
 
     /// Accounts for all numbers below `sequence`, which were acknowledged to the actor. Numbers that the account does
-    /// not have were lost with an earlier learner epoch. Returns the next sequence number; 0 without an account.
-    pub fn catch_up(&mut self, actor: u64, sequence: u64) -> u64 {
-        let Some(entry) = self.entries.get_mut(&actor) else { return 0 };
-        let lost = sequence.min(MAX_SEQUENCE).saturating_sub(entry.next_sequence);
-        if let Some(produced) = self.sums.produced.checked_add(lost) {
-            entry.next_sequence += lost;
-            self.sums.produced = produced;
-            self.sums.dropped.count(Reason::LostAtRestart, lost);
-        }
-        entry.next_sequence
+    /// not have were lost with an earlier learner epoch. Returns the next sequence number. `None`, and nothing is changed,
+    /// without an account, or if so many cannot have been lost.
+    pub fn catch_up(&mut self, actor: u64, sequence: u64) -> Option<u64> {
+        let entry = self.entries.get_mut(&actor)?;
+        let lost = sequence.saturating_sub(entry.next_sequence);
+        let produced = self.sums.produced.checked_add(lost).filter(|_| lost <= MOST_LOST)?;
+        entry.next_sequence += lost;
+        self.sums.produced = produced;
+        self.sums.dropped.count(Reason::LostAtRestart, lost);
+        Some(entry.next_sequence)
     }
 
     /// Closes the account with the oldest activity.
@@ -170,6 +175,7 @@ impl Ledger {
             Some(entry) if entry.incarnation != incarnation => SequenceStatus::Unknown,
             Some(_) if sequence >= MAX_SEQUENCE => SequenceStatus::OutOfRange,
             Some(entry) if sequence < entry.next_sequence => SequenceStatus::Duplicate,
+            Some(entry) if sequence - entry.next_sequence > MOST_LOST => SequenceStatus::OutOfRange,
             Some(_) => SequenceStatus::New,
             None => SequenceStatus::Unknown,
         }

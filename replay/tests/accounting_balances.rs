@@ -196,7 +196,7 @@ impl World {
                 let acknowledged = self.next_sequence(actor);
                 let actor = self.actors[actor as usize];
                 assert_eq!(self.batcher.join(actor.incarnation, Some(actor.actor)).unwrap().actor, actor.actor);
-                assert_eq!(self.batcher.catch_up(actor.actor, acknowledged), acknowledged);
+                assert_eq!(self.batcher.catch_up(actor.actor, acknowledged), Some(acknowledged));
                 self.known.cursors.insert(actor.incarnation, acknowledged);
             }
             Event::Replace { actor } => {

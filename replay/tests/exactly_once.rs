@@ -5,7 +5,7 @@
 mod common;
 
 use comic_proto::MAX_SEQUENCE;
-use comic_replay::{Dropped, Outcome, Phase, Reason};
+use comic_replay::{Dropped, MOST_LOST, Outcome, Phase, Reason};
 use common::{Actor, CONFIG, NEXT_PHASE, PHASE, batch_now, batcher, insert_now, payload};
 
 #[test]
@@ -38,6 +38,19 @@ fn two_incarnations_have_separate_accounts() {
     assert_eq!(one.send(&batcher, 0), Some(Outcome::Taken));
     assert_eq!(other.send(&batcher, 0), Some(Outcome::Taken));
     assert_eq!(batcher.accounting().produced, 2);
+}
+
+/// An actor that could claim any number would bring the sums to their end.
+#[test]
+fn more_unrolls_than_an_actor_can_make_are_not_lost() {
+    let batcher = batcher();
+    let actor = Actor::join(&batcher, 5);
+    assert_eq!(batcher.catch_up(actor.actor, MOST_LOST + 1), None);
+    assert_eq!(actor.send(&batcher, MOST_LOST + 1), Some(Outcome::Invalid));
+    assert_eq!(batcher.accounting().produced, 0);
+    assert_eq!(batcher.catch_up(actor.actor, MOST_LOST), Some(MOST_LOST));
+    assert_eq!(actor.send(&batcher, 2 * MOST_LOST), Some(Outcome::Taken));
+    assert_eq!(batcher.accounting().dropped.lost_at_restart, 2 * MOST_LOST);
 }
 
 #[test]

@@ -98,11 +98,11 @@ fn a_reconnecting_actor_keeps_its_account_and_skipped_numbers_are_lost() {
 #[test]
 fn acknowledged_numbers_that_the_checkpoint_does_not_have_are_lost() {
     let (actor, after, joined) = rejoined_after_a_crash();
-    assert_eq!(after.catch_up(joined.actor, 3), 3);
-    assert_eq!(after.catch_up(joined.actor, 2), 3, "an account never moves back");
+    assert_eq!(after.catch_up(joined.actor, 3), Some(3));
+    assert_eq!(after.catch_up(joined.actor, 2), Some(3), "an account never moves back");
     let dropped = Dropped { lost_at_restart: 3, ..Dropped::default() };
     assert_eq!(after.accounting(), Accounting { produced: 3, dropped, ..Accounting::default() });
-    assert_eq!(after.catch_up(99, 3), 0, "numbers without an account are not counted");
+    assert_eq!(after.catch_up(99, 3), None, "numbers without an account are not counted");
     assert_eq!(after.accounting().produced, 3);
     assert_eq!(actor.send(&after, 2), Some(Outcome::Duplicate), "it is never trained on again");
 }

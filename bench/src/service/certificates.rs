@@ -5,7 +5,7 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context as _, Result, ensure};
 
-/// A directory with an authority and a server's certificate.
+/// A directory with an authority, a server's certificate and a token.
 #[derive(Debug)]
 pub(super) struct Certificates {
     directory: PathBuf,
@@ -19,7 +19,7 @@ impl Certificates {
         let name = directory.to_str().context("the name of the temporary directory is not UTF-8")?.to_owned();
         let own = std::env::current_exe().context("cannot find the path of this program")?;
         let learner = own.with_file_name("comic-learner");
-        let made = Command::new(&learner).args(["certs", "--out", &name]).stdout(Stdio::null()).status();
+        let made = Command::new(&learner).args(["certs", "--token", "--out", &name]).stdout(Stdio::null()).status();
         let made = made.with_context(|| format!("cannot start {}: `cargo build --release`", learner.display()))?;
         ensure!(made.success(), "`comic-learner certs` made no certificates in {name}");
         Ok(Self { directory, name })

@@ -60,7 +60,7 @@ pub struct Crowd {
     /// Mean seconds between an actor's restarts, and between its stalls
     #[arg(long, value_parser = positive)]
     churn: Option<f64>,
-    /// Connect by TLS and trust the authority that `comic-learner certs` made in this directory
+    /// Connect by TLS with the authority and the token that `comic-learner certs` made in this directory
     #[arg(long)]
     tls: Option<PathBuf>,
     /// Bytes of a version, for the kinds that count bytes only

@@ -11,7 +11,7 @@ use anyhow::{Context as _, Result};
 use bytes::Bytes;
 use clap::{Args, ValueEnum};
 use comic_learner::publish::Publisher;
-use comic_learner::security::{ConnectionLimits, Security, Tls};
+use comic_learner::security::{ConnectionLimits, Security, Tls, Tokens};
 use comic_learner::service::http2::{server, window};
 use comic_learner::service::process::{allow_descriptors, runtime};
 use comic_learner::service::quarantine::QuarantineArguments;
@@ -46,7 +46,7 @@ pub struct Host {
     /// Seconds of an update
     #[arg(long, value_parser = positive)]
     update: Option<f64>,
-    /// Serve by TLS with the certificates that `comic-learner certs` made in this directory
+    /// Serve by TLS, and require the token, with what `comic-learner certs` made in this directory
     #[arg(long)]
     tls: Option<PathBuf>,
     /// Updates between versions
@@ -118,7 +118,7 @@ impl StandIn {
         let (experiment, spec, layout) = experiment()?;
         let config = Config {
             unrolls: experiment.unroll.batch,
-            max_staleness: experiment.unroll.max_staleness,
+            max_staleness: experiment.max_versions_late(),
             ahead: experiment.unroll.ahead,
             order: BatchOrder::Arrival,
         };
@@ -126,7 +126,7 @@ impl StandIn {
         let publisher = Publisher::new(EPOCH);
         let limits = ConnectionLimits {
             max_actors: 65_536,
-            max_connections_per_address: 65_536,
+            max_connections_per_address: Some(65_536),
             max_requests: 262_144,
             ..ConnectionLimits::default()
         };
@@ -207,10 +207,11 @@ impl StandIn {
     }
 }
 
-/// TLS where it is asked for; no tokens.
+/// TLS and a token where they are asked for.
 fn security(certificates: Option<&Path>) -> Result<Security> {
-    let serving = |directory: &Path| Tls::new(&directory.join("server.pem"), &directory.join("server-key.pem"), None);
-    Ok(Security { tls: certificates.map(serving).transpose()?, tokens: None })
+    let Some(directory) = certificates else { return Ok(Security::default()) };
+    let tls = Tls::new(&directory.join("server.pem"), &directory.join("server-key.pem"), None)?;
+    Ok(Security { tls: Some(tls), tokens: Tokens::new(Some(&directory.join("token")))? })
 }
 
 fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> Result<()> {

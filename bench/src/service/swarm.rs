@@ -7,6 +7,7 @@ use anyhow::{Result, ensure};
 use clap::Args;
 use serde_json::{Value, json};
 
+use super::certificates::Certificates;
 use super::figure::{MEGABYTE, extended};
 use super::paper::{PATIENCE, positive};
 use super::process::Process;
@@ -37,6 +38,9 @@ pub struct Swarm {
     /// Mean seconds between an actor's restarts, and between its stalls of 5 to 60 s
     #[arg(long, default_value_t = 300.0, value_parser = positive)]
     churn: f64,
+    /// Connect by TLS and with a token
+    #[arg(long)]
+    tls: bool,
 }
 
 impl Swarm {
@@ -45,7 +49,9 @@ impl Swarm {
     /// # Errors
     /// A process of the measurement that fails; a bound that is not kept.
     pub fn run(&self) -> Result<()> {
-        let (mut host, mut crowd) = self.start()?;
+        let certificates = self.tls.then(Certificates::new).transpose()?;
+        let access: Vec<&str> = certificates.iter().flat_map(Certificates::option).collect();
+        let (mut host, mut crowd) = self.start(&access)?;
         // Connections made so far, not those of now: some actors have restarted already.
         crowd.wait_for("connections", self.actors as f64, 5 * PATIENCE)?;
         let (start, length) = (Instant::now(), Duration::from_secs_f64(60.0 * self.minutes));
@@ -68,7 +74,7 @@ impl Swarm {
         let per_second = |now: &Value, then: f64| (now.as_f64().unwrap_or_default() - then) / seconds;
         ensure!(state["balanced"] == true, "the accounting does not balance: {state}");
         let rest = json!({
-            "actors": self.actors, "minutes": self.minutes, "unrolls_per_s": per_second(&state["trained"], trained),
+            "actors": self.actors, "tls": self.tls, "minutes": self.minutes, "unrolls_per_s": per_second(&state["trained"], trained),
             "parameters_mb_per_s": per_second(&stats["bytes"], bytes) / MEGABYTE,
             "cores": (usage.cpu_seconds - cpu) / seconds, "crowd": stats, "accounting": state["accounting"],
         });
@@ -83,13 +89,16 @@ impl Swarm {
         check_bounds(&line)
     }
 
-    fn start(&self) -> Result<(Process, Process)> {
+    /// `access` is the option of host and crowd.
+    fn start(&self, access: &[&str]) -> Result<(Process, Process)> {
         let (parameters, update) = (self.parameters.to_string(), (1.0 / self.batches).to_string());
         let period = self.target_period.to_string();
         let trainer = ["--update", &update, "--target-period", &period];
-        let host = Process::host(&[&["--kind", "learner", "--parameters", &parameters], &trainer[..]].concat())?;
+        let host =
+            Process::host(&[&["--kind", "learner", "--parameters", &parameters], &trainer[..], access].concat())?;
         let (actors, churn) = (self.actors.to_string(), self.churn.to_string());
-        let crowd = Process::crowd(&host, &["--actors", &actors, "--window", "1", "--watch", "--churn", &churn])?;
+        let options = ["--actors", &actors, "--window", "1", "--watch", "--churn", &churn];
+        let crowd = Process::crowd(&host, &[&options[..], access].concat())?;
         Ok((host, crowd))
     }
 }

@@ -17,8 +17,8 @@ const RECORD: &str = "best.json";
 /// The checkpoint that an evaluation is about, as its report names it, and how good it is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Evaluated {
-    /// The run, if the report names it.
-    pub run: Option<u64>,
+    /// The run.
+    pub run: u64,
     /// The learner epoch.
     pub epoch: u64,
     /// Updates until then.
@@ -62,7 +62,7 @@ impl Best {
     pub(super) fn judge(directory: &Path, evaluated: Evaluated) -> Result<Judgement> {
         let Evaluated { run, epoch: learner_epoch, updates, normalised_reward } = evaluated;
         // Another run, or an earlier epoch of this one, may have left a checkpoint of the same name.
-        let same = |found: &Position| found.epoch == learner_epoch && (run.is_none() || found.run == run);
+        let same = |found: &Position| found.epoch == learner_epoch && found.run == Some(run);
         let position = Position::read(&Name::Updates(updates).within(directory));
         let Some(Position { version, .. }) = position.filter(same) else {
             return Ok(Judgement::Gone);

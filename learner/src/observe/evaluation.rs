@@ -7,8 +7,8 @@ use crate::checkpoint::Evaluated;
 /// An evaluation that an actor reported.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Evaluation {
-    /// The run whose parameters were evaluated, if the actor knows it.
-    pub run: Option<u64>,
+    /// The run whose parameters were evaluated: the learner's own.
+    pub run: u64,
     /// The learner epoch of the parameters.
     pub epoch: u64,
     /// The version of the parameters.

@@ -2,6 +2,7 @@
 //! secret, and accepts no input.
 
 use std::convert::Infallible;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -12,12 +13,17 @@ use http_body_util::Full;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
+use tokio::task::JoinHandle;
 
-/// Connections at once; further ones wait to be accepted.
+/// Connections at once, of all peers and of one address. A further one takes the place of the oldest, so that nobody keeps the
+/// places; an answer takes milliseconds.
 const CONNECTIONS: usize = 64;
+/// See [`CONNECTIONS`].
+const CONNECTIONS_PER_ADDRESS: usize = 16;
 /// A connection is one request and its answer, and lasts no longer.
 const LIMIT: Duration = Duration::from_secs(10);
+/// A request has come by then, or the connection is closed.
+const REQUEST_LIMIT: Duration = Duration::from_secs(2);
 /// A trainer that has not moved for this time is dead. The longest step is the first one on XLA, which compiles for up to eight
 /// minutes.
 const LONGEST_STEP: Duration = Duration::from_secs(900);
@@ -37,22 +43,33 @@ pub trait Probed: Send + Sync + 'static {
 
 /// Answers until the process ends.
 pub async fn serve(listener: TcpListener, probed: Arc<impl Probed>) {
-    let places = Arc::new(Semaphore::new(CONNECTIONS));
-    // The semaphore is never closed.
-    while let Ok(place) = places.clone().acquire_owned().await {
+    let mut connections = Vec::new();
+    loop {
         match listener.accept().await {
-            Ok((stream, _)) => {
-                let probed = probed.clone();
-                tokio::spawn(async move {
-                    let _ = tokio::time::timeout(LIMIT, answer(stream, probed)).await;
-                    drop(place);
-                });
+            Ok((stream, peer)) => {
+                make_room(&mut connections, peer.ip());
+                let answer = tokio::spawn(tokio::time::timeout(LIMIT, answer(stream, probed.clone())));
+                connections.push((peer.ip(), answer));
             }
             Err(error) => {
                 tracing::warn!(%error, "a connection to the metrics could not be accepted");
                 tokio::time::sleep(RETRY_DELAY).await;
             }
         }
+    }
+}
+
+/// Closes the oldest connection of this address, or of all, if they have as many as they may.
+fn make_room<T>(connections: &mut Vec<(IpAddr, JoinHandle<T>)>, address: IpAddr) {
+    connections.retain(|(_, answer)| !answer.is_finished());
+    let of_address = |(other, _): &(IpAddr, JoinHandle<T>)| *other == address;
+    let oldest = if connections.iter().filter(|connection| of_address(connection)).count() >= CONNECTIONS_PER_ADDRESS {
+        connections.iter().position(of_address)
+    } else {
+        (connections.len() >= CONNECTIONS).then_some(0)
+    };
+    if let Some(oldest) = oldest {
+        connections.remove(oldest).1.abort();
     }
 }
 
@@ -63,7 +80,7 @@ async fn answer(stream: TcpStream, probed: Arc<impl Probed>) -> Result<(), hyper
         async move { Ok::<_, Infallible>(response) }
     });
     let mut http = hyper::server::conn::http1::Builder::new();
-    http.timer(TokioTimer::new()).keep_alive(false);
+    http.timer(TokioTimer::new()).header_read_timeout(REQUEST_LIMIT).keep_alive(false);
     http.serve_connection(TokioIo::new(stream), respond).await
 }
 

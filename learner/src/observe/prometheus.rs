@@ -217,9 +217,9 @@ impl Default for Prometheus {
             joins: all.labelled(
                 "counter",
                 ("comic_joins", "result"),
-                &["joined", "full", "draining", "refused"],
-                "Attempts to join, reconnections included: accepted, refused because --max-actors are present or because the \
-                 learner is going down, refused for good",
+                &["joined", "full", "draining", "limited", "refused"],
+                "Attempts to join, reconnections included: accepted, refused because --max-actors are present, because the \
+                 learner is going down or because the name joins too often, refused for good",
             ),
             connections: all.gauge("comic_connections", "Connections that are open"),
             connections_refused: all.labelled(

@@ -12,7 +12,8 @@ use tokio_rustls::TlsAcceptor;
 use super::watched::Watched;
 use crate::error::{Error, Result};
 
-/// Certificates that are read again when they change.
+/// Certificates that are read again when they change. Files that cannot be used, as between the two writes of a renewal, leave
+/// the last ones in use.
 #[derive(Debug)]
 pub struct Tls(Watched<ServerConfig>);
 
@@ -30,7 +31,7 @@ impl Tls {
 
     /// The acceptor for a connection that arrives now.
     pub(crate) fn acceptor(&self) -> TlsAcceptor {
-        TlsAcceptor::from(self.0.current())
+        TlsAcceptor::from(self.0.last_usable())
     }
 }
 

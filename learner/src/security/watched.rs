@@ -6,20 +6,27 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use comic_proto::chain;
-use parking_lot::Mutex;
+use parking_lot::{Mutex, MutexGuard};
 
 use crate::error::Result;
 
 /// Identifies a state of a file: device, inode, size, and the times of its last changes.
 type Stamp = Option<[i64; 7]>;
 
-/// A value made of files. [`current`](Self::current) checks whether they changed, which costs one `stat` for each. Nothing
-/// polls them; a change takes effect at the next connection. If changed files cannot be used, this is logged and the old
-/// value stays.
+/// A value made of files. Each question checks whether they changed, which costs one `stat` for each. Nothing polls them. That
+/// changed files cannot be used is logged.
 pub(super) struct Watched<T> {
     files: Vec<PathBuf>,
     load: Box<dyn Fn() -> Result<T> + Send + Sync>,
-    state: Mutex<(Vec<Stamp>, Arc<T>)>,
+    state: Mutex<State<T>>,
+}
+
+struct State<T> {
+    stamps: Vec<Stamp>,
+    /// The last value that could be used.
+    usable: Arc<T>,
+    /// Whether it is that of the files as they are.
+    current: bool,
 }
 
 impl<T> Watched<T> {
@@ -28,28 +35,41 @@ impl<T> Watched<T> {
     /// # Errors
     /// The errors of `load`.
     pub(super) fn new(files: Vec<PathBuf>, load: impl Fn() -> Result<T> + Send + Sync + 'static) -> Result<Self> {
-        let first = (stamps(&files), Arc::new(load()?));
-        Ok(Self { files, load: Box::new(load), state: Mutex::new(first) })
+        // Before the files are read, so that a later change is noticed the next time.
+        let stamps = stamps(&files);
+        let state = State { stamps, usable: Arc::new(load()?), current: true };
+        Ok(Self { files, load: Box::new(load), state: Mutex::new(state) })
     }
 
-    /// The value of the files as they are now, or the last one that could be used.
-    pub(super) fn current(&self) -> Arc<T> {
+    /// The value of the files as they are now; `None` if they cannot be used.
+    pub(super) fn current(&self) -> Option<Arc<T>> {
+        let state = self.refresh();
+        state.current.then(|| state.usable.clone())
+    }
+
+    /// The value of the files as they were when they could be used last.
+    pub(super) fn last_usable(&self) -> Arc<T> {
+        self.refresh().usable.clone()
+    }
+
+    fn refresh(&self) -> MutexGuard<'_, State<T>> {
         let mut state = self.state.lock();
-        // Taken before the files are read, so that a later change is noticed the next time.
         let stamps = stamps(&self.files);
-        if state.0 != stamps {
-            state.0 = stamps;
-            match (self.load)() {
+        if state.stamps != stamps {
+            state.stamps = stamps;
+            let loaded = (self.load)();
+            state.current = loaded.is_ok();
+            match loaded {
                 Ok(value) => {
-                    state.1 = Arc::new(value);
+                    state.usable = Arc::new(value);
                     tracing::info!(files = ?self.files, "changed files are in use");
                 }
                 Err(error) => {
-                    tracing::error!(files = ?self.files, "changed files cannot be used; the old ones stay in use: {}", chain(&error));
+                    tracing::error!(files = ?self.files, "changed files cannot be used: {}", chain(&error));
                 }
             }
         }
-        state.1.clone()
+        state
     }
 }
 
@@ -75,7 +95,7 @@ mod tests {
     use crate::error::Error;
 
     #[test]
-    fn a_change_takes_effect_at_once_and_an_unusable_one_changes_nothing() {
+    fn a_change_takes_effect_at_once_and_an_unusable_one_leaves_only_the_last_usable_value() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("number");
         std::fs::write(&path, "1").unwrap();
@@ -87,15 +107,16 @@ mod tests {
             }
         };
         let watched = Watched::new(vec![path.clone()], read).unwrap();
-        assert_eq!(*watched.current(), 1);
+        let found = || (watched.current().as_deref().copied(), *watched.last_usable());
+        assert_eq!(found(), (Some(1), 1));
         std::fs::write(&path, "22").unwrap();
-        assert_eq!(*watched.current(), 22);
+        assert_eq!(found(), (Some(22), 22));
         std::fs::write(&path, "no number").unwrap();
-        assert_eq!(*watched.current(), 22);
+        assert_eq!(found(), (None, 22));
         std::fs::remove_file(&path).unwrap();
-        assert_eq!(*watched.current(), 22);
+        assert_eq!(found(), (None, 22));
         std::fs::write(&path, "333").unwrap();
-        assert_eq!(*watched.current(), 333);
+        assert_eq!(found(), (Some(333), 333));
     }
 
     #[test]

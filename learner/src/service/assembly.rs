@@ -12,13 +12,14 @@ use parking_lot::Mutex;
 
 use super::assets::Assets;
 use super::assignments::Assignments;
+use super::authorisation::PUBLIC_CALLS;
 use super::calls::Calls;
 use super::evaluations::Evaluations;
 use super::framing::parameters::Parameters;
 use super::framing::unrolls::Unrolls;
 use super::http2::{connection_window, window};
 use super::intake::Intake;
-use super::join::{Join, JoinTerms};
+use super::join::{self, Join, JoinTerms};
 use super::memory::IngestLimits;
 use super::offer::{NewestCheckpoint, Offer, description};
 use super::quarantine::{Quarantine, QuarantineArguments};
@@ -137,7 +138,7 @@ impl Service {
         let terms = JoinTerms::new(id, &experiment, &spec, assets.iter().map(description).collect())?;
         let quarantine = Quarantine::start(&quarantine, &prometheus)?;
         let quarantines = quarantine.is_some();
-        let (evaluations, checkpoint) = (Evaluations::default(), NewestCheckpoint::default());
+        let (evaluations, checkpoint) = (Evaluations::new(id), NewestCheckpoint::default());
         let status = Arc::new(common.status(run, &experiment));
         let gate = Gate {
             tls: security.tls.map(Arc::new),
@@ -241,7 +242,8 @@ impl Common {
 
     fn join(&self, terms: JoinTerms) -> Join {
         let Self { batcher, publisher, roster, assignments, shutdown, prometheus, .. } = self.clone();
-        Join { terms, batcher, roster, assignments, shutdown, prometheus, epoch: publisher.epoch() }
+        let (epoch, joins) = (publisher.epoch(), join::joins());
+        Join { terms, batcher, roster, assignments, shutdown, prometheus, epoch, joins }
     }
 
     fn intake(&self, spec: &TaskSpec, quarantine: Option<Quarantine>) -> Intake {
@@ -259,7 +261,7 @@ impl Gate {
             connections: self.limits.max_connections(),
             window: connection_window(self.window) as usize,
             room: self.limits.max_ingest_bytes,
-            requests: self.limits.max_requests,
+            requests: self.limits.max_requests.saturating_add(PUBLIC_CALLS),
             message: self.message_limit,
             quarantined: if quarantines { Quarantine::HELD } else { 0 },
         }

@@ -8,14 +8,13 @@ use comic_proto::v1::{
     JoinRequest, ParametersChunk, StatusRequest, UnrollAck, UnrollMessage, WatchRequest,
 };
 use futures::stream::{BoxStream, StreamExt as _};
-use serde::de::IgnoredAny;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::assets::Assets;
 use super::evaluations::Evaluations;
 use super::join::Join;
+use super::peer::Peer;
 use super::status::StatusBoard;
-use crate::observe::evaluation::Evaluation;
 use crate::observe::prometheus::Prometheus;
 
 /// tonic's service. A server has one, which all its connections share.
@@ -35,8 +34,8 @@ impl Learner for Calls {
     type WatchParametersStream = BoxStream<'static, Result<ParametersChunk, Status>>;
 
     async fn join(&self, request: Request<JoinRequest>) -> Result<Response<JoinReply>, Status> {
-        let peer = request.remote_addr();
-        self.join.answer(&request.into_inner(), peer).map(Response::new)
+        let peer = request.extensions().get::<Peer>().cloned();
+        self.join.answer(&request.into_inner(), peer.as_ref()).map(Response::new)
     }
 
     async fn fetch_asset(&self, request: Request<AssetRequest>) -> Result<Response<Self::FetchAssetStream>, Status> {
@@ -50,18 +49,10 @@ impl Learner for Calls {
     }
 
     async fn report_evaluation(&self, request: Request<EvaluationReport>) -> Result<Response<EvaluationAck>, Status> {
-        let EvaluationReport { learner_epoch: epoch, version, updates, json, run, environment_steps, seconds, film } =
-            request.into_inner();
-        if let Err(error) = serde_json::from_str::<IgnoredAny>(&json) {
-            return Err(Status::invalid_argument(format!("the report is no JSON: {error}")));
-        }
         if self.status.publisher.run_is_over() {
             return Err(Status::unavailable("the run is over, and the trainer takes no evaluations"));
         }
-        let evaluation = Evaluation { run, epoch, version, updates, environment_steps, seconds, json, film };
-        if !self.evaluations.add(evaluation) {
-            return Err(Status::resource_exhausted("too many evaluations wait for the trainer: report this one later"));
-        }
+        self.evaluations.report(request.into_inner())?;
         self.prometheus.evaluations.inc();
         Ok(Response::new(EvaluationAck {}))
     }

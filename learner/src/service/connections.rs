@@ -1,6 +1,5 @@
 //! Accepts connections: counts and limits them, and makes the TLS handshake where TLS is on.
 
-use std::collections::HashMap;
 use std::future::Future as _;
 use std::io;
 use std::net::{IpAddr, SocketAddr};
@@ -10,21 +9,21 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use futures::stream::{self, Stream};
-use parking_lot::Mutex;
+use prometheus_client::metrics::gauge::Gauge;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
-use tokio::time::Sleep;
-use tonic::transport::server::{Connected, TcpConnectInfo};
+use tokio::time::{Instant, Sleep};
+use tonic::transport::server::Connected;
 
+use super::peer::{self, Peer};
 use crate::log_limiter::LogLimiter;
 use crate::observe::prometheus::Prometheus;
+use crate::places::{Full, Place, Places};
 use crate::security::{ConnectionLimits, Tls};
 
-/// The time limit of the TLS handshake, and of the HTTP/2 preface. Each takes a few round trips.
-const HANDSHAKE: Duration = Duration::from_secs(10);
-/// Bytes with which HTTP/2 begins (RFC 9113, 3.4). After them pings find peers that are gone.
-const PREFACE: usize = 24;
+/// How long a connection stays open beyond its age. By then its streams have ended, and their peers have closed it.
+const LINGER: Duration = Duration::from_secs(30);
 /// How long a peer may take to read why its handshake failed.
 const ALERT_TIMEOUT: Duration = Duration::from_secs(1);
 /// The pause before the next attempt when the system has no file descriptor left.
@@ -34,30 +33,16 @@ const RETRY_DELAY: Duration = Duration::from_millis(100);
 #[derive(Clone, Debug)]
 pub(super) struct Acceptor {
     tls: Option<Arc<Tls>>,
-    per_address: usize,
-    total: usize,
-    open: Arc<Mutex<OpenConnections>>,
+    limits: ConnectionLimits,
+    places: Arc<Places>,
     log_limiter: Arc<LogLimiter<IpAddr>>,
     prometheus: Arc<Prometheus>,
 }
 
-/// Numbers of open connections.
-#[derive(Debug, Default)]
-struct OpenConnections {
-    by_address: HashMap<IpAddr, usize>,
-    total: usize,
-}
-
 impl Acceptor {
     pub(super) fn new(tls: Option<Arc<Tls>>, limits: &ConnectionLimits, prometheus: Arc<Prometheus>) -> Self {
-        Self {
-            tls,
-            per_address: limits.max_connections_per_address,
-            total: limits.max_connections(),
-            open: Arc::default(),
-            log_limiter: Arc::default(),
-            prometheus,
-        }
+        let places = Places::new(limits.max_connections(), limits.connections_per_address());
+        Self { tls, limits: limits.clone(), places, log_limiter: Arc::default(), prometheus }
     }
 
     /// The accepted connections. Handshakes run concurrently, so that a slow peer does not delay others, and each handshake
@@ -73,8 +58,8 @@ impl Acceptor {
                     }
                     accepted = listener.accept() => match accepted {
                         Ok((stream, peer)) => {
-                            if let Some(place) = acceptor.reserve(peer) {
-                                handshakes.spawn(acceptor.clone().handshake(stream, place));
+                            if let Some(open) = acceptor.reserve(peer) {
+                                handshakes.spawn(acceptor.clone().handshake(stream, peer, open));
                             }
                         }
                         Err(error) => {
@@ -88,54 +73,46 @@ impl Acceptor {
     }
 
     /// A place for a connection of this peer, if the limits allow one.
-    fn reserve(&self, peer: SocketAddr) -> Option<Place> {
-        let address = peer.ip().to_canonical();
-        let mut open = self.open.lock();
-        let taken = open.by_address.get(&address).copied().unwrap_or_default();
-        let reason = if open.total >= self.total {
-            "total"
-        } else if taken >= self.per_address {
-            "per_address"
-        } else {
-            open.total += 1;
-            open.by_address.insert(address, taken + 1);
-            self.prometheus.connections.inc();
-            return Some(Place { address, acceptor: self.clone() });
+    fn reserve(&self, peer: SocketAddr) -> Option<OpenConnection> {
+        let address = peer.ip();
+        let reason = match self.places.take(address) {
+            Ok(place) => return Some(OpenConnection::new(place, self.prometheus.connections.clone())),
+            Err(Full::Total) => "total",
+            Err(Full::Address) => "per_address",
         };
-        drop(open);
         self.prometheus.connections_refused.of(reason).inc();
         if let Some(unreported) = self.log_limiter.due(address) {
-            let (per_address, total) = (self.per_address, self.total);
+            let (per_address, total) = (self.limits.connections_per_address(), self.limits.max_connections());
             tracing::warn!(%address, unreported, per_address, total, "connection refused: too many");
         }
         None
     }
 
     /// Makes the TLS handshake where TLS is on. `None` if it fails.
-    async fn handshake(self, stream: TcpStream, place: Place) -> Option<Connection> {
-        let info = stream.connect_info();
+    async fn handshake(self, stream: TcpStream, peer: SocketAddr, open: OpenConnection) -> Option<Connection> {
+        let mut peer = Peer::new(peer, &self.limits);
         // A failure costs latency and nothing else.
         let _ = stream.set_nodelay(true);
-        let stream: Pin<Box<dyn Socket>> = match &self.tls {
-            None => Box::pin(stream),
-            Some(tls) => {
-                let handshake = tls.acceptor().accept(stream).into_fallible();
-                let (error, stream) = match tokio::time::timeout(HANDSHAKE, handshake).await {
-                    Ok(Ok(stream)) => return Some(Connection::new(Box::pin(stream), info, place)),
-                    Ok(Err((error, stream))) => (error, Some(stream)),
-                    Err(_) => (io::ErrorKind::TimedOut.into(), None),
-                };
-                self.prometheus.connections_refused.of("tls").inc();
-                if let Some(unreported) = self.log_limiter.due(place.address) {
-                    tracing::warn!(address = %place.address, unreported, "the TLS handshake failed: {error}");
-                }
-                if let Some(stream) = stream {
-                    let _ = tokio::time::timeout(ALERT_TIMEOUT, close_gently(stream)).await;
-                }
-                return None;
+        let Some(tls) = &self.tls else { return Some(Connection::new(Box::pin(stream), peer, open)) };
+        let handshake = tls.acceptor().accept(stream).into_fallible();
+        let (error, stream) = match tokio::time::timeout_at(peer.authenticates_until(), handshake).await {
+            Ok(Ok(stream)) => {
+                let certificate = stream.get_ref().1.peer_certificates().and_then(<[_]>::first);
+                peer.owner = certificate.and_then(peer::owner);
+                return Some(Connection::new(Box::pin(stream), peer, open));
             }
+            Ok(Err((error, stream))) => (error, Some(stream)),
+            Err(_) => (io::ErrorKind::TimedOut.into(), None),
         };
-        Some(Connection::new(stream, info, place))
+        self.prometheus.connections_refused.of("tls").inc();
+        let address = peer.address.ip();
+        if let Some(unreported) = self.log_limiter.due(address) {
+            tracing::warn!(%address, unreported, "the TLS handshake failed: {error}");
+        }
+        if let Some(stream) = stream {
+            let _ = tokio::time::timeout(ALERT_TIMEOUT, close_gently(stream)).await;
+        }
+        None
     }
 }
 
@@ -148,24 +125,23 @@ async fn close_gently(mut stream: TcpStream) -> io::Result<()> {
     Ok(())
 }
 
-/// A connection among those that the limits allow. Its drop frees the place.
+/// A connection among those that the limits allow, and that are counted. Its drop frees the place.
 #[derive(Debug)]
-struct Place {
-    address: IpAddr,
-    acceptor: Acceptor,
+struct OpenConnection {
+    open: Gauge,
+    _place: Place,
 }
 
-impl Drop for Place {
+impl OpenConnection {
+    fn new(place: Place, open: Gauge) -> Self {
+        open.inc();
+        Self { open, _place: place }
+    }
+}
+
+impl Drop for OpenConnection {
     fn drop(&mut self) {
-        self.acceptor.prometheus.connections.dec();
-        let mut open = self.acceptor.open.lock();
-        open.total -= 1;
-        if let Some(connections) = open.by_address.get_mut(&self.address) {
-            *connections -= 1;
-            if *connections == 0 {
-                open.by_address.remove(&self.address);
-            }
-        }
+        self.open.dec();
     }
 }
 
@@ -176,38 +152,37 @@ impl<T: AsyncRead + AsyncWrite + Send> Socket for T {}
 /// An accepted connection, with TLS or without.
 pub(super) struct Connection {
     stream: Pin<Box<dyn Socket>>,
-    /// Until the peer has sent the HTTP/2 preface: the bytes that are missing, and the time limit.
-    preface: Option<(usize, Pin<Box<Sleep>>)>,
-    info: TcpConnectInfo,
-    _place: Place,
+    peer: Peer,
+    /// Wakes the connection when it may have to close.
+    deadline: Pin<Box<Sleep>>,
+    _open: OpenConnection,
 }
 
 impl Connection {
-    fn new(stream: Pin<Box<dyn Socket>>, info: TcpConnectInfo, place: Place) -> Self {
-        let preface = Some((PREFACE, Box::pin(tokio::time::sleep(HANDSHAKE))));
-        Self { stream, preface, info, _place: place }
+    fn new(stream: Pin<Box<dyn Socket>>, peer: Peer, open: OpenConnection) -> Self {
+        let deadline = Box::pin(tokio::time::sleep_until(peer.authenticates_until()));
+        Self { stream, peer, deadline, _open: open }
     }
 }
 
 impl Connected for Connection {
-    type ConnectInfo = TcpConnectInfo;
+    type ConnectInfo = Peer;
 
-    fn connect_info(&self) -> TcpConnectInfo {
-        self.info.clone()
+    fn connect_info(&self) -> Peer {
+        self.peer.clone()
     }
 }
 
 impl AsyncRead for Connection {
+    /// An error when the peer must have authenticated itself by now, or when the connection is too old.
     fn poll_read(mut self: Pin<&mut Self>, context: &mut Context<'_>, into: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        let before = into.filled().len();
         let read = self.stream.as_mut().poll_read(context, into);
-        if let Some((missing, deadline)) = &mut self.preface {
-            *missing = missing.saturating_sub(into.filled().len() - before);
-            if *missing == 0 {
-                self.preface = None;
-            } else if deadline.as_mut().poll(context).is_ready() {
+        while self.deadline.as_mut().poll(context).is_ready() {
+            let closes_at = self.peer.closes_at(LINGER);
+            if closes_at <= Instant::now() {
                 return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
             }
+            self.deadline.as_mut().reset(closes_at);
         }
         read
     }

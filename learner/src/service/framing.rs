@@ -38,6 +38,6 @@
 
 mod messages;
 pub(super) mod parameters;
-mod response;
+pub(super) mod response;
 pub(super) mod router;
 pub(super) mod unrolls;

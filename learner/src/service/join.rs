@@ -1,8 +1,7 @@
 //! `Join`: which actors are accepted, and what they are told.
 
-use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::v1::{self, Environments, JoinReply, JoinRequest};
@@ -11,11 +10,17 @@ use comic_replay::Batcher;
 use tonic::Status;
 
 use super::assignments::{Assignment, Assignments, Denied};
-use super::roster::{Joined, Roster, superseded};
+use super::peer::{Owner, Peer};
+use super::roster::{Joined, Name, Roster, superseded};
 use super::shutdown::Shutdown;
 use crate::error::{Error, Result};
 use crate::observe::prometheus::Prometheus;
+use crate::quota::Quota;
 
+/// Joins under one name at once, and then one in each interval. An actor that loses its connection again and again waits longer.
+const JOINS_AT_ONCE: u32 = 30;
+/// See [`JOINS_AT_ONCE`].
+const JOIN_INTERVAL: Duration = Duration::from_secs(2);
 /// Bytes of an actor's name, as many as a host's name can have.
 const NAME_LIMIT: usize = 253;
 
@@ -66,20 +71,29 @@ pub(super) struct Join {
     pub(super) prometheus: Arc<Prometheus>,
     /// The learner epoch.
     pub(super) epoch: u64,
+    /// Limits the joins under each name.
+    pub(super) joins: Quota<String>,
+}
+
+/// The limit on the joins under each name.
+pub(super) fn joins() -> Quota<String> {
+    Quota::new(JOINS_AT_ONCE, JOIN_INTERVAL)
 }
 
 /// A refusal: the value of the label `result` under which `comic_joins` counts it, and the status.
 struct Refusal(&'static str, Status);
 
 impl Join {
-    /// Answers a request of an actor at this address, and counts the answer.
-    pub(super) fn answer(&self, request: &JoinRequest, peer: Option<SocketAddr>) -> Result<JoinReply, Status> {
-        let answer = self.check(request).and_then(|()| self.accept(request));
+    /// Answers a request on the connection of this peer, and counts the answer.
+    pub(super) fn answer(&self, request: &JoinRequest, peer: Option<&Peer>) -> Result<JoinReply, Status> {
+        let owner = peer.and_then(|peer| peer.owner);
+        let answer = self.check(request).and_then(|()| self.accept(request, owner));
         let result = answer.as_ref().map_or_else(|Refusal(result, _)| *result, |_| "joined");
         self.prometheus.joins.of(result).inc();
         if let Ok(JoinReply { actor, .. }) = &answer {
             let incarnation = format_args!("{:016x}", request.incarnation);
-            tracing::info!(actor, incarnation, peer = ?peer, "actor joined");
+            let address = peer.map(|peer| peer.address);
+            tracing::info!(actor, incarnation, peer = ?address, "actor joined");
         }
         answer.map_err(|Refusal(_, status)| status)
     }
@@ -101,6 +115,14 @@ impl Join {
             );
             return Err(Refusal("refused", Status::invalid_argument(status)));
         }
+        if !name.is_empty() && !self.joins.take(name.clone()) {
+            let per_minute = 60 / JOIN_INTERVAL.as_secs();
+            let status = format!(
+                "more than {per_minute} joins a minute under the name `{name}`: is another actor running under it, or does \
+                 this one crash?"
+            );
+            return Err(Refusal("limited", Status::resource_exhausted(status)));
+        }
         // The epochs and versions of another run belong to other policies.
         if run.is_some_and(|run| run != self.terms.run) {
             let status = "another run has begun here since: start the actor again";
@@ -115,15 +137,20 @@ impl Join {
         Ok(())
     }
 
-    fn accept(&self, request: &JoinRequest) -> Result<JoinReply, Refusal> {
+    fn accept(&self, request: &JoinRequest, owner: Option<Owner>) -> Result<JoinReply, Refusal> {
         let JoinRequest { incarnation, actor, acknowledged, ref name, .. } = *request;
-        match self.roster.join(incarnation, name, actor, Instant::now()) {
+        match self.roster.join(incarnation, Name { text: name, owner }, actor, Instant::now()) {
             Joined::Welcome => {}
             Joined::Full => {
                 let status = "there are as many actors as --max-actors allows: try again later";
                 return Err(Refusal("full", Status::resource_exhausted(status)));
             }
             Joined::Superseded => return Err(Refusal("refused", superseded())),
+            Joined::Foreign => {
+                let status =
+                    format!("the name `{name}` belongs to an actor with another certificate: choose another --name");
+                return Err(Refusal("refused", Status::permission_denied(status)));
+            }
         }
         let stand_by = |_: &Refusal| self.roster.stand_by(incarnation);
         let environments = self.environments(request).inspect_err(stand_by)?;
@@ -132,7 +159,14 @@ impl Join {
             .map_err(|refused| Refusal("refused", Status::failed_precondition(refused.to_string())))
             .inspect_err(stand_by)?;
         self.roster.set_index(incarnation, joined.actor);
-        let next_sequence = self.batcher.catch_up(joined.actor, acknowledged);
+        let next_sequence = self.batcher.catch_up(joined.actor, acknowledged).ok_or_else(|| {
+            let status = format!(
+                "the learner cannot have lost all unrolls before number {acknowledged}, which this actor had acknowledged: \
+                 start the actor again"
+            );
+            Refusal("refused", Status::failed_precondition(status))
+        });
+        let next_sequence = next_sequence.inspect_err(stand_by)?;
         // In lockstep the seed belongs to the environments and not to the actor that simulates them.
         let index = if environments.is_some() { self.epoch } else { joined.actor };
         Ok(JoinReply {

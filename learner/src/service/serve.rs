@@ -20,6 +20,8 @@ use crate::error::{Error, Result};
 
 /// How long the server waits for its streams to end. After it, a connection whose peer reads nothing is abandoned.
 const GRACE: Duration = Duration::from_secs(1);
+/// Bytes of the largest request for the health, which names a service. Anybody may send it.
+const HEALTH_MESSAGE: usize = 1024;
 /// The services whose health is reported: the whole server, and the learner's.
 const HEALTH: [&str; 2] = ["", "comic.v1.Learner"];
 
@@ -31,13 +33,14 @@ pub async fn serve(listener: TcpListener, service: Service, shutdown: impl Futur
     let gate = &service.gate;
     let calls = LearnerServer::from_arc(service.calls.clone()).max_decoding_message_size(gate.message_limit);
     let (reporter, health) = tonic_health::server::health_reporter();
+    let health = health.max_decoding_message_size(HEALTH_MESSAGE);
     reporter.set_serving::<LearnerServer<Calls>>().await;
     let reflection = tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
         .build_v1()
         .map_err(|error| Error::Defect(format!("the protocol's descriptors are damaged: {error}")))?;
-    let authorisation = AuthorisationLayer::new(gate.tokens.clone(), gate.limits.max_requests, gate.prometheus.clone());
+    let authorisation = AuthorisationLayer::new(gate.tokens.clone(), &gate.limits, gate.prometheus.clone());
     let acceptor = Acceptor::new(gate.tls.clone(), &gate.limits, gate.prometheus.clone());
     let mut closing = service.shutdown.closing();
     let server = server(gate.window)

@@ -262,7 +262,7 @@ fn write_evaluated(store: &Store, updates: u64) {
 }
 
 fn judge(store: &Store, updates: u64, normalised_reward: f64) -> Judgement {
-    store.judge(Evaluated { run: Some(RUN), epoch: 3, updates, normalised_reward }).unwrap()
+    store.judge(Evaluated { run: RUN, epoch: 3, updates, normalised_reward }).unwrap()
 }
 
 #[test]
@@ -304,13 +304,12 @@ fn the_record_of_the_best_survives_a_crash_while_it_is_written() {
 fn an_evaluation_of_a_removed_checkpoint_or_of_another_epoch_or_run_changes_nothing() {
     let (run, store) = evaluated_run(&[10, 20, 30]);
     assert_eq!(judge(&store, 10, 0.9), Judgement::Gone);
-    for (run, epoch) in [(None, 2), (Some(RUN), 2), (Some(RUN + 1), 3)] {
+    for (run, epoch) in [(RUN, 2), (RUN + 1, 3)] {
         let evaluated = Evaluated { run, epoch, updates: 30, normalised_reward: 0.9 };
         assert_eq!(store.judge(evaluated).unwrap(), Judgement::Gone, "{evaluated:?}");
     }
     assert!(!run.path().join("checkpoints/best.json").exists());
-    // A report without the run's number.
-    let evaluated = Evaluated { run: None, epoch: 3, updates: 30, normalised_reward: 0.9 };
+    let evaluated = Evaluated { run: RUN, epoch: 3, updates: 30, normalised_reward: 0.9 };
     assert_eq!(store.judge(evaluated).unwrap(), Judgement::Best(Name::Updates(30)));
 }
 

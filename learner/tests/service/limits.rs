@@ -5,23 +5,25 @@
 use std::io::ErrorKind;
 use std::time::Duration;
 
-use crate::support::{EPOCH, World, joining, within};
+use crate::support::{EPOCH, RUN, World, joining, within};
 use comic_learner::publish::Publisher;
 use comic_learner::security::{ConnectionLimits, Security};
 use comic_learner::service::quarantine::QuarantineArguments;
 use comic_learner::service::{Service, Setup};
 use comic_proto::v1::learner_client::LearnerClient;
-use comic_proto::v1::{EvaluationReport, StatusRequest};
+use comic_proto::v1::{EvaluationReport, StatusRequest, Verdict};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 use tonic::Code;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_client::HealthClient;
 
 const LIMIT: Duration = Duration::from_secs(10);
 
 #[tokio::test]
 async fn connections_from_one_address() {
     let world =
-        World::limited(ConnectionLimits { max_connections_per_address: 2, ..ConnectionLimits::default() }).await;
+        World::limited(ConnectionLimits { max_connections_per_address: Some(2), ..ConnectionLimits::default() }).await;
     let (mut first, mut second) = (world.client().await, world.client().await);
     first.get_status(StatusRequest {}).await.unwrap();
     second.get_status(StatusRequest {}).await.unwrap();
@@ -46,20 +48,47 @@ async fn connections_from_one_address() {
     within(LIMIT, again).await;
 }
 
-/// A silent connection would keep a place that others need.
+/// Such a connection would keep a place that others need.
 #[tokio::test]
-async fn connections_that_stay_silent() {
-    let world = World::start().await;
+async fn connections_without_an_accepted_call() {
+    let authentication_timeout = Duration::from_secs(1);
+    let world = World::limited(ConnectionLimits { authentication_timeout, ..ConnectionLimits::default() }).await;
+    let mut actor = world.actor(70).await;
     let address = world.address.trim_start_matches("http://");
     let falls_silent_after = async |word: &[u8]| {
         let mut silent = TcpStream::connect(address).await.unwrap();
         silent.write_all(word).await.unwrap();
         let mut said = Vec::new();
         // The learner sends its settings and then closes.
-        let ended = within(3 * LIMIT, silent.read_to_end(&mut said)).await;
+        let ended = within(LIMIT, silent.read_to_end(&mut said)).await;
         assert!(ended.is_ok() || ended.is_err_and(|error| error.kind() == ErrorKind::ConnectionReset));
     };
-    tokio::join!(falls_silent_after(b""), falls_silent_after(b"PRI * HTTP/2.0"));
+    let only_checks_the_health = async {
+        let mut health = HealthClient::new(world.channel().await);
+        while health.check(HealthCheckRequest::default()).await.is_ok() {}
+    };
+    tokio::join!(falls_silent_after(b""), falls_silent_after(b"PRI * HTTP/2.0"), within(LIMIT, only_checks_the_health));
+    actor.client.get_status(StatusRequest {}).await.expect("an older connection with an accepted call stays");
+}
+
+/// Otherwise a peer whose certificate is no longer accepted would stay connected for ever.
+#[tokio::test]
+async fn the_age_of_connections() {
+    let max_connection_age = Duration::from_secs(2);
+    let world = World::limited(ConnectionLimits { max_connection_age, ..ConnectionLimits::default() }).await;
+    let mut actor = world.actor(70).await;
+    let (mut watch, mut unrolls) = (actor.watch().await, actor.stream().await);
+    assert_eq!(unrolls.verdict(actor.unroll(0)).await, Verdict::Taken);
+    // A stream ends with the reason, so that no unroll is sent in vain.
+    for ended in [within(LIMIT, watch.message()).await.map(drop), within(LIMIT, unrolls.acks.message()).await.map(drop)]
+    {
+        let ended = ended.unwrap_err();
+        assert_eq!(ended.code(), Code::Unavailable, "the actor connects again");
+        assert!(ended.message().contains("--max-connection-age"), "{ended}");
+    }
+    assert_eq!(actor.client.get_status(StatusRequest {}).await.unwrap_err().code(), Code::Unavailable);
+    let mut again = world.actor(70).await;
+    assert_eq!(again.stream().await.verdict(again.unroll(1)).await, Verdict::Taken);
 }
 
 #[tokio::test]
@@ -93,6 +122,7 @@ async fn bytes_of_a_message() {
         World::limited(ConnectionLimits { max_message_bytes: Some(64 * 1024), ..ConnectionLimits::default() }).await;
     let mut client = world.client().await;
     let report = |bytes| EvaluationReport {
+        run: Some(RUN),
         learner_epoch: EPOCH,
         json: format!("\"{}\"", "x".repeat(bytes)),
         ..EvaluationReport::default()

@@ -14,6 +14,7 @@ mod parameters;
 mod room;
 mod shutdown;
 mod status;
+mod strangers;
 mod support;
 mod tls;
 mod token;

@@ -37,7 +37,7 @@ async fn reported_evaluations_wait_for_the_trainer_in_order_and_in_limited_numbe
     }
     assert_eq!(client.report_evaluation(report(4)).await.unwrap_err().code(), Code::ResourceExhausted);
     let evaluation = |version| Evaluation {
-        run: Some(RUN),
+        run: RUN,
         epoch: EPOCH,
         version,
         updates: 7,
@@ -54,7 +54,7 @@ async fn reported_evaluations_wait_for_the_trainer_in_order_and_in_limited_numbe
 async fn a_report_that_is_no_json_is_refused() {
     let world = World::start().await;
     let json = "{broken".into();
-    let report = EvaluationReport { learner_epoch: EPOCH, json, ..EvaluationReport::default() };
+    let report = EvaluationReport { run: Some(RUN), learner_epoch: EPOCH, json, ..EvaluationReport::default() };
     let refused = world.client().await.report_evaluation(report).await.unwrap_err();
     assert_eq!(refused.code(), Code::InvalidArgument);
     assert!(world.service.trainer().take_evaluations().is_empty());

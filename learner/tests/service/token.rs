@@ -3,8 +3,9 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::path::Path;
+use std::time::Duration;
 
-use crate::support::World;
+use crate::support::{World, joining, parameters, within};
 use comic_learner::security::{Security, Tokens};
 use comic_proto::Access;
 use comic_proto::v1::{JoinRequest, StatusRequest, WatchRequest};
@@ -60,6 +61,48 @@ async fn a_renewed_token_takes_effect_without_a_restart() {
     assert!(second.get_status(StatusRequest {}).await.is_ok());
     std::fs::write(&accepted, "second").unwrap();
     assert!(first.get_status(StatusRequest {}).await.is_err());
+}
+
+/// Who deletes a file of tokens wants nobody to enter with them.
+#[tokio::test]
+async fn a_token_file_that_is_gone_or_unusable_refuses_everybody_until_it_is_there_again() {
+    let directory = tempfile::tempdir().unwrap();
+    let accepted = directory.path().join("accepted");
+    std::fs::write(&accepted, "open-sesame").unwrap();
+    let world = world(&accepted).await;
+    let mut client = world.client_with(&access(directory.path(), "open-sesame")).await.unwrap();
+    let spoilt: [&dyn Fn(); 3] =
+        [&|| std::fs::remove_file(&accepted).unwrap(), &|| std::fs::write(&accepted, "").unwrap(), &|| {
+            std::fs::write(&accepted, [0xff; 8]).unwrap()
+        }];
+    for spoil in spoilt {
+        spoil();
+        let refused = client.get_status(StatusRequest {}).await.unwrap_err();
+        assert_eq!(refused.code(), Code::Unauthenticated);
+        std::fs::write(&accepted, "open-sesame").unwrap();
+        client.get_status(StatusRequest {}).await.unwrap();
+    }
+}
+
+#[tokio::test]
+async fn streams_end_when_their_token_is_withdrawn() {
+    let directory = tempfile::tempdir().unwrap();
+    let accepted = directory.path().join("accepted");
+    std::fs::write(&accepted, "withdrawn\nkept").unwrap();
+    let world = world(&accepted).await;
+    let mut streams = Vec::new();
+    for (incarnation, token) in [(70, "withdrawn"), (71, "kept")] {
+        let mut client = world.client_with(&access(directory.path(), token)).await.unwrap();
+        let actor = client.join(joining(incarnation)).await.unwrap().into_inner().actor;
+        let request = WatchRequest { actor, incarnation };
+        streams.push(client.watch_parameters(request).await.unwrap().into_inner());
+    }
+    let [withdrawn, kept] = &mut streams[..] else { panic!("two streams") };
+    std::fs::write(&accepted, "kept").unwrap();
+    let ended = within(Duration::from_secs(30), withdrawn.message()).await.unwrap_err();
+    assert_eq!(ended.code(), Code::Unauthenticated);
+    world.publisher.publish(1, &parameters(1, 100));
+    assert!(within(Duration::from_secs(30), kept.message()).await.unwrap().is_some());
 }
 
 #[tokio::test]

@@ -41,11 +41,12 @@ impl<'a> Connection<'a> {
     pub(super) async fn open(actors: &'a Actors, index: usize, identity: &mut Identity) -> Result<Self> {
         let Crowd { window, watch, kind, tls, host, .. } = &actors.options;
         let Identity { actor, incarnation, .. } = *identity;
-        let ca = tls.as_ref().map(|directory| directory.join("ca.pem"));
-        let scheme = if ca.is_some() { "https" } else { "http" };
-        let endpoint = Access { ca, ..Access::default() }.lasting_endpoint(&format!("{scheme}://{host}"))?;
+        let file = |name: &str| tls.as_ref().map(|directory| directory.join(name));
+        let access = Access { ca: file("ca.pem"), token_file: file("token"), ..Access::default() };
+        let scheme = if tls.is_some() { "https" } else { "http" };
+        let endpoint = access.lasting_endpoint(&format!("{scheme}://{host}"))?;
         let permit = actors.connecting.acquire().await?;
-        let mut client = LearnerClient::new(endpoint.connect().await?);
+        let mut client = LearnerClient::with_interceptor(endpoint.connect().await?, access.bearer()?);
         let reply = match kind {
             Kind::Grpc => {
                 let request = JoinRequest { incarnation, actor, protocol: PROTOCOL_VERSION, ..JoinRequest::default() };

@@ -29,7 +29,8 @@ pub(super) fn respond(frames: impl Stream<Item = Result<Bytes, Status>> + Send +
     response
 }
 
-fn trailers(status: &Status) -> HeaderMap {
+/// The trailers that end a stream with this status.
+pub(in crate::service) fn trailers(status: &Status) -> HeaderMap {
     let mut trailers = HeaderMap::new();
     // It cannot fail: the text is percent-encoded, and the learner's statuses have no details.
     let _ = status.add_header(&mut trailers);
