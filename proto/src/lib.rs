@@ -7,6 +7,7 @@
 //! - [`PerField`] is an array with one value for each field.
 //! - [`UnrollBuffer`] is an unroll that an actor writes.
 //! - [`ReceivedUnroll`] is an unroll that a learner has received, in the [`Pieces`] of the network.
+//! - [`frame`](frame()) encodes a message with gRPC's prefix, and a [`FrameReader`] finds messages in received bytes.
 //! - [`Access`] is a client's access to a learner: URL, TLS, and [`Token`].
 //! - [`validate()`] checks a payload before it is copied into a batch.
 //!
@@ -42,7 +43,7 @@ pub use access::{Access, Authorised, Bearer, Client, FRAME_BYTES, chain, distrus
 pub use access_error::AccessError;
 pub use buffer::UnrollBuffer;
 pub use field::Field;
-pub use frame::frame;
+pub use frame::{FrameError, FrameReader, frame};
 pub use layout::UnrollLayout;
 pub use per_field::PerField;
 pub use pieces::{Malformed, Pieces, ReceivedUnroll};

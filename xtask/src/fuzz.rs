@@ -1,8 +1,9 @@
 //! `cargo xtask fuzz`: random bytes for everything that reads bytes from outside, guided by the code that they reach.
 //!
 //! libFuzzer guides. rustc's own options compile its counters in, so the stable toolchain is enough. The crates are built
-//! for this in a directory of their own. Seeds are valid files of the present formats, which each target writes. Inputs
-//! that reach new code are kept in `target/fuzz/corpus`, where the next run starts.
+//! for this in a directory of their own. Seeds are valid files of the present formats, which each target writes.
+//! `tests/fuzz/corpus` has a few inputs that reach more; they are part of the repository. Inputs that reach new code are kept
+//! in `target/fuzz/corpus`, where the next run starts.
 
 use std::fs;
 use std::path::PathBuf;
@@ -22,6 +23,9 @@ pub(crate) struct Options {
     /// Minutes for each target
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     minutes: u64,
+    /// Do not fuzz: add the kept inputs that reach new code, but are not large, to the corpus of the repository
+    #[arg(long)]
+    merge: bool,
 }
 
 #[derive(Clone, Copy, Debug, clap::ValueEnum)]
@@ -38,6 +42,10 @@ enum Target {
     Clips,
     /// Saved tables of a replay
     Table,
+    /// Messages in the frames of a connection
+    Frames,
+    /// Exported policies and low levels
+    Exported,
 }
 
 /// Coverage counters for libFuzzer: what `-fsanitize=fuzzer-no-link` does in clang.
@@ -53,6 +61,8 @@ const COUNTERS: [&str; 7] = [
 const HOST: &str = "x86_64-unknown-linux-gnu";
 /// The limit of resident memory. libtorch alone needs a few hundred.
 const MEGABYTES: usize = 2048;
+/// The longest input that `--merge` adds to the repository, bytes.
+const LONGEST_COMMITTED: usize = 4096;
 /// An input takes less than a second; the machine may be busy.
 const SECONDS_OF_AN_INPUT: usize = 20;
 
@@ -75,10 +85,18 @@ pub(crate) fn fuzz(options: &Options) -> Result<()> {
             Ok(path)
         };
         let (seeds, corpus, findings) = (made("seeds")?, made("corpus")?, made("findings")?);
+        let committed = root().join("tests/fuzz/corpus").join(&name);
+        fs::create_dir_all(&committed).with_context(|| format!("cannot make {}", committed.display()))?;
         run(Command::new(&program).arg("-runs=0").env("COMIC_FUZZ_SEEDS", &seeds))?;
+        if options.merge {
+            let mut merge = Command::new(&program);
+            merge.args(["-merge=1", &format!("-max_len={LONGEST_COMMITTED}")]).args([&committed, &corpus]);
+            run(merge.env("OMP_NUM_THREADS", "1").current_dir(root()))?;
+            continue;
+        }
         eprintln!("fuzzing {name} for {} minutes", options.minutes);
         let mut fuzzer = Command::new(&program);
-        fuzzer.args([&corpus, &seeds]).args([
+        fuzzer.args([&corpus, &seeds, &committed]).args([
             format!("-max_total_time={}", 60 * options.minutes),
             format!("-rss_limit_mb={MEGABYTES}"),
             format!("-timeout={SECONDS_OF_AN_INPUT}"),

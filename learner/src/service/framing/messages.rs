@@ -9,8 +9,8 @@ use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
-use bytes::{Buf as _, Bytes};
-use comic_proto::Pieces;
+use bytes::Bytes;
+use comic_proto::{FrameError, FrameReader, Pieces};
 use http_body::{Body as _, Frame};
 use http_body_util::BodyExt as _;
 use prometheus_client::metrics::counter::Counter;
@@ -21,9 +21,6 @@ use tonic::body::Body;
 
 use crate::service::room::{Room, Taken};
 
-/// Bytes before a message ("gRPC over HTTP2", Length-Prefixed-Message): one that says whether the message is compressed, and
-/// four with its length, big-endian.
-const PREFIX: usize = 5;
 /// How long a message that has begun may keep room for which others wait.
 const TIME_LIMIT: Duration = Duration::from_secs(10);
 
@@ -40,9 +37,7 @@ pub(super) enum Broken {
 #[derive(Debug)]
 pub(super) struct Messages {
     body: Body,
-    arrived: Pieces,
-    /// Bytes of the message that is arriving, when its prefix is there.
-    length: Option<usize>,
+    frames: FrameReader,
     /// Bytes of the largest message. The message takes this much room until its length is known.
     limit: u32,
     room: PollSemaphore,
@@ -53,46 +48,35 @@ pub(super) struct Messages {
 
 impl Messages {
     pub(super) fn new(body: Body, limit: usize, room: &Room) -> Self {
+        let frames = FrameReader::new(limit);
         let limit = u32::try_from(limit).unwrap_or(u32::MAX);
-        Self {
-            body,
-            arrived: Pieces::default(),
-            length: None,
-            limit,
-            room: room.free(),
-            late: room.late(),
-            taken: None,
-        }
+        Self { body, frames, limit, room: room.free(), late: room.late(), taken: None }
     }
 
     /// The next message and its room; `None` after the last message. A message that came in the last frame of another one has
     /// no room of its own; such messages are never larger than a frame. Cancel-safe: what has arrived is kept.
     pub(super) async fn next(&mut self) -> Result<Option<(Pieces, Option<Taken>)>, Broken> {
         loop {
-            if let Some(message) = self.take_whole().map_err(Broken::Protocol)? {
+            if let Some(message) = self.frames.next_message().map_err(broken)? {
                 let taken = self.taken.take().map(|(mut taken, _)| {
                     taken.split(taken.num_permits().saturating_sub(message.len()));
                     taken
                 });
                 return Ok(Some((message, taken)));
             }
-            let frame = match self.has_begun() {
+            let frame = match self.frames.has_begun() {
                 true => self.read_on().await?,
                 false => poll_fn(|context| self.poll_begin(context)).await,
             };
             match frame {
-                Some(Ok(frame)) => frame.into_data().into_iter().for_each(|data| self.arrived.push(data)),
+                Some(Ok(frame)) => frame.into_data().into_iter().for_each(|data| self.frames.push(data)),
                 Some(Err(error)) => return Err(Broken::Connection(error)),
-                None if self.has_begun() => {
+                None if self.frames.has_begun() => {
                     return Err(Broken::Protocol(Status::internal("the stream ended inside a message")));
                 }
                 None => return Ok(None),
             }
         }
-    }
-
-    fn has_begun(&self) -> bool {
-        !self.arrived.is_empty() || self.length.is_some()
     }
 
     /// Asks for the first bytes of a message. The message has room before its bytes are read, and gives the room back while
@@ -117,7 +101,7 @@ impl Messages {
         }
         // `None` only if the semaphore was closed, which never happens.
         let Some((taken, deadline)) = &mut self.taken else { return Ok(self.body.frame().await) };
-        if let Some(length) = self.length {
+        if let Some(length) = self.frames.length() {
             taken.split(taken.num_permits().saturating_sub(length));
         }
         loop {
@@ -134,27 +118,11 @@ impl Messages {
             }
         }
     }
+}
 
-    /// Takes the next message from what has arrived, if all of it is there.
-    fn take_whole(&mut self) -> Result<Option<Pieces>, Status> {
-        let length = match self.length {
-            Some(length) => length,
-            None => {
-                let Some(mut prefix) = self.arrived.split_to(PREFIX) else { return Ok(None) };
-                if prefix.get_u8() != 0 {
-                    return Err(Status::internal("the message is compressed, but the request names no encoding"));
-                }
-                let (length, limit) = (prefix.get_u32() as usize, self.limit as usize);
-                if length > limit {
-                    return Err(Status::out_of_range(format!("a message of {length} bytes, the limit is {limit}")));
-                }
-                *self.length.insert(length)
-            }
-        };
-        let message = self.arrived.split_to(length);
-        if message.is_some() {
-            self.length = None;
-        }
-        Ok(message)
-    }
+fn broken(error: FrameError) -> Broken {
+    Broken::Protocol(match error {
+        FrameError::Compressed => Status::internal(error.to_string()),
+        FrameError::Long { .. } => Status::out_of_range(error.to_string()),
+    })
 }
