@@ -54,8 +54,8 @@ pub struct Unroll {
     /// B: unrolls in a batch (S).
     pub batch: usize,
     /// Most updates since newer parameters than an unroll's were published. An older unroll is dropped as stale. Counted in
-    /// whole versions, rounded up: V-MPO publishes one every `vmpo.target_period` updates. 400 are four versions of the paper's,
-    /// one more than 99 % of the unrolls were late with 4000 actors (D; docs/capacity.md). SVG(0) learns from a replay and has no
+    /// whole versions, rounded up: V-MPO publishes one every `vmpo.target_period` updates. 400 are four versions of the paper's;
+    /// with 4000 actors, 99 % of the versions were at most three late (D; docs/capacity.md). SVG(0) learns from a replay and has no
     /// limit.
     pub max_staleness: u64,
     /// Batches that are assembled while the learner trains on one: 1 keeps the device busy (D), 0 keeps the experience new.

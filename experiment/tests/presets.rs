@@ -83,7 +83,7 @@ fn every_preset_is_in_the_list_of_the_documentation() {
 
 /// docs/capacity.md, "How old an unroll may be", has the measured ages.
 #[test]
-fn every_preset_drops_what_is_older_than_any_unroll_of_a_healthy_run_and_nothing_younger() {
+fn every_preset_limits_the_age_of_unrolls_as_docs_capacity_says() {
     for (name, _) in presets::ALL {
         let preset = preset(name);
         let (updates, versions) = match (preset.algorithm, preset.vmpo.target_period) {

@@ -53,7 +53,7 @@ impl Places {
 }
 
 /// What counts as one address. A host with IPv6 has a whole network of 64 bits (RFC 4291, 2.5.4).
-fn network(address: IpAddr) -> IpAddr {
+pub(crate) fn network(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V6(address) => Ipv6Addr::from_bits(address.to_bits() >> 64 << 64).into(),
         address => address,

@@ -88,7 +88,13 @@ class Policy:
             inputs.append(torch.as_tensor(image).reshape(len(rows), self._image))
         inputs.append(memory)
         with torch.inference_mode():
-            output = self._module(*inputs)
+            try:
+                output = self._module(*inputs)
+            except RuntimeError as error:
+                if not self._image:
+                    raise
+                # Until 0.1.0 a module took the image last.
+                raise _native.Error(f"the policy cannot act: export it again with this release ({error})") from error
         actions, self._memory = output[:, : -self._memory_size or None], output[:, -self._memory_size :]
         numbers: npt.NDArray[np.float32] = actions.numpy()
         return numbers if np.ndim(vector) == 2 else numbers[0]

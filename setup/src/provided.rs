@@ -30,6 +30,8 @@ pub(crate) fn directory(
     if let Err(problem) = match part {
         Part::Mujoco => check_mujoco(&directory),
         Part::Libtorch => check_libtorch(&directory),
+        // The compiler would look for it from another directory.
+        Part::DmControl if directory.is_relative() => Err("it must be an absolute path".into()),
         Part::DmControl => require(&directory, &["humanoid_CMU_V2020.xml", "humanoid_CMU_V2019.xml", "arena.xml"]),
         Part::Python => Ok(()),
     } {
@@ -119,6 +121,9 @@ mod tests {
     #[test]
     fn a_users_directory_without_the_library_is_refused_with_its_variable() {
         let own = tempfile::tempdir().unwrap();
+        let relative = |_: &str| Some("own/dm_control".into());
+        let error = directory(Part::DmControl, Path::new(".deps"), relative).unwrap_err().to_string();
+        assert!(error.contains("COMIC_DM_CONTROL_DIR=own/dm_control: it must be an absolute path"), "{error}");
         let error = directory(Part::Mujoco, Path::new(".deps"), |_| Some(own.path().into())).unwrap_err().to_string();
         assert!(error.contains("MUJOCO_DYNAMIC_LINK_DIR=") && error.contains("libmujoco.so"), "{error}");
     }

@@ -8,7 +8,9 @@ use mujoco_rs::prelude::MjEditError;
 #[non_exhaustive]
 pub enum Error {
     /// MuJoCo refused the humanoid.
-    #[error("{doing}: {reason}; the XML must be that of dm_control 1.0.49, run `cargo xtask setup`")]
+    #[error(
+        "{doing}: {reason}; this program was built with other XML than that of dm_control 1.0.49; build it again after `cargo xtask setup`"
+    )]
     Model {
         /// The step that failed.
         doing: &'static str,

@@ -63,6 +63,8 @@ async fn silent_connections(to: SocketAddr) -> Result<()> {
 }
 
 async fn silent_connection(to: SocketAddr) -> Result<()> {
+    // The two cores of this machine also train.
+    tokio::time::sleep(Duration::from_millis(20)).await;
     let socket = TcpSocket::new_v4()?;
     socket.bind(SocketAddr::from(([127, 0, 0, 2], 0)))?;
     let connection: TcpStream = socket.connect(to).await?;
@@ -75,8 +77,6 @@ async fn silent_connection(to: SocketAddr) -> Result<()> {
             _ => {}
         }
     }
-    // The two cores of this machine also train.
-    tokio::time::sleep(Duration::from_millis(20)).await;
     Ok(())
 }
 

@@ -6,7 +6,7 @@
 //! in `target/fuzz/corpus`, where the next run starts.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::{Context, Result};
@@ -61,8 +61,8 @@ const COUNTERS: [&str; 7] = [
 const HOST: &str = "x86_64-unknown-linux-gnu";
 /// The limit of resident memory. libtorch alone needs a few hundred.
 const MEGABYTES: usize = 2048;
-/// The longest input that `--merge` adds to the repository, bytes.
-const LONGEST_COMMITTED: usize = 4096;
+/// The longest input that `--merge` adds to the repository, bytes. libFuzzer would cut longer ones.
+const LONGEST_COMMITTED: u64 = 4096;
 /// An input takes less than a second; the machine may be busy.
 const SECONDS_OF_AN_INPUT: usize = 20;
 
@@ -89,8 +89,12 @@ pub(crate) fn fuzz(options: &Options) -> Result<()> {
         fs::create_dir_all(&committed).with_context(|| format!("cannot make {}", committed.display()))?;
         run(Command::new(&program).arg("-runs=0").env("COMIC_FUZZ_SEEDS", &seeds))?;
         if options.merge {
+            let small = made("small")?;
+            for folder in [&seeds, &corpus] {
+                copy_small(folder, &small)?;
+            }
             let mut merge = Command::new(&program);
-            merge.args(["-merge=1", &format!("-max_len={LONGEST_COMMITTED}")]).args([&committed, &corpus]);
+            merge.arg("-merge=1").args([&committed, &small]);
             run(merge.env("OMP_NUM_THREADS", "1").current_dir(root()))?;
             continue;
         }
@@ -108,6 +112,17 @@ pub(crate) fn fuzz(options: &Options) -> Result<()> {
             let (program, findings) = (program.display(), findings.display());
             format!("{name}: the findings are in {findings}; `{program} {findings}/FILE` runs one of them")
         })?;
+    }
+    Ok(())
+}
+
+/// Copies the files that the repository can hold.
+fn copy_small(from: &Path, to: &Path) -> Result<()> {
+    for entry in fs::read_dir(from).with_context(|| format!("cannot read {}", from.display()))? {
+        let entry = entry?;
+        if entry.metadata()?.len() <= LONGEST_COMMITTED {
+            fs::copy(entry.path(), to.join(entry.file_name()))?;
+        }
     }
     Ok(())
 }

@@ -15,8 +15,10 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinHandle;
 
-/// Connections at once, of all peers and of one address. A further one takes the place of the oldest, so that nobody keeps the
-/// places; an answer takes milliseconds.
+use crate::places;
+
+/// Connections at once, of all peers and of one address. A further one takes the place of the oldest of the address that has most,
+/// so that nobody keeps the places; an answer takes milliseconds.
 const CONNECTIONS: usize = 64;
 /// See [`CONNECTIONS`].
 const CONNECTIONS_PER_ADDRESS: usize = 16;
@@ -47,9 +49,10 @@ pub async fn serve(listener: TcpListener, probed: Arc<impl Probed>) {
     loop {
         match listener.accept().await {
             Ok((stream, peer)) => {
-                make_room(&mut connections, peer.ip());
+                let network = places::network(peer.ip());
+                make_room(&mut connections, network);
                 let answer = tokio::spawn(tokio::time::timeout(LIMIT, answer(stream, probed.clone())));
-                connections.push((peer.ip(), answer));
+                connections.push((network, answer));
             }
             Err(error) => {
                 tracing::warn!(%error, "a connection to the metrics could not be accepted");
@@ -59,16 +62,19 @@ pub async fn serve(listener: TcpListener, probed: Arc<impl Probed>) {
     }
 }
 
-/// Closes the oldest connection of this address, or of all, if they have as many as they may.
-fn make_room<T>(connections: &mut Vec<(IpAddr, JoinHandle<T>)>, address: IpAddr) {
+/// Closes the oldest connection of this network, if it has as many as it may, or of the network that has most, if all together
+/// have as many as they may.
+fn make_room<T>(connections: &mut Vec<(IpAddr, JoinHandle<T>)>, network: IpAddr) {
     connections.retain(|(_, answer)| !answer.is_finished());
-    let of_address = |(other, _): &(IpAddr, JoinHandle<T>)| *other == address;
-    let oldest = if connections.iter().filter(|connection| of_address(connection)).count() >= CONNECTIONS_PER_ADDRESS {
-        connections.iter().position(of_address)
+    let count = |network: IpAddr| connections.iter().filter(|(other, _)| *other == network).count();
+    let crowded = if count(network) >= CONNECTIONS_PER_ADDRESS {
+        Some(network)
+    } else if connections.len() >= CONNECTIONS {
+        connections.iter().map(|(other, _)| *other).max_by_key(|other| count(*other))
     } else {
-        (connections.len() >= CONNECTIONS).then_some(0)
+        None
     };
-    if let Some(oldest) = oldest {
+    if let Some(oldest) = crowded.and_then(|crowded| connections.iter().position(|(other, _)| *other == crowded)) {
         connections.remove(oldest).1.abort();
     }
 }
@@ -124,6 +130,27 @@ mod tests {
         fn silence(&self) -> Duration {
             self.0
         }
+    }
+
+    #[tokio::test]
+    async fn who_has_most_connections_makes_room() {
+        let mut connections = Vec::new();
+        let mut connect = |host: [u8; 4]| {
+            make_room(&mut connections, host.into());
+            connections.push((host.into(), tokio::spawn(std::future::pending::<()>())));
+            let count = |host: [u8; 4]| connections.iter().filter(|(other, _)| *other == IpAddr::from(host)).count();
+            (connections.len(), count([192, 0, 2, 1]), count([192, 0, 2, 2]))
+        };
+        assert_eq!(connect([192, 0, 2, 1]), (1, 1, 0), "a kubelet");
+        for _ in 0..2 * CONNECTIONS_PER_ADDRESS {
+            connect([192, 0, 2, 2]);
+        }
+        assert_eq!(connect([192, 0, 2, 2]), (1 + CONNECTIONS_PER_ADDRESS, 1, CONNECTIONS_PER_ADDRESS));
+        for host in 0..250 {
+            connect([198, 51, 100, host % 4]);
+        }
+        let (all, kubelet, _) = connect([198, 51, 100, 0]);
+        assert_eq!((all, kubelet), (CONNECTIONS, 1));
     }
 
     #[test]

@@ -225,8 +225,9 @@ impl Default for Prometheus {
             connections_refused: all.labelled(
                 "counter",
                 ("comic_connections_refused", "reason"),
-                &["per_address", "total", "tls"],
-                "Connections closed at once: beyond --max-connections-per-address, beyond the limit on all connections, or without agreement on TLS",
+                &["per_address", "total", "tls", "unauthenticated"],
+                "Connections closed: at once beyond --max-connections-per-address, beyond the limit on all connections or without \
+                 agreement on TLS; and without an accepted call within --authentication-timeout",
             ),
             requests: all.gauge("comic_requests", "Calls in flight, streams included"),
             requests_refused: all.labelled(

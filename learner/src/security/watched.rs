@@ -4,6 +4,7 @@ use std::fmt;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use comic_proto::chain;
 use parking_lot::{Mutex, MutexGuard};
@@ -12,6 +13,10 @@ use crate::error::Result;
 
 /// Identifies a state of a file: device, inode, size, and the times of its last changes.
 type Stamp = Option<[i64; 7]>;
+
+/// How soon files that could not be used are read again even if they did not change: reading may have failed for want of a file
+/// descriptor.
+const RETRY: Duration = Duration::from_secs(1);
 
 /// A value made of files. Each question checks whether they changed, which costs one `stat` for each. Nothing polls them. That
 /// changed files cannot be used is logged.
@@ -25,8 +30,8 @@ struct State<T> {
     stamps: Vec<Stamp>,
     /// The last value that could be used.
     usable: Arc<T>,
-    /// Whether it is that of the files as they are.
-    current: bool,
+    /// If it is not that of the files as they are, when they were read.
+    failed: Option<Instant>,
 }
 
 impl<T> Watched<T> {
@@ -37,14 +42,14 @@ impl<T> Watched<T> {
     pub(super) fn new(files: Vec<PathBuf>, load: impl Fn() -> Result<T> + Send + Sync + 'static) -> Result<Self> {
         // Before the files are read, so that a later change is noticed the next time.
         let stamps = stamps(&files);
-        let state = State { stamps, usable: Arc::new(load()?), current: true };
+        let state = State { stamps, usable: Arc::new(load()?), failed: None };
         Ok(Self { files, load: Box::new(load), state: Mutex::new(state) })
     }
 
     /// The value of the files as they are now; `None` if they cannot be used.
     pub(super) fn current(&self) -> Option<Arc<T>> {
         let state = self.refresh();
-        state.current.then(|| state.usable.clone())
+        state.failed.is_none().then(|| state.usable.clone())
     }
 
     /// The value of the files as they were when they could be used last.
@@ -55,17 +60,20 @@ impl<T> Watched<T> {
     fn refresh(&self) -> MutexGuard<'_, State<T>> {
         let mut state = self.state.lock();
         let stamps = stamps(&self.files);
-        if state.stamps != stamps {
+        let changed = state.stamps != stamps;
+        if changed || state.failed.is_some_and(|failed| failed.elapsed() >= RETRY) {
             state.stamps = stamps;
-            let loaded = (self.load)();
-            state.current = loaded.is_ok();
-            match loaded {
+            match (self.load)() {
                 Ok(value) => {
                     state.usable = Arc::new(value);
+                    state.failed = None;
                     tracing::info!(files = ?self.files, "changed files are in use");
                 }
                 Err(error) => {
-                    tracing::error!(files = ?self.files, "changed files cannot be used: {}", chain(&error));
+                    state.failed = Some(Instant::now());
+                    if changed {
+                        tracing::error!(files = ?self.files, "changed files cannot be used: {}", chain(&error));
+                    }
                 }
             }
         }
@@ -91,8 +99,31 @@ impl<T> fmt::Debug for Watched<T> {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicBool, Ordering};
+
     use super::*;
     use crate::error::Error;
+
+    #[test]
+    fn what_could_not_be_read_is_read_again_although_it_did_not_change() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        // As when no file descriptor is left.
+        let fails = Arc::new(AtomicBool::new(false));
+        let load = {
+            let fails = fails.clone();
+            move || if fails.load(Ordering::Relaxed) { Err(Error::configuration("unreadable")) } else { Ok(()) }
+        };
+        let watched = Watched::new(vec![file.path().to_path_buf()], load).unwrap();
+        fails.store(true, Ordering::Relaxed);
+        std::fs::write(file.path(), "new").unwrap();
+        assert!(watched.current().is_none());
+        fails.store(false, Ordering::Relaxed);
+        let until = Instant::now() + 20 * RETRY;
+        while watched.current().is_none() {
+            assert!(Instant::now() < until);
+            std::thread::yield_now();
+        }
+    }
 
     #[test]
     fn a_change_takes_effect_at_once_and_an_unusable_one_leaves_only_the_last_usable_value() {

@@ -9,7 +9,6 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use futures::stream::{self, Stream};
-use prometheus_client::metrics::gauge::Gauge;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
@@ -76,7 +75,7 @@ impl Acceptor {
     fn reserve(&self, peer: SocketAddr) -> Option<OpenConnection> {
         let address = peer.ip();
         let reason = match self.places.take(address) {
-            Ok(place) => return Some(OpenConnection::new(place, self.prometheus.connections.clone())),
+            Ok(place) => return Some(OpenConnection::new(place, self.prometheus.clone())),
             Err(Full::Total) => "total",
             Err(Full::Address) => "per_address",
         };
@@ -128,20 +127,20 @@ async fn close_gently(mut stream: TcpStream) -> io::Result<()> {
 /// A connection among those that the limits allow, and that are counted. Its drop frees the place.
 #[derive(Debug)]
 struct OpenConnection {
-    open: Gauge,
+    prometheus: Arc<Prometheus>,
     _place: Place,
 }
 
 impl OpenConnection {
-    fn new(place: Place, open: Gauge) -> Self {
-        open.inc();
-        Self { open, _place: place }
+    fn new(place: Place, prometheus: Arc<Prometheus>) -> Self {
+        prometheus.connections.inc();
+        Self { prometheus, _place: place }
     }
 }
 
 impl Drop for OpenConnection {
     fn drop(&mut self) {
-        self.open.dec();
+        self.prometheus.connections.dec();
     }
 }
 
@@ -155,13 +154,29 @@ pub(super) struct Connection {
     peer: Peer,
     /// Wakes the connection when it may have to close.
     deadline: Pin<Box<Sleep>>,
-    _open: OpenConnection,
+    open: OpenConnection,
 }
 
 impl Connection {
     fn new(stream: Pin<Box<dyn Socket>>, peer: Peer, open: OpenConnection) -> Self {
         let deadline = Box::pin(tokio::time::sleep_until(peer.authenticates_until()));
-        Self { stream, peer, deadline, _open: open }
+        Self { stream, peer, deadline, open }
+    }
+
+    /// An error when the peer must have authenticated itself by now, or when the connection is too old. Every operation checks it:
+    /// of a peer that reads nothing, HTTP/2 soon reads nothing either.
+    fn check_deadline(&mut self, context: &mut Context<'_>) -> io::Result<()> {
+        while self.deadline.as_mut().poll(context).is_ready() {
+            let closes_at = self.peer.closes_at(LINGER);
+            if closes_at <= Instant::now() {
+                if !self.peer.is_authenticated() {
+                    self.open.prometheus.connections_refused.of("unauthenticated").inc();
+                }
+                return Err(io::ErrorKind::TimedOut.into());
+            }
+            self.deadline.as_mut().reset(closes_at);
+        }
+        Ok(())
     }
 }
 
@@ -174,22 +189,15 @@ impl Connected for Connection {
 }
 
 impl AsyncRead for Connection {
-    /// An error when the peer must have authenticated itself by now, or when the connection is too old.
     fn poll_read(mut self: Pin<&mut Self>, context: &mut Context<'_>, into: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        let read = self.stream.as_mut().poll_read(context, into);
-        while self.deadline.as_mut().poll(context).is_ready() {
-            let closes_at = self.peer.closes_at(LINGER);
-            if closes_at <= Instant::now() {
-                return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
-            }
-            self.deadline.as_mut().reset(closes_at);
-        }
-        read
+        self.check_deadline(context)?;
+        self.stream.as_mut().poll_read(context, into)
     }
 }
 
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        self.check_deadline(context)?;
         self.stream.as_mut().poll_write(context, bytes)
     }
 
@@ -198,6 +206,7 @@ impl AsyncWrite for Connection {
         context: &mut Context<'_>,
         parts: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
+        self.check_deadline(context)?;
         self.stream.as_mut().poll_write_vectored(context, parts)
     }
 
@@ -206,6 +215,7 @@ impl AsyncWrite for Connection {
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.check_deadline(context)?;
         self.stream.as_mut().poll_flush(context)
     }
 

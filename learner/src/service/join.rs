@@ -71,12 +71,14 @@ pub(super) struct Join {
     pub(super) prometheus: Arc<Prometheus>,
     /// The learner epoch.
     pub(super) epoch: u64,
-    /// Limits the joins under each name.
-    pub(super) joins: Quota<String>,
+    /// Limits the joins under each name of each owner.
+    pub(super) joins: Joins,
 }
 
-/// The limit on the joins under each name.
-pub(super) fn joins() -> Quota<String> {
+/// The limit on the joins under each name. The owner is part of it, so that nobody uses up the joins of a name of others.
+pub(super) type Joins = Quota<(Option<Owner>, String)>;
+
+pub(super) fn joins() -> Joins {
     Quota::new(JOINS_AT_ONCE, JOIN_INTERVAL)
 }
 
@@ -87,7 +89,7 @@ impl Join {
     /// Answers a request on the connection of this peer, and counts the answer.
     pub(super) fn answer(&self, request: &JoinRequest, peer: Option<&Peer>) -> Result<JoinReply, Status> {
         let owner = peer.and_then(|peer| peer.owner);
-        let answer = self.check(request).and_then(|()| self.accept(request, owner));
+        let answer = self.check(request, owner).and_then(|()| self.accept(request, owner));
         let result = answer.as_ref().map_or_else(|Refusal(result, _)| *result, |_| "joined");
         self.prometheus.joins.of(result).inc();
         if let Ok(JoinReply { actor, .. }) = &answer {
@@ -99,7 +101,7 @@ impl Join {
     }
 
     /// Checks what does not depend on other actors.
-    fn check(&self, request: &JoinRequest) -> Result<(), Refusal> {
+    fn check(&self, request: &JoinRequest, owner: Option<Owner>) -> Result<(), Refusal> {
         let JoinRequest { protocol, acknowledged, name, run, .. } = request;
         if *protocol != PROTOCOL_VERSION {
             let status = format!(
@@ -115,7 +117,7 @@ impl Join {
             );
             return Err(Refusal("refused", Status::invalid_argument(status)));
         }
-        if !name.is_empty() && !self.joins.take(name.clone()) {
+        if !name.is_empty() && !self.joins.take((owner, name.clone())) {
             let per_minute = 60 / JOIN_INTERVAL.as_secs();
             let status = format!(
                 "more than {per_minute} joins a minute under the name `{name}`: is another actor running under it, or does \

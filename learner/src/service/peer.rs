@@ -51,9 +51,14 @@ impl Peer {
         self.authenticated.store(true, Ordering::Relaxed);
     }
 
+    /// Whether a call of this peer was accepted.
+    pub(super) fn is_authenticated(&self) -> bool {
+        self.authenticated.load(Ordering::Relaxed)
+    }
+
     /// Until when the connection may stay open. `linger` is how long calls may go on beyond its age.
     pub(super) fn closes_at(&self, linger: Duration) -> Instant {
-        if self.authenticated.load(Ordering::Relaxed) { self.expires + linger } else { self.authenticates_until }
+        if self.is_authenticated() { self.expires + linger } else { self.authenticates_until }
     }
 
     /// Until when the first accepted call must have come.
@@ -66,7 +71,10 @@ impl Peer {
 pub(super) fn owner(certificate: &CertificateDer<'_>) -> Option<Owner> {
     let certificate = EndEntityCert::try_from(certificate).ok()?;
     let mut hash = Sha256::new_with_prefix(certificate.subject());
-    for name in certificate.valid_dns_names() {
+    let mut names: Vec<_> = certificate.valid_dns_names().collect();
+    // An authority may write them in another order when it renews the certificate.
+    names.sort_unstable();
+    for name in names {
         // No name has a zero byte.
         hash.update([0]);
         hash.update(name);

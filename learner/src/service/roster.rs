@@ -109,20 +109,20 @@ impl Roster {
     pub(super) fn join(&self, incarnation: u64, name: Name<'_>, had: Option<u64>, now: Instant) -> Joined {
         let Name { text: name, owner } = name;
         let mut actors = self.actors.lock();
-        let is_foreign = |actor: &Actor| !name.is_empty() && actor.name == name && actor.owner != owner;
-        if actors.values().any(|actor| is_foreign(actor) && actor.is_remembered(now)) {
+        let namesake = |other: u64, actor: &Actor| other != incarnation && !name.is_empty() && actor.name == name;
+        let is_foreign = |other: u64, actor: &Actor| namesake(other, actor) && actor.owner != owner;
+        if actors.iter().any(|(other, actor)| is_foreign(*other, actor) && actor.is_remembered(now)) {
             return Joined::Foreign;
         }
         match actors.get_mut(&incarnation) {
             Some(actor) if actor.superseded => return Joined::Superseded,
             Some(actor) if actor.is_present(now) => {
-                actor.heard = now;
+                (actor.heard, actor.owner) = (now, owner);
                 return Joined::Welcome;
             }
             _ => {}
         }
         let order = had.unwrap_or(u64::MAX);
-        let namesake = |other: u64, actor: &Actor| other != incarnation && !name.is_empty() && actor.name == name;
         let mut namesakes = actors.iter().filter(|(other, actor)| namesake(**other, actor));
         if namesakes.any(|(_, actor)| actor.order > order && !actor.superseded) {
             return Joined::Superseded;
@@ -162,7 +162,7 @@ impl Roster {
             gone: None,
         };
         let actor = actors.entry(incarnation).or_insert(actor);
-        (actor.heard, actor.gone, actor.standing_by) = (now, None, false);
+        (actor.heard, actor.gone, actor.standing_by, actor.owner) = (now, None, false, owner);
         Joined::Welcome
     }
 

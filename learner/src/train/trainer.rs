@@ -188,7 +188,11 @@ impl Trainer {
     /// nothing. Unrolls so far were made with another scale.
     fn skip_batch(&mut self, batch: Batch) -> Result<()> {
         self.versions.supersede(&self.state);
-        self.publish()?;
+        // Also after a gradient step that was skipped, which changed no parameter: the next batch needs the scale.
+        match self.state.algorithm.is_finite() {
+            true => self.versions.publish(&mut self.state)?,
+            false => self.versions.repeat(&mut self.state),
+        }
         self.batcher.discard(batch, Reason::Superseded);
         self.after_update()
     }

@@ -51,7 +51,7 @@ async fn connections_from_one_address() {
 /// Such a connection would keep a place that others need.
 #[tokio::test]
 async fn connections_without_an_accepted_call() {
-    let authentication_timeout = Duration::from_secs(1);
+    let authentication_timeout = Duration::from_secs(3);
     let world = World::limited(ConnectionLimits { authentication_timeout, ..ConnectionLimits::default() }).await;
     let mut actor = world.actor(70).await;
     let address = world.address.trim_start_matches("http://");
@@ -67,14 +67,29 @@ async fn connections_without_an_accepted_call() {
         let mut health = HealthClient::new(world.channel().await);
         while health.check(HealthCheckRequest::default()).await.is_ok() {}
     };
-    tokio::join!(falls_silent_after(b""), falls_silent_after(b"PRI * HTTP/2.0"), within(LIMIT, only_checks_the_health));
+    tokio::join!(
+        falls_silent_after(b""),
+        falls_silent_after(b"PRI * HTTP/2.0"),
+        within(LIMIT, only_checks_the_health),
+        within(LIMIT, pings_and_never_reads(address)),
+    );
     actor.client.get_status(StatusRequest {}).await.expect("an older connection with an accepted call stays");
+}
+
+/// Sends HTTP/2 pings until the learner has no room for the answers, and goes on until it closes the connection.
+async fn pings_and_never_reads(address: &str) {
+    // A SETTINGS frame and a PING frame (RFC 9113, 6.5 and 6.7).
+    let settings = [0, 0, 0, 4, 0, 0, 0, 0, 0];
+    let ping = [0, 0, 8, 6, 0, 0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8];
+    let mut peer = TcpStream::connect(address).await.unwrap();
+    peer.write_all(&[b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", &settings[..]].concat()).await.unwrap();
+    while peer.write_all(&ping.repeat(1000)).await.is_ok() {}
 }
 
 /// Otherwise a peer whose certificate is no longer accepted would stay connected for ever.
 #[tokio::test]
 async fn the_age_of_connections() {
-    let max_connection_age = Duration::from_secs(2);
+    let max_connection_age = Duration::from_secs(5);
     let world = World::limited(ConnectionLimits { max_connection_age, ..ConnectionLimits::default() }).await;
     let mut actor = world.actor(70).await;
     let (mut watch, mut unrolls) = (actor.watch().await, actor.stream().await);

@@ -243,6 +243,8 @@ async fn an_actors_name_belongs_to_the_certificate_that_used_it_first() {
     assert_eq!(refused.code(), Code::PermissionDenied);
     assert!(refused.message().contains("certificate"), "{refused}");
     honest.join(request(70)).await.expect("the first one was not superseded");
+    while greedy.join(request(71)).await.unwrap_err().code() != Code::ResourceExhausted {}
+    honest.join(request(70)).await.expect("the joins of another certificate do not count");
     honest.join(request(72)).await.expect("its next process has the same certificate");
     greedy.join(JoinRequest { name: "another".into(), ..joining(73) }).await.unwrap();
     greedy.get_status(StatusRequest {}).await.unwrap();

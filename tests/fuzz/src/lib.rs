@@ -8,6 +8,11 @@ use comic_proto::{UnrollLayout, UnrollShape};
 
 /// A tracking experiment with narrow layers, so that runs are fast and seeds are small.
 pub fn experiment() -> Experiment {
+    experiment_with(&[])
+}
+
+/// The same with these overrides.
+pub fn experiment_with(more: &[&str]) -> Experiment {
     let overrides = [
         "network.encoder=[2]",
         "network.mlp.hidden=[2]",
@@ -18,7 +23,8 @@ pub fn experiment() -> Experiment {
         "vmpo.minibatch_unrolls=2",
         "tracking.observations=[\"body_height\"]",
     ];
-    resolve("tracking-mlp", &overrides.map(String::from)).expect("a valid experiment")
+    let overrides: Vec<String> = overrides.iter().chain(more).map(|field| (*field).into()).collect();
+    resolve("tracking-mlp", &overrides).expect("a valid experiment")
 }
 
 /// The observations of its task.

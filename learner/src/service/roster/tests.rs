@@ -34,6 +34,18 @@ fn an_actor_is_alive_then_slow_then_lost_then_forgotten() {
 }
 
 #[test]
+fn an_actor_keeps_its_name_when_its_certificate_gets_another_subject() {
+    let (roster, start) = (Arc::new(Roster::new(10)), Instant::now());
+    let join = |incarnation, owner| {
+        roster.join(incarnation, Name { text: "walker", owner: Some([owner; 32]) }, Some(incarnation), start)
+    };
+    assert_eq!(join(1, 7), Joined::Welcome);
+    assert_eq!(join(2, 8), Joined::Foreign);
+    assert_eq!(join(1, 8), Joined::Welcome, "the same process");
+    assert_eq!((join(2, 8), join(3, 7)), (Joined::Welcome, Joined::Foreign), "the name belongs to the new certificate");
+}
+
+#[test]
 fn an_actor_without_a_stream_is_absent_until_it_has_opened_one() {
     let (roster, start) = (Arc::new(Roster::new(10)), Instant::now());
     assert!(joins(&roster, 1, start) && joins(&roster, 2, start));
