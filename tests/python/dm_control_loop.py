@@ -13,9 +13,10 @@ import time
 import warnings
 
 warnings.simplefilter('ignore')
-# dm_control's EGL brings a system's libxml2 into the process, with which its lxml has crashed, so only the camera loads it.
+# Only the camera needs OpenGL.
 os.environ.setdefault('MUJOCO_GL', 'egl' if '--camera' in sys.argv else 'disable')
 
+import bind_lxml  # noqa: E402, F401
 import h5py  # noqa: E402
 import numpy as np  # noqa: E402
 from dm_control import composer  # noqa: E402

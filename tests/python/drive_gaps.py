@@ -14,6 +14,7 @@ import sys
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 
+import bind_lxml  # noqa: F401
 import numpy as np
 import torch
 from dm_control import composer

@@ -17,6 +17,7 @@ import pathlib
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 
+import bind_lxml  # noqa: F401
 import numpy as np
 from dm_control import composer
 from dm_control.locomotion import arenas, mocap

@@ -8,8 +8,9 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail, ensure};
 use serde_json::Value;
 
+use crate::accounting::balance_of_json;
 use crate::repository::root;
-use crate::system::{SMALL, balance_of_json};
+use crate::system::SMALL;
 
 /// Time between two checks of a condition. Each check starts a process in a container.
 const POLL: Duration = Duration::from_millis(500);

@@ -1,6 +1,7 @@
 //! Helpers of the whole-system tests.
 //!
 //! # Layout
+//! - [`accounting`] checks its law.
 //! - [`certificates`] makes certificates, also expired ones.
 //! - [`compose`] runs a learner and actors in containers.
 //! - [`kubernetes`] renders the manifests and reads them.
@@ -13,6 +14,7 @@
 //! - [`system`] runs a learner and actors as a user does: real programs, real sockets, one directory for the run.
 //! - [`tensorboard`] reads curves as TensorBoard does.
 
+pub mod accounting;
 pub mod certificates;
 pub mod compose;
 pub mod kubernetes;

@@ -7,8 +7,9 @@ use std::time::Duration;
 use anyhow::{Context, Result, ensure};
 use comic_proto::v1::{Accounting, Status};
 
+use crate::accounting::balance;
 use crate::process::Process;
-use crate::system::{Answered, System, balance, metric};
+use crate::system::{Answered, System, metric};
 
 /// Long enough for the slowest machine. A step ends as soon as its condition holds.
 pub const LIMIT: Duration = Duration::from_secs(120);

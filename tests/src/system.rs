@@ -11,10 +11,11 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail, ensure};
 use comic_proto::Access;
 use comic_proto::v1::learner_client::LearnerClient;
-use comic_proto::v1::{Accounting, Status, StatusRequest};
+use comic_proto::v1::{Status, StatusRequest};
 use serde_json::Value;
 use tempfile::TempDir;
 
+use crate::accounting::balance;
 use crate::process::{POLL, Process};
 use crate::repository::root;
 
@@ -416,24 +417,6 @@ fn flags(access: &Access) -> Vec<OsString> {
     let flags = [("--ca", ca), ("--cert", cert), ("--key", key), ("--token-file", token_file)];
     let given = flags.into_iter().filter_map(|(flag, path)| Some((flag, path.as_ref()?)));
     given.flat_map(|(flag, path)| [flag.into(), path.into()]).collect()
-}
-
-/// [`balance`] of accounting as metrics and `comic-learner status --json` write them.
-pub fn balance_of_json(accounting: &Value) -> bool {
-    let of = |value: &Value| value.as_u64();
-    let dropped = accounting["dropped"].as_object().map(|reasons| reasons.values().filter_map(of).sum::<u64>());
-    let parts = [of(&accounting["trained"]), dropped, of(&accounting["in_flight"])];
-    of(&accounting["produced"]).is_some_and(|produced| Some(produced) == parts.into_iter().sum::<Option<u64>>())
-}
-
-/// produced = trained + dropped by reason + in flight.
-pub fn balance(accounting: &Accounting) -> bool {
-    let Accounting { produced, trained, in_flight, .. } = *accounting;
-    let dropped = accounting.dropped_stale
-        + accounting.dropped_invalid
-        + accounting.dropped_superseded
-        + accounting.dropped_lost_at_restart;
-    produced == trained + dropped + in_flight
 }
 
 /// A number of the status's metrics, or 0 while there are none.

@@ -4,11 +4,12 @@
 
 use anyhow::{Result, ensure};
 use comic_proto::v1::Status;
+use comic_tests::accounting::balance_of_json;
 use comic_tests::steps::{
     EVERY_UNROLL, LIMIT, kill_and_restart_the_learner, leaves, the_accounting_balances_at_the_end, trains_on,
     trains_on_each,
 };
-use comic_tests::system::{SMALL, System, balance_of_json};
+use comic_tests::system::{SMALL, System};
 
 async fn two_actors_learn(overrides: &[&str], check: fn(&Status) -> Option<()>) -> Result<()> {
     let arguments = overrides.iter().flat_map(|field| ["--set", *field]);

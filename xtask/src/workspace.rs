@@ -18,9 +18,16 @@ pub(crate) fn dependencies() -> PathBuf {
     root().join(".deps")
 }
 
-/// The cargo that runs this program.
+/// The cargo that runs this program, with the environment that a shell gives it: ring's build script depends on variables that
+/// cargo sets for this program, so `cargo build` and `cargo xtask test` in turn would each build half of the workspace again.
 pub(crate) fn cargo() -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    for (name, _) in std::env::vars_os() {
+        let text = name.to_string_lossy();
+        if text.starts_with("CARGO_PKG_") || text.starts_with("CARGO_MANIFEST_") {
+            command.env_remove(name);
+        }
+    }
     command.current_dir(root());
     command
 }

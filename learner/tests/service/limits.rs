@@ -89,7 +89,7 @@ async fn pings_and_never_reads(address: &str) {
 /// Otherwise a peer whose certificate is no longer accepted would stay connected for ever.
 #[tokio::test]
 async fn the_age_of_connections() {
-    let max_connection_age = Duration::from_secs(5);
+    let max_connection_age = Duration::from_secs(4);
     let world = World::limited(ConnectionLimits { max_connection_age, ..ConnectionLimits::default() }).await;
     let mut actor = world.actor(70).await;
     let (mut watch, mut unrolls) = (actor.watch().await, actor.stream().await);
