@@ -78,11 +78,15 @@ fn a_wheel_works_in_an_empty_environment() -> Result<()> {
     succeeds(Command::new("python3").args(["-m", "venv"]).arg(directory.path().join("venv")))?;
     let python = directory.path().join("venv/bin/python");
     succeeds(Command::new(&python).args(["-m", "pip", "install", "--quiet"]).arg(wheel()?))?;
-    let script = "import comic, gymnasium, sys\n\
+    let script = "import comic, gymnasium, importlib.metadata, sys\n\
         environment = gymnasium.make('comic/Tracking-v0', clips='builtin:walk')\n\
         environment.reset(seed=1)\n\
         environment.step(environment.action_space.sample())\n\
-        assert 'torch' not in sys.modules and 'dm_control' not in sys.modules";
+        assert 'torch' not in sys.modules and 'dm_control' not in sys.modules\n\
+        files = importlib.metadata.files('comic-rl')\n\
+        texts = {file.name: file.read_text() for file in files if 'licenses' in file.parts}\n\
+        assert set(texts) == {'LICENSE-APACHE', 'LICENSE-MIT', 'NOTICE'}\n\
+        assert 'dm_control' in texts['NOTICE'] and 'Apache License' in texts['LICENSE-APACHE']";
     let mut command = Command::new(&python);
     command.args(["-c", script]).current_dir(directory.path()).env_clear().env("HOME", directory.path());
     succeeds(&mut command)

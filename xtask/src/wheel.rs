@@ -8,6 +8,8 @@ use anyhow::{Context, Result, bail};
 use crate::{python, setup, workspace};
 
 const REQUIREMENTS: &str = "requirements-wheel.txt";
+/// The wheel holds them, and maturin takes them from the package's directory alone.
+const LICENCES: [&str; 3] = ["LICENSE-APACHE", "LICENSE-MIT", "NOTICE"];
 
 /// Builds the wheel and returns its path. Its tag says the oldest libc that it runs with: the build machine decides.
 pub(crate) fn build() -> Result<PathBuf> {
@@ -16,6 +18,10 @@ pub(crate) fn build() -> Result<PathBuf> {
     let built = wheels.join("built");
     for directory in [&wheels, &built] {
         remove_wheels(directory)?;
+    }
+    for name in LICENCES {
+        let copied = fs::copy(workspace::root().join(name), workspace::root().join("python").join(name));
+        copied.with_context(|| format!("cannot copy {name} to python/"))?;
     }
     let mut maturin = python::tool("maturin", REQUIREMENTS)?;
     maturin.args(["build", "--release", "--locked", "--auditwheel", "skip", "--manifest-path", "python/Cargo.toml"]);
