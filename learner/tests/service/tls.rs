@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use crate::support::{World, within};
 use comic_learner::commands::certs::Certs;
-use comic_learner::security::{Security, Tls};
+use comic_learner::security::{ConnectionLimits, Security, Tls};
 use comic_proto::v1::StatusRequest;
 use comic_proto::{Access, distrusted};
 use rustls::pki_types::CertificateDer;
@@ -26,10 +26,14 @@ fn certificates(directory: &Path) {
 }
 
 /// A learner that requires client certificates if `mutual`.
-async fn world(directory: &Path, mutual: bool) -> World {
+fn security(directory: &Path, mutual: bool) -> Security {
     let ca = directory.join("ca.pem");
     let tls = Tls::new(&directory.join("server.pem"), &directory.join("server-key.pem"), mutual.then_some(&ca));
-    World::secured(Security { tls: Some(tls.unwrap()), tokens: None }).await
+    Security { tls: Some(tls.unwrap()), tokens: None }
+}
+
+async fn world(directory: &Path, mutual: bool) -> World {
+    World::secured(security(directory, mutual)).await
 }
 
 /// Access of a client that trusts the authority of one directory and shows the certificate of another.
@@ -104,7 +108,8 @@ async fn a_peer_without_tls_is_refused_and_delays_no_other() {
 async fn a_peer_that_is_silent_after_the_tls_handshake_is_disconnected() {
     let own = tempfile::tempdir().unwrap();
     certificates(own.path());
-    let world = world(own.path(), false).await;
+    let limits = ConnectionLimits { authentication_timeout: Duration::from_secs(2), ..ConnectionLimits::default() };
+    let world = World::guarded(8, Vec::new(), security(own.path(), false), limits).await;
     let mut roots = RootCertStore::empty();
     roots.add(CertificateDer::from_pem_file(own.path().join("ca.pem")).unwrap()).unwrap();
     let provider = Arc::new(rustls::crypto::ring::default_provider());

@@ -86,7 +86,13 @@ impl World {
         Self::of(experiment, 8, Vec::new(), security, limits, quarantine).await
     }
 
-    async fn guarded(proprioception: usize, assets: Vec<Asset>, security: Security, limits: ConnectionLimits) -> Self {
+    /// With all of these.
+    pub(crate) async fn guarded(
+        proprioception: usize,
+        assets: Vec<Asset>,
+        security: Security,
+        limits: ConnectionLimits,
+    ) -> Self {
         Self::of(experiment(), proprioception, assets, security, limits, QuarantineArguments::default()).await
     }
 
