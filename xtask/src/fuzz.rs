@@ -61,7 +61,7 @@ const COUNTERS: [&str; 7] = [
 const HOST: &str = "x86_64-unknown-linux-gnu";
 /// The limit of resident memory. libtorch alone needs a few hundred.
 const MEGABYTES: usize = 2048;
-/// The longest input that `--merge` adds to the repository, bytes. libFuzzer would cut longer ones.
+/// The longest input that `--merge` adds to the repository, bytes.
 const LONGEST_COMMITTED: u64 = 2048;
 /// An input takes less than a second; the machine may be busy.
 const SECONDS_OF_AN_INPUT: usize = 20;
@@ -94,7 +94,7 @@ pub(crate) fn fuzz(options: &Options) -> Result<()> {
                 copy_small(folder, &small)?;
             }
             let mut merge = Command::new(&program);
-            // By the code that an input reaches, not by how often: a tenth of the inputs.
+            // By the code that an input reaches, not by how often.
             merge.args(["-merge=1", "-use_counters=0"]).args([&committed, &small]);
             run(merge.env("OMP_NUM_THREADS", "1").current_dir(root()))?;
             continue;
