@@ -10,9 +10,6 @@ use comic_experiment::{Experiment, TaskSpec, resolve};
 use comic_learner::checkpoint::Store;
 use comic_learner::device::Backend;
 use comic_learner::publish::{Published, Publisher};
-use comic_learner::security::{ConnectionLimits, Security};
-use comic_learner::service::quarantine::QuarantineArguments;
-use comic_learner::service::{self, Service};
 use comic_learner::tensors;
 use comic_learner::train::parts::{Ending, TrainerParts};
 use comic_learner::train::trainer::Trainer;
@@ -25,6 +22,10 @@ use rand_pcg::Pcg64;
 use serde_json::Value;
 use tch::{Device, Kind, Tensor, nn};
 use tonic_prost::prost::Message as _;
+
+mod open_service;
+
+use open_service::open_service;
 
 /// Steps an unroll.
 const LENGTH: usize = 5;
@@ -137,19 +138,7 @@ fn train(
     let config = Config { unrolls: experiment.unroll.batch, max_staleness: 0, ahead: 0, order };
     let batcher = Batcher::new(layout.clone(), config, Phase::begin(epoch), ledger);
     let publisher = Publisher::new(epoch);
-    let service = Service::new(service::Setup {
-        run: run.to_path_buf(),
-        id: store.run().unwrap(),
-        security: Security::default(),
-        limits: ConnectionLimits::default(),
-        experiment: experiment.clone(),
-        spec: spec.clone(),
-        assets: Vec::new(),
-        batcher: batcher.clone(),
-        publisher: publisher.clone(),
-        quarantine: QuarantineArguments::default(),
-    })
-    .unwrap();
+    let service = open_service(run, store.run().unwrap(), &experiment, &spec, &batcher, &publisher);
     let joined = batcher.join(INCARNATION, None).unwrap();
     let parts = TrainerParts {
         pose: vec![0.0; spec.action],

@@ -12,9 +12,6 @@ use comic_learner::checkpoint::{Snapshot, Store, find, read};
 use comic_learner::device::Backend;
 use comic_learner::observe::probes::Probed as _;
 use comic_learner::publish::{Published, Publisher};
-use comic_learner::security::{ConnectionLimits, Security};
-use comic_learner::service::quarantine::QuarantineArguments;
-use comic_learner::service::{self, Service};
 use comic_learner::train::parts::{Ending, TrainerParts};
 use comic_learner::train::trainer::Trainer;
 use comic_proto::v1::{EvaluationReport, UnrollHeader};
@@ -22,6 +19,10 @@ use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Outcome, Phase};
 use rand::{Rng as _, SeedableRng as _};
 use rand_pcg::Pcg64;
+
+mod open_service;
+
+use open_service::open_service;
 
 const INCARNATION: u64 = 7;
 const UPDATES: u64 = 6;
@@ -140,19 +141,7 @@ fn live_evaluated(
     let config = Config { unrolls: experiment.unroll.batch, max_staleness: 1000, ahead: 1, order: BatchOrder::Arrival };
     let batcher = Batcher::new(layout.clone(), config, Phase::begin(epoch), ledger);
     let publisher = Publisher::new(epoch);
-    let service = Service::new(service::Setup {
-        run: run.to_path_buf(),
-        id: store.run().unwrap(),
-        security: Security::default(),
-        limits: ConnectionLimits::default(),
-        experiment: experiment.clone(),
-        spec: spec.clone(),
-        assets: Vec::new(),
-        batcher: batcher.clone(),
-        publisher: publisher.clone(),
-        quarantine: QuarantineArguments::default(),
-    })
-    .unwrap();
+    let service = open_service(run, store.run().unwrap(), &experiment, &spec, &batcher, &publisher);
     evaluations.iter().for_each(|report| service.evaluations().report(report.clone()).unwrap());
     let pose = vec![0.1; spec.action];
     let run = run.to_path_buf();
