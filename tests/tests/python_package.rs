@@ -58,6 +58,26 @@ fn clips_and_experiments_are_read() -> Result<()> {
 }
 
 #[test]
+fn a_run_is_copied_to_a_tracker_once() -> Result<()> {
+    pytest("test_track.py", "not full")
+}
+
+#[test]
+fn a_search_reads_the_curves_of_its_runs() -> Result<()> {
+    pytest("test_sweep.py", "not full")
+}
+
+#[test]
+fn cards_say_what_a_file_holds_and_hostile_files_are_refused() -> Result<()> {
+    pytest("test_card.py", "not full")
+}
+
+#[test]
+fn the_hub_says_what_it_needs() -> Result<()> {
+    pytest("test_hub.py", "not full")
+}
+
+#[test]
 fn opengl_draws_pictures_and_camera_images() -> Result<()> {
     pytest("test_pictures.py", "not full")
 }
