@@ -6,6 +6,7 @@
 
 pub mod command;
 mod delivery;
+mod page;
 mod report;
 mod rewards;
 mod rollout;

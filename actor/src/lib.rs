@@ -31,6 +31,7 @@ pub mod forward_pass;
 pub mod latents;
 pub mod liveness;
 pub mod mailbox;
+pub mod page;
 pub mod policy;
 pub mod render;
 pub mod round;

@@ -10,7 +10,7 @@
 //! - `gradient.rs` differentiates the reward with respect to the actions, for every task but ball-catch.
 //! - `joint.rs` plays several tasks, one in each episode.
 //! - [`humanoid`] makes the compiled model from dm_control's XML, and `arenas/` makes what surrounds the humanoid.
-//! - `rendering/` draws: [`film`] and `viewer` for people, [`vision`] for the policy.
+//! - `rendering/` draws: [`film`] and `viewer` for people, [`vision`] for the policy; [`geometry`] has the same as numbers.
 //! - [`raw_physics`] steps the physics without a task: the lower limit of an environment's time in benchmarks.
 //!
 //! Tracking, go-to-target and the corridors are dm_control's: the state of the simulation is equal bit for bit,
@@ -40,6 +40,6 @@ pub use physics::Simulation;
 pub use rendering::ghost::Ghost;
 #[cfg(feature = "viewer")]
 pub use rendering::viewer;
-pub use rendering::{film, vision};
+pub use rendering::{film, geometry, vision};
 pub use rules::comparison;
 pub use tracking::{TrackingEnvironment, TrackingTask};

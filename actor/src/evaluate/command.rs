@@ -10,7 +10,7 @@ use comic_clips::Catalogue;
 use comic_experiment::{Experiment, Transfer};
 use comic_proto::v1::EvaluationReport;
 use comic_proto::{Access, UnrollShape};
-use comic_tasks::{Simulated, Task};
+use comic_tasks::{Simulated, Step, Task};
 
 use super::delivery::deliver;
 use super::settings::{RolloutSettings, Starts};
@@ -20,6 +20,7 @@ use crate::acting_loop::Controller;
 use crate::checkpoint::{self, Checkpoint, Position};
 use crate::film::encode::Format;
 use crate::film::recorder::{Look, Recorder};
+use crate::page::is_page;
 use crate::policy::TorchPolicy;
 
 const JSON_HELP: &str = "\
@@ -99,7 +100,7 @@ pub struct Evaluate {
     /// Evaluates the newest checkpoint of the run of --learner without noise, on at most 64 starts that are always the
     /// same, again and again until the run is over. The learner stores the evaluations with a short film each.
     #[arg(long, requires = "learner", help_heading = "Watch")]
-    #[arg(conflicts_with_all = ["checkpoint", "noise", "episodes", "json", "rewards", "video", "camera", "ghost", "size", "fps"])]
+    #[arg(conflicts_with_all = ["checkpoint", "noise", "episodes", "json", "rewards", "html", "video", "camera", "ghost", "size", "fps"])]
     watch: bool,
     /// Minutes from one evaluation to the next.
     #[arg(long, value_name = "MINUTES", default_value_t = 2.0, value_parser = minutes, help_heading = "Watch")]
@@ -123,6 +124,9 @@ pub struct Evaluate {
     video: Option<PathBuf>,
     #[command(flatten)]
     look: Look,
+    /// Writes a page for any browser that plays the worst, the median and the best start.
+    #[arg(long, value_name = "FILE", help_heading = "Film")]
+    html: Option<PathBuf>,
 }
 
 /// What is evaluated.
@@ -179,6 +183,9 @@ impl Evaluate {
             // The servo action is a command, not a latent.
             experiment.transfer = Transfer::default();
         }
+        if let Some(out) = self.html.as_ref().filter(|out| !is_page(out)) {
+            return Err(Error::Usage(format!("--html {}: name it .html", out.display())));
+        }
         if let Some(out) = &self.video {
             Format::of(out)?;
             self.look.suits(experiment.task)?;
@@ -211,7 +218,11 @@ impl Evaluate {
             (Some(error), _) => Err(error),
             (None, recorder) => recorder.map_or(Ok(()), Recorder::finish),
         };
-        Ok((report, film))
+        let page = self.html.as_ref().map_or(Ok(()), |out| {
+            let title = format!("{}, {} episodes", experiment.task, finished.len());
+            super::page::write(out, title, &mut controller, &task, &shape, &finished, &options)
+        });
+        Ok((report, film.and(page)))
     }
 
     /// The experiment, and the parameters when there is a checkpoint.
@@ -264,7 +275,12 @@ struct Follower {
 }
 
 impl Audience<Box<dyn Simulated>> for Follower {
-    fn watch(&mut self, number: usize, environment: &mut Box<dyn Simulated>) -> Result<ControlFlow<()>, Error> {
+    fn watch(
+        &mut self,
+        number: usize,
+        environment: &mut Box<dyn Simulated>,
+        _: Option<&Step>,
+    ) -> Result<ControlFlow<()>, Error> {
         if let (Some(recorder), None, 0) = (&mut self.recorder, &self.failed, number) {
             self.failed = recorder.shoot(environment.as_mut()).err();
         }

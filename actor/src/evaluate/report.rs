@@ -37,6 +37,11 @@ impl Finished {
     pub fn steps(&self) -> usize {
         self.rewards.len()
     }
+
+    /// Return / (largest reward of a step × steps left at the start).
+    pub fn normalised_reward(&self, spec: &TaskSpec) -> f64 {
+        ratio(self.returns.iter().sum(), spec.max_reward(self.clip) * self.steps_left as f64)
+    }
 }
 
 /// An evaluation: `comic-actor evaluate --json` prints exactly this.
@@ -159,7 +164,7 @@ impl ClipReport {
             diverged: finished.iter().filter(|episode| episode.outcome == Outcome::Diverged).count(),
             length_mean: mean(&|episode| episode.steps() as f64),
             return_mean: mean(&total),
-            normalised_reward: mean(&|episode| ratio(total(episode), most(episode) * episode.steps_left as f64)),
+            normalised_reward: mean(&|episode| episode.normalised_reward(spec)),
             reward_per_step: per_step(&|episode| ratio(total(episode), most(episode))),
             fraction_survived: mean(&|episode| ratio(episode.steps() as f64, episode.steps_left as f64)),
             success_rate: mean(&|episode| if episode.achievement.success { 1.0 } else { 0.0 }),

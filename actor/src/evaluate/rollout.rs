@@ -5,7 +5,7 @@ use std::ops::ControlFlow;
 use std::slice::Iter;
 
 use comic_proto::UnrollShape;
-use comic_tasks::{Environment, Outcome};
+use comic_tasks::{Environment, Outcome, Step};
 use rand::SeedableRng as _;
 use rand_pcg::Pcg64;
 
@@ -18,13 +18,13 @@ use crate::forward_pass::{ActingRow, ForwardPass};
 
 /// Watches a rollout, to show its progress or to film it.
 pub trait Audience<E> {
-    /// Called at an episode's begin and after each of its steps, except a step that diverged. `number` is the place of
-    /// the episode's start among all starts. `Break` ends the rollout.
+    /// Called at an episode's begin, without a step, and after each of its steps, except a step that diverged. `number`
+    /// is the place of the episode's start among all starts. `Break` ends the rollout.
     ///
     /// # Errors
     /// An error ends the rollout.
-    fn watch(&mut self, number: usize, environment: &mut E) -> Result<ControlFlow<()>, Error> {
-        let _ = (number, environment);
+    fn watch(&mut self, number: usize, environment: &mut E, step: Option<&Step>) -> Result<ControlFlow<()>, Error> {
+        let _ = (number, environment, step);
         Ok(ControlFlow::Continue(()))
     }
 
@@ -123,7 +123,7 @@ impl<E: Environment> EpisodeRecorder<'_, E> {
         let tracking = TrackingErrors::at_start(&self.errors);
         self.running[index] = Running { number, start: *start, rewards: Vec::new(), tracking };
         rollout.begin_episode(row);
-        self.audience.watch(number, &mut rollout.environment)
+        self.audience.watch(number, &mut rollout.environment, None)
     }
 
     fn finish(&mut self, index: usize, rollout: &Rollout<E>, outcome: Outcome) {
@@ -185,7 +185,7 @@ impl<E: Environment> Recorder<E> for EpisodeRecorder<'_, E> {
         tracking.add(&self.errors);
         let mut flow = ControlFlow::Continue(());
         if step.outcome != Outcome::Diverged {
-            flow = self.audience.watch(*number, &mut rollout.environment)?;
+            flow = self.audience.watch(*number, &mut rollout.environment, Some(&step))?;
         }
         if rollout.ended {
             self.finish(index, rollout, step.outcome);
@@ -200,7 +200,7 @@ impl<E: Environment> Recorder<E> for EpisodeRecorder<'_, E> {
 #[cfg(test)]
 mod tests {
     use comic_proto::Field;
-    use comic_tasks::{Achievement, Episode, MAX_REWARD_TERMS, Step};
+    use comic_tasks::{Achievement, Episode, MAX_REWARD_TERMS};
 
     use super::*;
     use crate::forward_pass::ActingBatch;
@@ -307,7 +307,13 @@ mod tests {
     }
 
     impl Audience<Fixed> for Spectator {
-        fn watch(&mut self, number: usize, environment: &mut Fixed) -> Result<ControlFlow<()>, Error> {
+        fn watch(
+            &mut self,
+            number: usize,
+            environment: &mut Fixed,
+            step: Option<&Step>,
+        ) -> Result<ControlFlow<()>, Error> {
+            assert_eq!(step.is_some(), environment.step > 0, "the begin of an episode is no step");
             self.watched.push((number, environment.step));
             Ok(if self.watched.len() < self.patience { ControlFlow::Continue(()) } else { ControlFlow::Break(()) })
         }

@@ -10,7 +10,7 @@ use comic_clips::Catalogue;
 use comic_experiment::Experiment;
 use comic_proto::v1::{Checkpoint, EvaluationReport};
 use comic_proto::{Access, UnrollShape, chain};
-use comic_tasks::{Simulated, Task};
+use comic_tasks::{Simulated, Step, Task};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
 use tokio::time::Instant;
@@ -237,7 +237,12 @@ struct Crew<'a> {
 }
 
 impl Audience<Box<dyn Simulated>> for Crew<'_> {
-    fn watch(&mut self, number: usize, environment: &mut Box<dyn Simulated>) -> Result<ControlFlow<()>, Error> {
+    fn watch(
+        &mut self,
+        number: usize,
+        environment: &mut Box<dyn Simulated>,
+        _: Option<&Step>,
+    ) -> Result<ControlFlow<()>, Error> {
         if let (0, Ok(Some(camera))) = (number, &mut self.camera)
             && let Err(error) = camera.shoot(environment.as_mut())
         {

@@ -1,6 +1,5 @@
 //! Draws the steps of an environment into a film.
 
-use std::io::IsTerminal as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -8,13 +7,10 @@ use clap::{Args, ValueEnum};
 use comic_experiment::TaskName;
 use comic_tasks::film::{Camera, Film, Shot, Size};
 use comic_tasks::{Ghost, Simulated};
-use indicatif::{ProgressBar, ProgressStyle};
 
 use super::encode::{Format, Movie};
 use crate::Error;
-
-/// Frames between two log lines, when there is no terminal.
-const FRAMES_A_LINE: usize = 100;
+use crate::page::document::GhostPlace;
 
 /// How a film looks.
 #[derive(Args, Clone, Debug)]
@@ -55,7 +51,6 @@ pub struct Recorder {
     every: usize,
     steps: usize,
     frames: usize,
-    bar: Option<ProgressBar>,
 }
 
 impl Look {
@@ -68,6 +63,30 @@ impl Look {
     /// For a contact sheet: a tile every third of a second.
     pub(crate) fn sheet() -> Self {
         Self { camera: Place::Side, ghost: None, size: Size::new(160, 120), fps: Some(3) }
+    }
+
+    /// Control steps of `step` seconds from one picture to the next.
+    pub(crate) fn every(&self, step: f64) -> usize {
+        self.fps.map_or(1, |fps| ((1.0 / (f64::from(fps) * step)) - 1e-9).ceil().max(1.0) as usize)
+    }
+
+    /// Where a page has the reference at first.
+    ///
+    /// # Errors
+    /// A size or a camera: who looks at the page chooses them.
+    pub(crate) fn of_page(&self) -> Result<GhostPlace, Error> {
+        let refused = match (self.size, self.camera) {
+            (Some(_), _) => "--size",
+            (None, Place::Egocentric | Place::Side) => "--camera",
+            (None, Place::Tracking) => {
+                return Ok(match self.ghost {
+                    None => GhostPlace::Off,
+                    Some(Ghost::On) => GhostPlace::On,
+                    Some(Ghost::Beside) => GhostPlace::Beside,
+                });
+            }
+        };
+        Err(Error::Usage(format!("{refused}: a page has none, who looks at it turns and zooms: leave the option out")))
     }
 
     /// Checks whether a film of this task can look like this.
@@ -94,7 +113,7 @@ impl Recorder {
             Some(size) => size,
             None => Format::of(out)?.usual_size().parse().map_err(Error::Usage)?,
         };
-        let every = look.fps.map_or(1, |fps| ((1.0 / (f64::from(fps) * step)) - 1e-9).ceil().max(1.0) as usize);
+        let every = look.every(step);
         let camera = match look.camera {
             Place::Tracking => Camera::Tracking,
             Place::Egocentric => Camera::Egocentric,
@@ -102,18 +121,7 @@ impl Recorder {
         };
         let film = Film::new(Shot { size, camera, ghost: look.ghost });
         let movie = Movie::create(out, size, Duration::from_secs_f64(step * every as f64))?;
-        Ok(Self { film, movie, out: out.to_path_buf(), step, every, steps: 0, frames: 0, bar: None })
-    }
-
-    /// Shows on a terminal how many of `seconds` have been filmed.
-    #[must_use]
-    pub fn with_bar(mut self, seconds: f64) -> Self {
-        if std::io::stderr().is_terminal() {
-            let style = ProgressStyle::with_template("{bar:40} {pos} of {len} steps, {eta} left");
-            let bar = ProgressBar::new((seconds / self.step).ceil() as u64);
-            self.bar = Some(style.map_or(bar.clone(), |style| bar.with_style(style)));
-        }
-        self
+        Ok(Self { film, movie, out: out.to_path_buf(), step, every, steps: 0, frames: 0 })
     }
 
     /// Draws a picture of the environment if one is due. Called at an episode's begin and after each of its steps.
@@ -125,14 +133,8 @@ impl Recorder {
         if self.steps.is_multiple_of(self.every) {
             self.movie.frame(self.film.draw(environment)?)?;
             self.frames += 1;
-            if self.bar.is_none() && self.frames.is_multiple_of(FRAMES_A_LINE) {
-                tracing::info!(frames = self.frames, "filming");
-            }
         }
         self.steps += 1;
-        if let Some(bar) = &self.bar {
-            bar.inc(1);
-        }
         Ok(())
     }
 
@@ -148,9 +150,6 @@ impl Recorder {
     pub fn finish(self) -> Result<(), Error> {
         let (frames, seconds) = (self.frames, self.seconds());
         self.movie.finish()?;
-        if let Some(bar) = self.bar {
-            bar.finish_and_clear();
-        }
         tracing::info!(file = %self.out.display(), frames, seconds = format!("{seconds:.2}"), "filmed");
         Ok(())
     }

@@ -71,6 +71,12 @@ impl Scene {
         self.task
     }
 
+    /// What is shown, in words.
+    pub(super) fn title(&self) -> String {
+        let policy = self.checkpoint.as_ref().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
+        policy.map_or_else(|| self.task.to_string(), |policy| format!("{}, {policy}", self.task))
+    }
+
     /// Reads experiment, checkpoint and clips, and builds the task.
     ///
     /// # Errors
@@ -149,7 +155,29 @@ impl Cast {
         episodes: usize,
         audience: &mut dyn Audience<Box<dyn Simulated>>,
     ) -> Result<Vec<Finished>, Error> {
-        let starts: Vec<Start> = self.starts.iter().copied().cycle().take(episodes).collect();
+        self.roll_out(1, episodes, audience)
+    }
+
+    /// Rolls out `episodes` episodes, whose starts are spread evenly over all starts, or fewer if the audience breaks.
+    ///
+    /// # Errors
+    /// As for [`play`](Self::play).
+    pub(super) fn play_spread(
+        &mut self,
+        episodes: usize,
+        audience: &mut dyn Audience<Box<dyn Simulated>>,
+    ) -> Result<Vec<Finished>, Error> {
+        self.roll_out((self.starts.len() / episodes.max(1)).max(1), episodes, audience)
+    }
+
+    /// Rolls out every `stride`-th start until there are so many episodes.
+    fn roll_out(
+        &mut self,
+        stride: usize,
+        episodes: usize,
+        audience: &mut dyn Audience<Box<dyn Simulated>>,
+    ) -> Result<Vec<Finished>, Error> {
+        let starts: Vec<Start> = self.starts.iter().copied().step_by(stride).cycle().take(episodes).collect();
         let mut controller = match &mut self.policy {
             Some(policy) => Controller::Policy(policy),
             None if self.name == TaskName::Tracking => Controller::Servo,

@@ -40,8 +40,8 @@ mod window {
     use std::sync::atomic::{AtomicBool, Ordering};
     use std::time::{Duration, Instant};
 
-    use comic_tasks::Simulated;
     use comic_tasks::viewer::{Screen, Viewer};
+    use comic_tasks::{Simulated, Step};
 
     use super::View;
     use crate::Error;
@@ -82,7 +82,12 @@ mod window {
     }
 
     impl Audience<Box<dyn Simulated>> for Shown<'_> {
-        fn watch(&mut self, _: usize, environment: &mut Box<dyn Simulated>) -> Result<ControlFlow<()>, Error> {
+        fn watch(
+            &mut self,
+            _: usize,
+            environment: &mut Box<dyn Simulated>,
+            _: Option<&Step>,
+        ) -> Result<ControlFlow<()>, Error> {
             self.screen.show(environment.as_mut());
             // Lost time is not made up for.
             self.due = (self.due + self.step).max(Instant::now());
