@@ -106,8 +106,10 @@ fn arguments_of(dockerfile: &str) -> BTreeSet<String> {
 fn every_argument_of_the_dockerfile_can_be_given_to_compose() -> Result<()> {
     let dockerfile = text("Dockerfile")?;
     let mut asked = arguments_of(&dockerfile);
-    // Compose does not build the images for accelerators.
-    ensure!(asked.remove("ACCELERATOR"), "the Dockerfile has no argument ACCELERATOR");
+    // Compose builds the programs itself, and not for accelerators.
+    for argument in ["ACCELERATOR", "FILES"] {
+        ensure!(asked.remove(argument), "the Dockerfile has no argument {argument}");
+    }
     let given_to = |service: &str| -> Result<(Value, BTreeSet<String>)> {
         let build = compose("compose.yaml")?["services"][service]["build"].clone();
         let given = build["args"].as_mapping().context("no arguments")?;
@@ -156,6 +158,102 @@ fn what_is_in_volumes_is_where_the_image_lets_it_be_written() -> Result<()> {
                 ensure!(prepared.contains(place), "{place} is not comic's");
             }
         }
+    }
+    Ok(())
+}
+
+/// A service of the profile `monitoring`. Its image is another project's.
+fn monitoring(service: &str) -> Result<Value> {
+    let service = compose("compose.yaml")?["services"][service].clone();
+    ensure!(service["profiles"] == Value::from(vec!["monitoring"]), "{service:?}");
+    Ok(service)
+}
+
+/// The strings of a list.
+fn words(list: &Value) -> impl Iterator<Item = &str> {
+    list.as_sequence().into_iter().flatten().filter_map(Value::as_str)
+}
+
+#[test]
+fn monitoring_is_pinned_not_root_and_reachable_from_this_machine_only() -> Result<()> {
+    for name in ["prometheus", "grafana"] {
+        let service = monitoring(name)?;
+        let image = service["image"].as_str().and_then(|image| image.split_once(":-")).context("no default image")?.1;
+        let (_, tag) = image.trim_end_matches('}').split_once(':').context("no tag")?;
+        let version: Vec<_> = tag.trim_start_matches('v').split('.').map(str::parse::<u32>).collect();
+        ensure!(version.len() == 3 && version.iter().all(Result::is_ok), "{image} is not one release");
+        let user = service["user"].as_str().context("no user")?;
+        ensure!(user.split(':').all(|number| number.parse::<u32>().is_ok_and(|number| number > 0)), "{user}");
+        ensure!(!service["healthcheck"]["test"].is_null(), "{service:?}");
+        let ports: Vec<_> = words(&service["ports"]).collect();
+        ensure!(matches!(ports[..], [port] if port.starts_with("127.0.0.1:")), "{ports:?}");
+    }
+    Ok(())
+}
+
+#[test]
+fn monitoring_mounts_files_of_the_repository_and_cannot_change_them() -> Result<()> {
+    for name in ["prometheus", "grafana"] {
+        let service = monitoring(name)?;
+        let mut ours = words(&service["volumes"]).filter(|volume| volume.starts_with('.')).peekable();
+        ensure!(ours.peek().is_some(), "{name} is not configured");
+        for volume in ours {
+            let file = volume.split(':').next().unwrap_or_default();
+            ensure!(volume.ends_with(":ro") && root().join("deploy").join(file).exists(), "{volume}");
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn prometheus_keeps_a_bounded_volume() -> Result<()> {
+    let command = command("compose.yaml", "prometheus")?;
+    for bound in ["--storage.tsdb.retention.time=30d", "--storage.tsdb.retention.size=1GB"] {
+        ensure!(command.iter().any(|option| option == bound), "{command:?} lacks {bound}");
+    }
+    Ok(())
+}
+
+/// Prometheus finds the learner, Grafana finds Prometheus, and the dashboard.
+#[test]
+fn monitoring_finds_the_learner_by_the_names_and_ports_of_the_compose_files() -> Result<()> {
+    let prometheus: Value = serde_yaml_ng::from_str(&text("prometheus/prometheus.yml")?)?;
+    let scraped = &prometheus["scrape_configs"][0];
+    for file in ["compose.yaml", "compose.tls.yaml"] {
+        let options = command(file, "learner")?;
+        let port = options.iter().skip_while(|option| *option != "--metrics-port").nth(1).context("no port")?;
+        let targets: Vec<_> = words(&scraped["static_configs"][0]["targets"]).collect();
+        ensure!(targets == [format!("learner:{port}")], "{file}: {targets:?}");
+    }
+    let job = scraped["job_name"].as_str().context("no job")?;
+    ensure!(text("prometheus/rules/comic.yml")?.contains(&format!("up{{job=\"{job}\"}}")), "no rule knows {job}");
+
+    let sources: Value = serde_yaml_ng::from_str(&text("grafana/provisioning/datasources/prometheus.yml")?)?;
+    let source = &sources["datasources"][0];
+    ensure!(source["url"] == "http://prometheus:9090" && source["type"] == "prometheus", "{source:?}");
+    ensure!(source["jsonData"]["timeInterval"] == prometheus["global"]["scrape_interval"], "{source:?}");
+    let providers: Value = serde_yaml_ng::from_str(&text("grafana/provisioning/dashboards/comic.yml")?)?;
+    let folder = providers["providers"][0]["options"]["path"].as_str().context("no folder")?;
+    let grafana = monitoring("grafana")?;
+    let dashboard = format!("{folder}/comic.json");
+    ensure!(
+        words(&grafana["volumes"]).any(|volume| volume == format!("./grafana/comic.json:{dashboard}:ro")),
+        "{folder}"
+    );
+    let home = &grafana["environment"]["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"];
+    ensure!(*home == dashboard.as_str(), "{home:?}");
+    Ok(())
+}
+
+#[test]
+fn whoever_opens_grafana_may_look_and_nobody_can_log_in() -> Result<()> {
+    let settings = monitoring("grafana")?["environment"].clone();
+    for (setting, value) in [
+        ("GF_AUTH_ANONYMOUS_ENABLED", "true"),
+        ("GF_AUTH_ANONYMOUS_ORG_ROLE", "Viewer"),
+        ("GF_SECURITY_DISABLE_INITIAL_ADMIN_CREATION", "true"),
+    ] {
+        ensure!(settings[setting] == value, "{setting}: {:?}", settings[setting]);
     }
     Ok(())
 }

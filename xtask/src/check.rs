@@ -17,7 +17,8 @@ pub(crate) struct TestOptions {
     /// Test the update on XLA instead, on the device that PJRT_DEVICE names or on a CPU; needs torch_xla
     #[arg(long, conflicts_with = "docker")]
     xla: bool,
-    /// Run the long tests of the Python package instead: an algorithm learns on it, the notebooks run; 15 minutes
+    /// Run the long tests of the Python package instead: an algorithm learns on it, the notebooks run, trackers and Optuna
+    /// follow real runs; 20 minutes
     #[arg(long, conflicts_with_all = ["docker", "xla"])]
     python_full: bool,
     /// Arguments for the test runner, for instance a part of a test's name
@@ -113,10 +114,9 @@ fn test_xla(arguments: &[String]) -> Result<()> {
 /// The long tests of the Python package.
 fn test_python(arguments: &[String]) -> Result<()> {
     setup::run(&setup::Options::default())?;
-    python::prepare_tests()?;
     workspace::build()?;
-    python::install_for_tests(&wheel::build()?)?;
-    let mut pytest = python::tool("pytest", python::TESTS)?;
+    python::install(&wheel::build()?, python::FULL)?;
+    let mut pytest = python::tool("pytest", python::FULL)?;
     // Beside python/comic, which has no native module.
     pytest
         .args(["-m", "full", "--capture", "no", "."])
@@ -142,6 +142,11 @@ fn demanding(options: &TestOptions) -> Vec<Demanding> {
             what: "fill a disk of their own: they need root and util-linux",
             // A mount that this process alone sees.
             possible: answers("unshare", &["--mount", "mount", "-t", "tmpfs", "tmpfs", "/mnt"]),
+        },
+        Demanding {
+            prefix: "promtool_",
+            what: "evaluate the alert rules: they need promtool, for instance Debian's package prometheus",
+            possible: answers("promtool", &["--version"]),
         },
         Demanding {
             prefix: "containers_",

@@ -102,20 +102,51 @@ fn the_reference_agrees_with_the_code() {
     );
 }
 
+/// Whether a letter can be in the name of a metric.
+fn in_name(letter: char) -> bool {
+    letter.is_ascii_alphanumeric() || letter == '_'
+}
+
+/// How often the text names a metric. Each of them must exist.
+fn metrics_that_exist(text: &str) -> usize {
+    let known: BTreeSet<String> = Prometheus::default().names().into_iter().collect();
+    let words = text.split(|letter| !in_name(letter));
+    let names: Vec<_> = words.filter(|word| word.starts_with("comic_") || word.starts_with("process_")).collect();
+    for name in &names {
+        assert!(known.contains(*name), "{text}: no metric is called {name}");
+    }
+    names.len()
+}
+
 #[test]
 fn the_dashboard_shows_metrics_that_exist() {
     let dashboard: serde_json::Value = serde_json::from_str(&repository("deploy/grafana/comic.json")).unwrap();
-    let known: BTreeSet<String> = Prometheus::default().names().into_iter().collect();
     let panels = dashboard["panels"].as_array().unwrap();
     let targets = panels.iter().flat_map(|panel| panel["targets"].as_array().into_iter().flatten());
     let expressions: Vec<&str> = targets.map(|target| target["expr"].as_str().unwrap()).collect();
     assert!(expressions.len() > 10, "{expressions:?}");
     for expression in expressions {
-        let words = expression.split(|letter: char| !letter.is_ascii_alphanumeric() && letter != '_');
-        let names: Vec<_> = words.filter(|word| word.starts_with("comic_") || word.starts_with("process_")).collect();
-        assert!(!names.is_empty(), "{expression}");
-        for name in names {
-            assert!(known.contains(name), "{expression}: no metric is called {name}");
-        }
+        // Prometheus itself makes ALERTS.
+        assert!(metrics_that_exist(expression) > 0 || expression.contains("(ALERTS{"), "{expression}");
     }
+}
+
+#[test]
+fn the_alert_rules_ask_for_metrics_labels_and_values_that_exist() {
+    let rules = repository("deploy/prometheus/rules/comic.yml");
+    assert!(metrics_that_exist(&rules) > 10);
+    let reference = Prometheus::default().reference();
+    let mut selections = 0;
+    for (name, rest) in rules.split("comic_").filter_map(|text| text.split_once('{')) {
+        let Some((selection, _)) = rest.split_once('}').filter(|_| name.chars().all(in_name)) else { continue };
+        let (label, values) = selection.split_once('=').unwrap();
+        let row = reference.lines().find(|row| row.starts_with(&format!("| `comic_{name}` |"))).unwrap();
+        let (_, allowed) = row.split_once(&format!("`{label}`: ")).unwrap_or_else(|| panic!("{row}: no label {label}"));
+        let allowed: Vec<_> = allowed.split(" |").next().unwrap().split(", ").collect();
+        for value in values.trim_matches(['~', '"']).split('|') {
+            assert!(allowed.contains(&value), "comic_{name}: {label} is never {value}");
+        }
+        selections += 1;
+    }
+    assert!(selections > 5, "{selections}");
 }
