@@ -44,6 +44,9 @@ pub(crate) fn fixtures(options: &FixtureOptions) -> Result<()> {
 /// The environment of the tests, which also gets the wheel of our own package.
 pub(crate) const TESTS: &str = "requirements-tests.txt";
 
+/// The packages of the long tests of our package, beside those of [`TESTS`].
+pub(crate) const FULL: &str = "requirements-full.txt";
+
 /// Makes the environments in which tests run dm_control, torch and TensorBoard, and kubectl. Takes less than a second if
 /// they exist.
 pub(crate) fn prepare_tests() -> Result<()> {
@@ -52,7 +55,12 @@ pub(crate) fn prepare_tests() -> Result<()> {
 
 /// Installs a wheel in the environment of the tests. Its dependencies are there.
 pub(crate) fn install_for_tests(wheel: &Path) -> Result<()> {
-    let mut pip = Command::new(python_of(TESTS)?);
+    install(wheel, TESTS)
+}
+
+/// Installs a wheel in an environment that has its dependencies.
+pub(crate) fn install(wheel: &Path, requirements: &str) -> Result<()> {
+    let mut pip = Command::new(python_of(requirements)?);
     pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps", "--force-reinstall"]);
     workspace::run(pip.arg(wheel))
 }
@@ -67,9 +75,16 @@ pub(crate) fn tool(name: &str, requirements: &str) -> Result<Command> {
     Ok(command)
 }
 
-/// The Python of the environment for `tests/python/REQUIREMENTS`.
+/// The Python of the environment for `tests/python/REQUIREMENTS`. It is made if it does not exist or has other requirements.
 fn python_of(requirements: &str) -> Result<PathBuf> {
-    environment(&workspace::root().join("tests/python").join(requirements))
+    let files: &[&str] = if requirements == FULL { &[TESTS, FULL] } else { &[requirements] };
+    let mut wanted = String::new();
+    for name in files {
+        let path = workspace::root().join("tests/python").join(name);
+        wanted += &fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+    }
+    let name = Path::new(requirements).file_stem().unwrap_or_default();
+    environment(&workspace::dependencies().join("python").join(name), &wanted)
 }
 
 /// A command that runs `tests/python/SCRIPT` with the packages of `tests/python/REQUIREMENTS`.
@@ -83,28 +98,25 @@ pub(crate) fn script_command(script: &str, requirements: &str) -> Result<Command
     Ok(command)
 }
 
-/// The Python of the environment for `requirements`. It is made if it does not exist or has other requirements.
-fn environment(requirements: &Path) -> Result<PathBuf> {
-    let wanted = fs::read_to_string(requirements).with_context(|| format!("cannot read {}", requirements.display()))?;
-    let name = requirements.file_stem().unwrap_or_default();
-    let directory = workspace::dependencies().join("python").join(name);
+/// The Python of the environment in `directory` with the packages `wanted`.
+fn environment(directory: &Path, wanted: &str) -> Result<PathBuf> {
     let python = directory.join("bin/python");
     let stamp = directory.join("requirements.txt");
     if fs::read_to_string(&stamp).is_ok_and(|made| made == wanted) {
         return Ok(python);
     }
     eprintln!("making a Python environment in {}", directory.display());
-    let _ = fs::remove_dir_all(&directory);
-    let made = workspace::run(Command::new("python3").args(["-m", "venv"]).arg(&directory));
+    let _ = fs::remove_dir_all(directory);
+    let made = workspace::run(Command::new("python3").args(["-m", "venv"]).arg(directory));
     made.context("python3 cannot make environments (Debian and Ubuntu: apt install python3-venv)")?;
-    install(&python, &directory, &wanted)?;
+    install_packages(&python, directory, wanted)?;
     fs::write(&stamp, wanted).with_context(|| format!("cannot write {}", stamp.display()))?;
     Ok(python)
 }
 
 /// Installs the packages. PyPI's only wheel of torch for Linux is the one for CUDA. It is installed without the gigabytes
 /// of NVIDIA's libraries, and `tests/python/bare_torch.py` makes it importable.
-fn install(python: &Path, directory: &Path, requirements: &str) -> Result<()> {
+fn install_packages(python: &Path, directory: &Path, requirements: &str) -> Result<()> {
     let pip = |arguments: &[&str]| {
         let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"];
         workspace::run(Command::new(python).args(pip).args(arguments))
