@@ -1,11 +1,13 @@
 //! The run path, as for every crate, and the C++ files for devices: CUDA where libtorch has it, XLA with `--features xla`.
 //! XLA also needs the directories of Python and of its packages.
 
+#[path = "../setup/cpp.rs"]
+mod cpp;
 #[allow(dead_code, reason = "its own `main` is for crates that need no more")]
 #[path = "../setup/rpath.rs"]
 mod rpath;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 fn main() {
     rpath::write_run_path();
@@ -20,25 +22,15 @@ fn cuda() {
     let Some(libtorch) = std::env::var_os("LIBTORCH").map(PathBuf::from) else { return };
     if rpath::link_cuda() {
         println!("cargo:rustc-cfg=cuda");
-        cpp(&libtorch, "src/device/cuda.cpp").compile("comic_cuda");
+        cpp::with_libtorch(&libtorch, "src/device/cuda.cpp").compile("comic_cuda");
     }
-}
-
-/// A C++ file that is compiled with libtorch's headers.
-fn cpp(libtorch: &Path, file: &str) -> cc::Build {
-    println!("cargo:rerun-if-changed={file}");
-    let include = libtorch.join("include");
-    let mut build = cc::Build::new();
-    build.cpp(true).std("c++17").warnings(false).define("_GLIBCXX_USE_CXX11_ABI", "1");
-    build.include(&include).include(include.join("torch/csrc/api/include")).file(file);
-    build
 }
 
 #[cfg(feature = "xla")]
 fn xla() {
     let libtorch = PathBuf::from(std::env::var_os("LIBTORCH").expect("LIBTORCH is not set: `cargo xtask setup --xla`"));
     // The object file registers itself and no symbol refers to it, so all of it is linked.
-    cpp(&libtorch, "src/device/xla.cpp").cargo_metadata(false).compile("comic_xla");
+    cpp::with_libtorch(&libtorch, "src/device/xla.cpp").cargo_metadata(false).compile("comic_xla");
     println!("cargo:rustc-link-search=native={}", std::env::var("OUT_DIR").expect("cargo sets OUT_DIR"));
     println!("cargo:rustc-link-lib=static:+whole-archive,-bundle=comic_xla");
     println!("cargo:rustc-link-lib=stdc++");

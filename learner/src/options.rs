@@ -69,7 +69,7 @@ pub enum Command {
         /// policy (everything that acts, for all tasks), policy:TASK (for one task), encoder:TASK, or low-level.
         #[arg(long)]
         part: Part,
-        /// The file: NAME.safetensors, or NAME.pt for a policy of one task as TorchScript.
+        /// The file: NAME.safetensors; or, for a policy of one task, NAME.pt for TorchScript or NAME.onnx for ONNX.
         #[arg(long, value_name = "FILE")]
         out: PathBuf,
     },

@@ -89,15 +89,22 @@ pub enum Error {
         /// What is wrong, and what to do.
         problem: String,
     },
-    /// The part cannot be exported as TorchScript, because it is not a policy of one task.
+    /// The part cannot be exported as TorchScript or ONNX, because it is not a policy of one task.
     #[error(
-        "only a policy of one task can be exported as TorchScript, not `{part}`: export policy:TASK; tasks are {tasks}"
+        "only a policy of one task can be exported as TorchScript or ONNX, not `{part}`: export policy:TASK; tasks are \
+         {tasks}"
     )]
     Script {
         /// The requested part.
         part: String,
         /// The tasks of the experiment.
         tasks: String,
+    },
+    /// The policy has an operator that cannot be written as ONNX.
+    #[error("the policy cannot be written as ONNX: {problem}; export it as TorchScript, to a file .pt")]
+    Onnx {
+        /// What cannot be written.
+        problem: String,
     },
     /// The file is longer than any policy.
     #[error("the file has more than {most} bytes, which is more than a policy can have")]

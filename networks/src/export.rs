@@ -8,7 +8,8 @@
 //!   policy from a checkpoint can read it from a file, and transfer learning can load the low level by name.
 //! - [`Exported::open_or_builtin`] also knows the low level that is compiled into the programs. A [`Card`] in a low level's file
 //!   says how that was made, and what it does.
-//! - [`Exported::save_script`] writes the same policy as TorchScript, for programs that do not know this format.
+//! - [`Exported::save_script`] writes the same policy as TorchScript, and [`Exported::to_onnx`] as ONNX, for programs that do
+//!   not know this format.
 //!
 //! Files may come from anywhere. Networks are built only if the file has the number of weights that its experiment
 //! describes. A file is accepted only after every name, shape and number was checked.
@@ -16,6 +17,7 @@
 mod builtin;
 mod card;
 mod file;
+mod onnx;
 mod part;
 mod script;
 mod spec;

@@ -17,13 +17,14 @@ pub(crate) fn linear(path: &nn::Path, input: i64, output: i64, scale: f64) -> nn
     )
 }
 
-/// Reshapes `[.., D]` to rows `[N, D]`. Rows stay as they are: the trace of an exported policy must not contain their number.
+/// Reshapes `[.., D]` to rows `[N, D]`. The trace of an exported policy must not contain their number.
 pub(crate) fn rows(tensor: &Tensor) -> Tensor {
     let size = tensor.size();
     match size.split_last() {
         None => tensor.reshape([1, 1]),
         Some((_, [_])) => tensor.shallow_clone(),
-        // The number of rows is given explicitly: −1 is ambiguous if the width is 0.
+        Some((width, _)) if *width > 0 => tensor.reshape([-1, *width]),
+        // −1 is ambiguous if the width is 0.
         Some((width, leading)) => tensor.reshape([leading.iter().product(), *width]),
     }
 }

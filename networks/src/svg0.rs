@@ -146,15 +146,16 @@ impl Core {
     /// Features h `[B, T, H]` of observations `[B, T, ·]`, and the state after the last row, `[B, S]`.
     pub fn forward(&self, observation: &NormalisedObservation, recurrent: RecurrentState<'_>) -> (Tensor, Tensor) {
         let NormalisedObservation { proprioception, task, .. } = observation;
-        let size = proprioception.size();
-        let (unrolls, steps) = (size[0], size[1]);
+        let steps = proprioception.size()[1];
         let mut parts = vec![self.proprioception.forward(&rows(proprioception))];
         let task = rows(task);
         if let Some(encoder) = &self.task {
             parts.push(encoder.forward(&task.narrow(1, 0, self.task_size)));
         }
         parts.push(task.narrow(1, self.task_size, task.size()[1] - self.task_size));
-        let encoded = Tensor::cat(&parts, 1).reshape([unrolls, steps, -1]);
+        let encoded = Tensor::cat(&parts, 1);
+        // The trace of an exported policy must not contain the number of unrolls.
+        let encoded = encoded.reshape([-1, steps, encoded.size()[1]]);
         self.lstm.forward(&encoded, recurrent)
     }
 

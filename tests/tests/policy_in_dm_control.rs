@@ -1,6 +1,6 @@
 //! `comic-learner export` end to end: the exported policy acts in `comic-actor evaluate` as its checkpoint does, and gets
 //! the same rewards in dm_control's own environment, which a script of ten statements drives. A policy that sees acts in
-//! dm_control's own corridor.
+//! dm_control's own corridor. As ONNX a policy acts in onnxruntime.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -175,6 +175,32 @@ async fn opengl_an_exported_policy_sees_in_dm_controls_gaps() -> Result<()> {
     Ok(())
 }
 
+/// `run_onnx.py` runs both files on golden observations. The networks' own tests compare all kinds of policies.
+#[tokio::test]
+async fn an_exported_policy_acts_in_onnxruntime_as_in_pytorch() -> Result<()> {
+    let system = trained_run("lstm").await?;
+    let directory = tempfile::tempdir()?;
+    for name in ["policy.onnx", "policy.pt"] {
+        export(&system.run(), "policy", &directory.path().join(name))?;
+    }
+    let mut script = Command::new(python()?);
+    script.arg(root().join("tests/python/run_onnx.py")).arg(directory.path());
+    let lines = String::from_utf8(succeeds(&mut script)?.stdout)?;
+    let steps: Vec<Value> = lines.lines().map(serde_json::from_str).collect::<Result<_, _>>()?;
+    ensure!(steps.len() >= 3, "{} steps", steps.len());
+    let rows = |rows: &Value| -> Result<Vec<Vec<f64>>> { Ok(serde_json::from_value(rows.clone())?) };
+    for step in &steps {
+        let [action, memory] = ["action", "next_recurrent_state"].map(|name| rows(&step["outputs"][name]));
+        for ((mut found, memory), expected) in action?.into_iter().zip(memory?).zip(rows(&step["torch"])?) {
+            found.extend(memory);
+            ensure!(found.len() == expected.len(), "{} numbers, not {}", found.len(), expected.len());
+            let largest = found.iter().zip(&expected).map(|(one, other)| (one - other).abs()).fold(0.0, f64::max);
+            ensure!(largest < 1e-5, "the outputs differ by {largest}");
+        }
+    }
+    Ok(())
+}
+
 #[tokio::test]
 async fn a_file_that_is_no_policy_is_refused_and_the_error_names_the_remedy() -> Result<()> {
     let system = trained_run("mlp").await?;
@@ -186,7 +212,7 @@ async fn a_file_that_is_no_policy_is_refused_and_the_error_names_the_remedy() ->
     for (part, out, remedy) in [
         ("encoder:gaps", "encoder.safetensors", "tracking"),
         ("low-level", "low-level.pt", "policy:TASK"),
-        ("policy", "policy.onnx", ".safetensors"),
+        ("policy", "policy.tflite", ".safetensors"),
     ] {
         let refused = export(&system.run(), part, &directory.path().join(out)).err();
         let refused = refused.context("exported")?.to_string();

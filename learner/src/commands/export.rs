@@ -15,25 +15,26 @@ use crate::error::{Error, Result};
 enum Format {
     Safetensors,
     TorchScript,
+    Onnx,
 }
 
 /// Writes `part` of the newest checkpoint at `path` to `out`. It is a part of the online policy, as in evaluations.
 ///
 /// # Errors
-/// [`Error::Configuration`] when `path` names no whole checkpoint; no such part in it, an extension other than `.safetensors`
-/// and `.pt`, or a disk that fails.
+/// [`Error::Configuration`] when `path` names no whole checkpoint; no such part in it, an extension other than `.safetensors`,
+/// `.pt` and `.onnx`, or a disk that fails.
 pub fn run(path: &Path, part: Part, out: &Path) -> Result<()> {
     let format = format_of(out)?;
     let (place, snapshot) = checkpoint::find(path)?;
     let exported =
         read(&place, part, &snapshot).map_err(Error::within(format!("cannot export {}", place.display())))?;
-    let written = match format {
-        Format::Safetensors => std::fs::write(out, &exported.bytes).map_err(Error::file("write", out)),
-        Format::TorchScript => {
-            exported.save_script(out).map_err(Error::within(format!("cannot write {}", out.display())))
-        }
-    };
-    written?;
+    let failed = || Error::within(format!("cannot write {}", out.display()));
+    let write = |bytes: &[u8]| std::fs::write(out, bytes).map_err(Error::file("write", out));
+    match format {
+        Format::Safetensors => write(&exported.bytes)?,
+        Format::TorchScript => exported.save_script(out).map_err(failed())?,
+        Format::Onnx => write(&exported.to_onnx().map_err(failed())?)?,
+    }
     tracing::info!(checkpoint = %place.display(), %part, out = %out.display(), "exported");
     Ok(())
 }
@@ -42,9 +43,11 @@ fn format_of(out: &Path) -> Result<Format> {
     match out.extension().and_then(|extension| extension.to_str()) {
         Some("safetensors") => Ok(Format::Safetensors),
         Some("pt") => Ok(Format::TorchScript),
-        _ => {
-            Err(Error::configuration(format!("--out {}: name it .safetensors, or .pt for TorchScript", out.display())))
-        }
+        Some("onnx") => Ok(Format::Onnx),
+        _ => Err(Error::configuration(format!(
+            "--out {}: name it .safetensors, .pt for TorchScript, or .onnx for ONNX",
+            out.display()
+        ))),
     }
 }
 

@@ -27,6 +27,15 @@ impl Exported {
     /// # Errors
     /// [`Error::Script`] if the part is not a policy of one task; [`Error::Torch`]; [`Error::File`].
     pub fn save_script(&self, path: &Path) -> Result<(), Error> {
+        self.trace()?.0.save(path)?;
+        self.enclose(path).map_err(Error::File)
+    }
+
+    /// The policy of one task as a module, and examples of its inputs, `[1, size]` each.
+    ///
+    /// # Errors
+    /// [`Error::Script`] if the part is not a policy of one task; [`Error::Torch`].
+    pub(super) fn trace(&self) -> Result<(CModule, Vec<Tensor>), Error> {
         let sizes = task_spec(&self.experiment)?;
         let refused = || {
             let tasks: Vec<&str> = sizes.tasks.iter().map(|task| task.name.as_str()).collect();
@@ -53,8 +62,7 @@ impl Exported {
             _ => Vec::new(),
         };
         let module = tch::no_grad(|| CModule::create_by_tracing("Policy", "forward", &inputs, &mut forward))?;
-        module.save(path)?;
-        self.enclose(path).map_err(Error::File)
+        Ok((module, inputs))
     }
 
     /// Adds the description to the archive. PyTorch reads extra files from its directory `extra`; the function of tch

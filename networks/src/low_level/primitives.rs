@@ -23,8 +23,9 @@ pub(crate) struct Primitives {
     heads: Tensor,
     /// `[K, 1, 2·A]`.
     head_biases: Tensor,
-    /// K numbers that are not trained. Each is added to every dimension of one primitive's mean.
-    fixed_biases: Option<Vec<f32>>,
+    /// K numbers that are not trained, `[K, 1]`. Each is added to every dimension of one primitive's mean. A tensor that is made
+    /// of numbers while a policy is traced would be zeros in the trace.
+    fixed_biases: Option<Tensor>,
     count: i64,
     min_std: f64,
 }
@@ -44,7 +45,7 @@ impl Primitives {
         let bias: Vec<f32> = config.pose.iter().copied().chain(std::iter::repeat_n(raw, config.pose.len())).collect();
         let bias = Tensor::from_slice(&bias).expand_as(&head_biases);
         tch::no_grad(|| head_biases.shallow_clone().copy_(&bias));
-        let fixed_biases = sizes.biases.then(|| evenly(sizes.count));
+        let fixed_biases = sizes.biases.then(|| Tensor::from_slice(&evenly(sizes.count)).unsqueeze(-1));
         Self { torso, hidden, heads, head_biases, fixed_biases, count, min_std: network.min_std }
     }
 
@@ -57,7 +58,7 @@ impl Primitives {
         let actions = output.size()[2] / 2;
         let mean = output.narrow(2, 0, actions);
         let mean = match &self.fixed_biases {
-            Some(biases) => mean + Tensor::from_slice(biases).to_device(output.device()).unsqueeze(-1),
+            Some(biases) => mean + biases.to_device(output.device()),
             None => mean,
         };
         let std = output.narrow(2, actions, actions).softplus() + self.min_std;

@@ -1,0 +1,13 @@
+//! Compiles the few C++ files that call what libtorch has and tch lacks.
+
+use std::path::Path;
+
+/// A C++ file that is compiled with libtorch's headers.
+pub(crate) fn with_libtorch(libtorch: &Path, file: &str) -> cc::Build {
+    println!("cargo:rerun-if-changed={file}");
+    let include = libtorch.join("include");
+    let mut build = cc::Build::new();
+    build.cpp(true).std("c++17").warnings(false).define("_GLIBCXX_USE_CXX11_ABI", "1");
+    build.include(&include).include(include.join("torch/csrc/api/include")).file(file);
+    build
+}
