@@ -26,5 +26,6 @@ mod store;
 pub use best::{Evaluated, Judgement};
 pub use name::Name;
 pub use snapshot::{Snapshot, find, read};
+pub(crate) use steps::replace_file;
 pub use store::Store;
 pub(crate) use store::incompatible;

@@ -2,12 +2,16 @@
 
 mod catalogue;
 pub mod evaluation;
+mod evaluation_history;
 mod evaluation_writer;
 mod films;
 pub mod heartbeat;
 mod heat_map;
+mod lines;
 pub mod metrics_file;
+mod page;
 pub mod probes;
 pub mod prometheus;
 mod tensorboard;
+mod thinned;
 mod whole;

@@ -66,6 +66,18 @@ pub(super) fn replace(path: &Path, bytes: Vec<u8>) -> [Step<'static>; 4] {
     [Step::Write(temporary.clone(), bytes.into()), Step::SyncFile(temporary), rename, sync]
 }
 
+/// Replaces a file that is no checkpoint. If the disk refuses, the former one stays, and nothing else is left.
+///
+/// # Errors
+/// When the disk refuses, with the path.
+pub(crate) fn replace_file(path: &Path, bytes: Vec<u8>) -> Result<()> {
+    let replaced = carry_out(&replace(path, bytes));
+    if replaced.is_err() {
+        drop(remove(&hidden("", path)));
+    }
+    replaced
+}
+
 /// Gives a file or directory that is whole and synced its final name.
 pub(super) fn put(temporary: PathBuf, path: &Path) -> [Step<'static>; 2] {
     let directory = path.parent().unwrap_or(path).to_path_buf();

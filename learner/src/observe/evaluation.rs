@@ -26,6 +26,11 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
+    /// Whether its place in the run is known. Only the initial checkpoint has no environment steps.
+    pub(super) fn has_place(&self) -> bool {
+        self.environment_steps > 0 || self.updates == 0
+    }
+
     /// The result that checkpoints are compared by; `None` if the report has no mean.
     pub(crate) fn evaluated(&self) -> Option<Evaluated> {
         let report: serde_json::Value = serde_json::from_str(&self.json).ok()?;

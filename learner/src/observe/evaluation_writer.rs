@@ -1,65 +1,62 @@
 //! Keeps the evaluations that actors report: lines of `RUN/evaluations.jsonl`, films in `RUN/films`, and curves and images
 //! for TensorBoard.
 
-use std::fs::File;
-use std::io::{self, BufRead as _, BufReader, Read as _};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
 use crate::error::{Error, Result};
 use crate::observe::evaluation::Evaluation;
+use crate::observe::evaluation_history::{EvaluationHistory, Summary, clips};
 use crate::observe::films::Films;
-use crate::observe::heat_map::HeatMap;
-use crate::observe::tensorboard::{Events, SummaryValue};
+use crate::observe::lines;
+use crate::observe::tensorboard::{Events, SummaryValue, points};
 use crate::observe::whole::Whole;
 
 /// Most clips that have a curve each. With more, TensorBoard's list of curves is hard to use.
 const MOST_CLIP_CURVES: usize = 64;
-/// Bytes of the longest name of a clip. Longer ones are not shown, because names come from the network.
-const LONGEST_NAME: usize = 200;
 
-/// Writes evaluations, and remembers their clips' rewards for the heat map.
+/// Writes evaluations, and remembers what is shown of them.
 #[derive(Debug)]
 pub(super) struct EvaluationWriter {
     lines: PathBuf,
     films: Films,
-    /// Updates and normalised reward of the best evaluation.
-    best: Option<(u64, f64)>,
-    heat_map: HeatMap,
+    history: EvaluationHistory,
 }
 
 impl EvaluationWriter {
     /// Writes into the directory `run`.
     pub(super) fn new(run: &Path) -> Self {
         let lines = run.join("evaluations.jsonl");
-        let mut writer = Self { films: Films::new(run), best: None, heat_map: HeatMap::new(), lines };
+        let mut writer = Self { films: Films::new(run), history: EvaluationHistory::new(), lines };
         writer.recall().unwrap_or_else(|error| tracing::error!("{}: {error}", writer.lines.display()));
         writer
     }
 
-    /// Finds the best of the evaluations that the run has.
+    /// Remembers the evaluations that the run has. A line that cannot be read is left out.
     fn recall(&mut self) -> io::Result<()> {
-        let file = match File::open(&self.lines) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
-            file => file?,
-        };
-        let length = file.metadata()?.len();
-        for line in BufReader::new(file.take(length)).split(b'\n') {
-            let line: Value = serde_json::from_slice(&line?).unwrap_or_default();
-            self.compare(line["updates"].as_u64(), &line["evaluation"]);
-        }
-        Ok(())
+        let (films, history) = (&self.films, &mut self.history);
+        lines::for_each(&self.lines, |line| {
+            let line: Value = serde_json::from_slice(line).unwrap_or_default();
+            let Some(updates) = line["updates"].as_u64() else { return };
+            let evaluation = Evaluation {
+                updates,
+                epoch: line["learner_epoch"].as_u64().unwrap_or_default(),
+                environment_steps: line["environment_steps"].as_u64().unwrap_or_default(),
+                seconds: line["seconds"].as_f64().unwrap_or_default(),
+                ..Evaluation::default()
+            };
+            history.add(&evaluation, &line["evaluation"]);
+            if films.has(updates) {
+                history.add_film();
+            }
+        })
     }
 
-    /// Remembers the best evaluation.
-    fn compare(&mut self, updates: Option<u64>, report: &Value) {
-        let reward = report["overall"]["normalised_reward"].as_f64();
-        if let Some((updates, reward)) = updates.zip(reward)
-            && self.best.is_none_or(|(_, best)| reward > best)
-        {
-            self.best = Some((updates, reward));
-        }
+    /// What is shown of the evaluations.
+    pub(super) fn summary(&self) -> Summary<'_> {
+        self.history.summary(&self.films)
     }
 
     /// Keeps an evaluation. What the disk refuses is logged, and the rest is kept. A report or a film that is not as expected
@@ -72,19 +69,17 @@ impl EvaluationWriter {
         if let Err(error) = self.append(evaluation, &report) {
             tracing::error!(version, "an evaluation is lost: {}", comic_proto::chain(&error));
         }
-        self.compare(Some(evaluation.updates), &report);
+        self.history.add(evaluation, &report);
         let film_size = gif_size(&evaluation.film);
-        let best = self.best.map(|(updates, _)| updates);
-        if film_size.is_some()
-            && let Err(error) = self.films.write(evaluation.updates, &evaluation.film, best)
-        {
-            tracing::error!(version, "an evaluation's film is lost: {error}");
-        }
-        if film_size.is_none() && !evaluation.film.is_empty() {
+        if film_size.is_some() {
+            match self.films.write(evaluation.updates, &evaluation.film, self.history.best()) {
+                Ok(()) => self.history.add_film(),
+                Err(error) => tracing::error!(version, "an evaluation's film is lost: {error}"),
+            }
+        } else if !evaluation.film.is_empty() {
             tracing::warn!(version, "an evaluation's film is ignored, because it is no GIF");
         }
-        let steps_are_unknown = evaluation.environment_steps == 0 && evaluation.updates > 0;
-        if let Some(events) = events.filter(|_| !steps_are_unknown)
+        if let Some(events) = events.filter(|_| evaluation.has_place())
             && let Err(error) = self.show(evaluation, &report, film_size, events)
         {
             tracing::error!(version, "TensorBoard's file lacks an evaluation: {error}");
@@ -108,35 +103,27 @@ impl EvaluationWriter {
 
     /// Writes curves, the film and the heat map of all evaluations for TensorBoard.
     fn show(
-        &mut self,
+        &self,
         evaluation: &Evaluation,
         report: &Value,
         film_size: Option<(u16, u16)>,
         events: &mut Events,
     ) -> io::Result<()> {
-        let mut values = SummaryValue::scalars("evaluation", &report["overall"]);
+        let mut values = points("evaluation", &report["overall"]);
         let clips = clips(report);
         if clips.len() <= MOST_CLIP_CURVES {
             let tag = |clip: &str| format!("evaluation_clips/{clip}/normalised_reward");
-            values.extend(clips.iter().map(|(clip, reward)| SummaryValue::scalar(tag(clip), *reward)));
+            values.extend(clips.iter().map(|(clip, reward, _)| SummaryValue::scalar(tag(clip), *reward)));
         }
         if let Some(size) = film_size {
             values.push(SummaryValue::image("evaluation/film", size, evaluation.film.clone()));
         }
         if clips.len() > 1 {
-            self.heat_map.add(&clips);
-            let picture = self.heat_map.draw()?;
+            let picture = self.history.heat_map().draw()?;
             values.push(SummaryValue::image("evaluation/clips", picture.size, picture.bytes.into()));
         }
         events.write_values(evaluation.environment_steps, values)
     }
-}
-
-/// The clips of a report with their normalised rewards, in the report's order.
-fn clips(report: &Value) -> Vec<(&str, f64)> {
-    let clips = report["clips"].as_array().into_iter().flatten();
-    let named = clips.filter_map(|clip| Some((clip["clip"].as_str()?, clip["normalised_reward"].as_f64()?)));
-    named.filter(|(clip, _)| clip.len() <= LONGEST_NAME).collect()
 }
 
 /// Width and height of a GIF, pixels, from its header. `None` if the bytes do not begin like a GIF; nothing else is checked.
@@ -238,6 +225,15 @@ mod tests {
     }
 
     #[test]
+    fn a_restarted_learner_continues_the_heat_map() {
+        let run = tempfile::tempdir().unwrap();
+        kept(run.path(), &[1, 2].map(|updates| evaluation(updates, &[("walk", 0.5), ("run", 1.0)])));
+        let writer = EvaluationWriter::new(run.path());
+        let steps: Vec<u64> = writer.history.heat_map().columns().map(|(steps, _)| steps).collect();
+        assert_eq!(steps, [4096, 8192]);
+    }
+
+    #[test]
     fn many_clips_have_no_curves_and_a_single_one_has_no_heat_map() {
         let names: Vec<String> = (0..65).map(|number| format!("clip {number}")).collect();
         let many: Vec<(&str, f64)> = names.iter().map(|name| (name.as_str(), 0.5)).collect();
@@ -264,7 +260,7 @@ mod tests {
 
     #[test]
     fn a_report_of_another_shape_costs_nothing_but_its_curves() {
-        let long = "x".repeat(LONGEST_NAME + 1);
+        let long = "x".repeat(201);
         let clip = json!({ "clip": long, "normalised_reward": 1 });
         let reports = [
             "broken".to_owned(),

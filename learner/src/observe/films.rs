@@ -10,7 +10,7 @@ const BUDGET: u64 = 64 << 20;
 /// `RUN/films`: a film is named by the updates of its checkpoint.
 #[derive(Debug)]
 pub(super) struct Films {
-    directory: PathBuf,
+    run: PathBuf,
     budget: u64,
 }
 
@@ -24,7 +24,21 @@ struct Film {
 impl Films {
     /// The films of `run`.
     pub(super) fn new(run: &Path) -> Self {
-        Self { directory: run.join("films"), budget: BUDGET }
+        Self { run: run.to_path_buf(), budget: BUDGET }
+    }
+
+    fn directory(&self) -> PathBuf {
+        self.run.join("films")
+    }
+
+    /// The path of a film within the run's directory.
+    pub(super) fn path(updates: u64) -> String {
+        format!("films/{updates:010}.gif")
+    }
+
+    /// Whether there is a film of the checkpoint after so many updates.
+    pub(super) fn has(&self, updates: u64) -> bool {
+        self.run.join(Self::path(updates)).is_file()
     }
 
     /// Writes `UPDATES.gif`, with as many digits as the name of the checkpoint. Beyond the budget it first removes others where
@@ -33,9 +47,9 @@ impl Films {
     /// # Errors
     /// When the disk refuses.
     pub(super) fn write(&self, updates: u64, film: &[u8], best: Option<u64>) -> io::Result<()> {
-        fs::create_dir_all(&self.directory)?;
+        fs::create_dir_all(self.directory())?;
         self.make_room(updates, film.len() as u64, best)?;
-        let path = self.directory.join(format!("{updates:010}.gif"));
+        let path = self.run.join(Self::path(updates));
         let written = fs::write(&path, film);
         if written.is_err() {
             // Half a film would look like a whole one.
@@ -63,7 +77,7 @@ impl Films {
     /// The films, oldest first. Other files are not this learner's.
     fn list(&self) -> io::Result<Vec<Film>> {
         let mut films = Vec::new();
-        for entry in fs::read_dir(&self.directory)? {
+        for entry in fs::read_dir(self.directory())? {
             let path = entry?.path();
             let updates = path.extension().filter(|extension| *extension == "gif").and(path.file_stem());
             if let Some(updates) = updates.and_then(|stem| stem.to_str()?.parse().ok()) {

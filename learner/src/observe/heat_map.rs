@@ -2,6 +2,8 @@
 
 use std::io;
 
+use crate::observe::thinned::{Entry, Thinned};
+
 /// Most columns. When there would be more, each two neighbours become one.
 const COLUMNS: usize = 256;
 /// Most rows.
@@ -30,44 +32,61 @@ pub(super) struct Png {
     pub(super) bytes: Vec<u8>,
 }
 
-/// The normalised rewards of the evaluations so far, in at most 256 columns and 256 rows.
-///
-/// It is kept in memory only. After a restart of the learner it begins anew, without the evaluations of earlier epochs.
+/// The normalised rewards of the evaluations so far, in at most 256 columns and 256 rows. Evaluations that share a column are
+/// shown by the newest of them.
 #[derive(Clone, Debug)]
 pub(super) struct HeatMap {
     /// The rows: clips in the order in which reports named them first.
     clips: Vec<String>,
-    /// The level of each row, oldest column first.
-    columns: Vec<[u8; ROWS]>,
-    /// Evaluations that share a column, which shows the newest of them.
-    every: usize,
-    seen: usize,
+    columns: Thinned<Column>,
+}
+
+/// An evaluation, or several neighbours.
+#[derive(Clone, Debug)]
+struct Column {
+    /// The learner epoch and the environment steps.
+    place: (u64, u64),
+    /// The level of each row.
+    levels: [u8; ROWS],
+}
+
+impl Entry for Column {
+    fn place(&self) -> (u64, u64) {
+        self.place
+    }
+
+    fn absorb(&mut self, newer: Self) {
+        *self = newer;
+    }
 }
 
 impl HeatMap {
     /// A map without evaluations.
     pub(super) fn new() -> Self {
-        Self { clips: Vec::new(), columns: Vec::new(), every: 1, seen: 0 }
+        Self { clips: Vec::new(), columns: Thinned::new(COLUMNS) }
     }
 
-    /// Adds an evaluation: clips and their normalised rewards, in the report's order. Clips for which no row is left are
-    /// ignored.
-    pub(super) fn add(&mut self, rewards: &[(&str, f64)]) {
-        let mut column = [GAP; ROWS];
+    /// Adds an evaluation at this learner epoch and these environment steps: clips and their normalised rewards, in the report's
+    /// order. Clips for which no row is left are ignored.
+    pub(super) fn add(&mut self, place: (u64, u64), rewards: &[(&str, f64)]) {
+        let mut levels = [GAP; ROWS];
         for (clip, reward) in rewards.iter().take(ROWS) {
             if let Some(row) = self.row(clip) {
-                column[row] = level(*reward);
+                levels[row] = level(*reward);
             }
         }
-        if !self.seen.is_multiple_of(self.every) {
-            // The newest evaluation replaces the one that it shares its column with.
-            self.columns.pop();
-        } else if self.columns.len() == COLUMNS {
-            self.columns = self.columns.iter().copied().skip(1).step_by(2).collect();
-            self.every *= 2;
-        }
-        self.columns.push(column);
-        self.seen += 1;
+        self.columns.add(Column { place, levels });
+    }
+
+    /// The clips, a row each.
+    pub(super) fn clips(&self) -> &[String] {
+        &self.clips
+    }
+
+    /// The environment steps of each column and the levels of its rows, oldest first. A level is 0 where there is no result, and
+    /// from 1 to 255 for a normalised reward from 0 to 1.
+    pub(super) fn columns(&self) -> impl ExactSizeIterator<Item = (u64, &[u8])> {
+        self.columns.iter().map(|column| (column.place.1, &column.levels[..self.clips.len()]))
     }
 
     /// The row of a clip: its own or a new one. `None` if all rows are taken.
@@ -85,12 +104,12 @@ impl HeatMap {
     /// # Errors
     /// When the map is empty.
     pub(super) fn draw(&self) -> io::Result<Png> {
-        let (columns, rows) = (self.columns.len(), self.clips.len());
+        let (columns, rows) = (self.columns().len(), self.clips.len());
         let cell = (SIDE / columns.max(rows).max(1)).clamp(SMALLEST_CELL, LARGEST_CELL);
         let (width, height) = (columns * cell, rows * cell);
         let mut pixels = Vec::with_capacity(width * height);
         for row in 0..rows {
-            let levels = self.columns.iter().map(|column| column[row]);
+            let levels = self.columns().map(|(_, levels)| levels[row]);
             let line: Vec<u8> = levels.flat_map(|level| std::iter::repeat_n(level, cell)).collect();
             for _ in 0..cell {
                 pixels.extend_from_slice(&line);
@@ -158,8 +177,8 @@ mod tests {
     #[test]
     fn rows_are_clips_and_columns_are_evaluations_oldest_left() {
         let mut map = HeatMap::new();
-        map.add(&[("walk", 0.0), ("run", 0.5)]);
-        map.add(&[("run", 1.0), ("jump", -3.0)]);
+        map.add((1, 10), &[("walk", 0.0), ("run", 0.5)]);
+        map.add((1, 20), &[("run", 1.0), ("jump", -3.0)]);
         let (colours, cell) = cells(&map.draw().unwrap(), 2);
         let [dark, _, middle, _, bright] = COLOURS;
         assert_eq!(colours, [dark, GAP_COLOUR, middle, bright, GAP_COLOUR, dark]);
@@ -183,14 +202,15 @@ mod tests {
     fn the_history_stays_bounded_and_shows_the_newest_evaluation() {
         let mut map = HeatMap::new();
         for evaluation in 0..1000 {
-            let reward = f64::from(evaluation) / 999.0;
-            map.add(&[("walk", reward), ("run", reward)]);
-            assert!(map.columns.len() <= COLUMNS, "{evaluation}");
-            assert_eq!(map.columns.last().unwrap()[0], level(reward), "{evaluation}");
+            let reward = evaluation as f64 / 999.0;
+            map.add((1, evaluation), &[("walk", reward), ("run", reward)]);
+            assert!(map.columns().len() <= COLUMNS, "{evaluation}");
+            let (steps, levels) = map.columns().last().unwrap();
+            assert_eq!((steps, levels), (evaluation, &[level(reward); 2][..]));
         }
-        assert!(map.columns.len() > COLUMNS / 2 && map.columns.is_sorted());
+        assert!(map.columns().len() > COLUMNS / 2 && map.columns().is_sorted());
         let picture = map.draw().unwrap();
-        assert_eq!(picture.size, ((SMALLEST_CELL * map.columns.len()) as u16, 2 * SMALLEST_CELL as u16));
+        assert_eq!(picture.size, ((SMALLEST_CELL * map.columns().len()) as u16, 2 * SMALLEST_CELL as u16));
     }
 
     #[test]
@@ -198,9 +218,9 @@ mod tests {
         let names: Vec<String> = (0..600).map(|number| format!("clip {number}")).collect();
         let rewards: Vec<(&str, f64)> = names.iter().map(|name| (name.as_str(), 1.0)).collect();
         let mut map = HeatMap::new();
-        map.add(&rewards[..300]);
-        map.add(&rewards[300..]);
-        assert_eq!(map.clips, names[..ROWS]);
-        assert_eq!(map.columns[1], [GAP; ROWS], "no row was left");
+        map.add((1, 10), &rewards[..300]);
+        map.add((1, 20), &rewards[300..]);
+        assert_eq!(map.clips(), &names[..ROWS]);
+        assert_eq!(map.columns().nth(1), Some((20, &[GAP; ROWS][..])), "no row was left");
     }
 }

@@ -5,7 +5,7 @@ use std::ops::AddAssign;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use comic_experiment::{TaskPart, TaskSpec};
+use comic_experiment::{Experiment, TaskPart, TaskSpec};
 use comic_proto::Field;
 use comic_proto::v1::{EpisodeEnd, EpisodeStatistics, UnrollHeader};
 use comic_replay::{AccountingByTask, Batch};
@@ -16,6 +16,7 @@ use crate::algorithm::replay::ReplayReport;
 use crate::error::{Error, Result};
 use crate::observe::evaluation::Evaluation;
 use crate::observe::evaluation_writer::EvaluationWriter;
+use crate::observe::page::{Page, State};
 use crate::observe::tensorboard::Events;
 use crate::observe::whole::Whole;
 
@@ -116,12 +117,14 @@ fn per(value: f64, count: u64) -> Value {
 /// Collects and writes metrics.
 #[derive(Debug)]
 pub struct MetricsFile {
+    experiment: Experiment,
     spec: TaskSpec,
     run: PathBuf,
     file: Whole,
     /// `None` if the file could not be opened.
     events: Option<Events>,
     evaluations: EvaluationWriter,
+    page: Page,
     window: Window,
     since: Instant,
     /// The accounting of the last line.
@@ -161,9 +164,11 @@ impl MetricsFile {
     ///
     /// # Errors
     /// When the file cannot be opened.
-    pub fn open(run: &Path, spec: &TaskSpec) -> Result<Self> {
+    pub fn open(run: &Path, experiment: &Experiment, spec: &TaskSpec) -> Result<Self> {
         let file = run.join("metrics.jsonl");
         Ok(Self {
+            page: Page::open(run, experiment)?,
+            experiment: experiment.clone(),
             spec: spec.clone(),
             run: run.to_path_buf(),
             file: Whole::open_lines(&file).map_err(Error::file("open", &file))?,
@@ -183,6 +188,17 @@ impl MetricsFile {
         self.events = begun
             .map_err(|error| tracing::error!("nothing is written for TensorBoard: {}", comic_proto::chain(&error)))
             .ok();
+        let written = self.events.as_mut().map(|events| events.write_experiment(environment_steps, &self.experiment));
+        if let Some(Err(error)) = written {
+            tracing::error!("TensorBoard's file lacks the experiment: {}", comic_proto::chain(&error));
+        }
+        self.page.write(State::Running, self.evaluations.summary());
+    }
+
+    /// Ends the learner epoch: the page says whether the run is `over`, or was stopped and may be resumed.
+    pub fn end(&mut self, over: bool) {
+        let state = if over { State::Over } else { State::Stopped };
+        self.page.write(state, self.evaluations.summary());
     }
 
     /// Seconds since the last line.
@@ -197,10 +213,13 @@ impl MetricsFile {
             || self.accounting != *accounting
     }
 
-    /// Appends an actor's evaluation to `RUN/evaluations.jsonl`, writes its film to `RUN/films/`, and shows both in
-    /// TensorBoard. If the disk refuses, the error is logged, and training continues.
-    pub fn keep_evaluation(&mut self, evaluation: &Evaluation) {
-        self.evaluations.keep(evaluation, self.events.as_mut());
+    /// Appends evaluations of actors to `RUN/evaluations.jsonl`, writes their films to `RUN/films/`, and shows both in
+    /// TensorBoard and on the page. If the disk refuses, the error is logged, and training continues.
+    pub fn keep_evaluations(&mut self, evaluations: &[Evaluation]) {
+        evaluations.iter().for_each(|evaluation| self.evaluations.keep(evaluation, self.events.as_mut()));
+        if !evaluations.is_empty() {
+            self.page.write(State::Running, self.evaluations.summary());
+        }
     }
 
     /// Counts the rows of a batch and returns the counts of each task.
@@ -256,8 +275,8 @@ impl MetricsFile {
         }
     }
 
-    /// Writes the line, starts a new window, and returns the line for the status. If the disk refuses, the error is logged,
-    /// and training continues.
+    /// Writes the line, and once a minute the page, starts a new window, and returns the line for the status. If the disk
+    /// refuses, the error is logged, and training continues.
     pub fn write(
         &mut self,
         position: Position,
@@ -274,6 +293,10 @@ impl MetricsFile {
         self.accounting = accounting;
         if let Some(Err(error)) = self.events.as_mut().map(|events| events.write(&line)) {
             tracing::error!("TensorBoard's file lacks a line: {error}");
+        }
+        self.page.add(&line);
+        if self.page.is_due() {
+            self.page.write(State::Running, self.evaluations.summary());
         }
         let line = line.to_string();
         if let Err(error) = self.file.append(format!("{line}\n").as_bytes()) {
@@ -334,8 +357,6 @@ impl MetricsFile {
 
 #[cfg(test)]
 mod tests {
-    use comic_experiment::Experiment;
-
     use super::*;
 
     #[test]
@@ -356,13 +377,14 @@ mod tests {
         // A device that is always full.
         std::os::unix::fs::symlink("/dev/full", directory.path().join("metrics.jsonl")).unwrap();
         std::os::unix::fs::symlink("/dev/full", directory.path().join("evaluations.jsonl")).unwrap();
-        let spec = TaskSpec::new(&Experiment::default(), vec!["walk".into()]).unwrap();
-        let mut metrics = MetricsFile::open(directory.path(), &spec).unwrap();
+        let experiment = Experiment::default();
+        let spec = TaskSpec::new(&experiment, vec!["walk".into()]).unwrap();
+        let mut metrics = MetricsFile::open(directory.path(), &experiment, &spec).unwrap();
         let position = Position { updates: 3, ..Position::default() };
         for _ in 0..2 {
             let line = metrics.write(position, AccountingByTask::default(), Map::new(), None);
             assert!(line.contains("\"updates\":3"), "{line}");
         }
-        metrics.keep_evaluation(&Evaluation { epoch: 5, updates: 3, json: "{}".into(), ..Evaluation::default() });
+        metrics.keep_evaluations(&[Evaluation { epoch: 5, updates: 3, json: "{}".into(), ..Evaluation::default() }]);
     }
 }

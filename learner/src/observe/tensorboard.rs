@@ -1,18 +1,24 @@
 //! Curves and images for TensorBoard: `RUN/tensorboard/events.out.tfevents.…`, a file for each learner epoch.
 //!
 //! A file is a sequence of records. A record is a length, its checksum, a message and the message's checksum (TensorFlow's
-//! `record_writer.cc`). The messages are those of `event.proto` and `summary.proto`, of which a few fields are used.
+//! `record_writer.cc`).
+
+mod experiment;
+mod messages;
 
 use std::fs;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use bytes::Bytes;
+use comic_experiment::Experiment;
 use prost::Message as _;
 use serde_json::Value;
 
 use crate::error::{Error, Result};
 use crate::observe::whole::Whole;
+use messages::{Event, SessionLog, Summary};
+
+pub(super) use messages::SummaryValue;
 
 /// The version that a reader expects in the first record.
 const VERSION: &str = "brain.Event:2";
@@ -29,84 +35,6 @@ const LONGEST_TAG: usize = 256;
 const BUDGET: u64 = 256 << 20;
 /// How often the distance between two lines, or two pictures, doubles until the budget is used up.
 const DOUBLINGS: u64 = 8;
-/// `Summary.Image.colorspace` of RGB.
-const RGB: i32 = 3;
-
-#[derive(Clone, PartialEq, prost::Message)]
-struct Event {
-    /// Seconds since 1970.
-    #[prost(double, tag = "1")]
-    wall_time: f64,
-    #[prost(int64, tag = "2")]
-    step: i64,
-    #[prost(string, optional, tag = "3")]
-    file_version: Option<String>,
-    #[prost(message, optional, tag = "5")]
-    summary: Option<Summary>,
-    #[prost(message, optional, tag = "7")]
-    session_log: Option<SessionLog>,
-}
-
-#[derive(Clone, PartialEq, prost::Message)]
-struct SessionLog {
-    #[prost(int32, tag = "1")]
-    status: i32,
-}
-
-#[derive(Clone, PartialEq, prost::Message)]
-struct Summary {
-    #[prost(message, repeated, tag = "1")]
-    values: Vec<SummaryValue>,
-}
-
-/// A point of a curve, or an image: `Summary.Value`.
-#[derive(Clone, PartialEq, prost::Message)]
-pub(super) struct SummaryValue {
-    #[prost(string, tag = "1")]
-    pub(super) tag: String,
-    /// Optional, so that 0 is written too.
-    #[prost(float, optional, tag = "2")]
-    pub(super) simple_value: Option<f32>,
-    #[prost(message, optional, tag = "4")]
-    pub(super) image: Option<Image>,
-}
-
-/// An encoded image: `Summary.Image`.
-#[derive(Clone, PartialEq, prost::Message)]
-pub(super) struct Image {
-    /// Pixels.
-    #[prost(int32, tag = "1")]
-    pub(super) height: i32,
-    /// Pixels.
-    #[prost(int32, tag = "2")]
-    pub(super) width: i32,
-    #[prost(int32, tag = "3")]
-    pub(super) colorspace: i32,
-    /// A PNG or GIF file.
-    #[prost(bytes = "bytes", tag = "4")]
-    pub(super) encoded_image_string: Bytes,
-}
-
-impl SummaryValue {
-    /// A point of the curve `tag`.
-    pub(super) fn scalar(tag: String, value: f64) -> Self {
-        Self { tag, simple_value: Some(value as f32), image: None }
-    }
-
-    /// An image in colour, a PNG or GIF file of this width and height in pixels.
-    pub(super) fn image(tag: &str, (width, height): (u16, u16), file: Bytes) -> Self {
-        let image = Image { height: height.into(), width: width.into(), colorspace: RGB, encoded_image_string: file };
-        Self { tag: tag.to_owned(), simple_value: None, image: Some(image) }
-    }
-
-    /// A point for each number below `value`, by its path within `value` below `tag`. Beyond 4,096 points, or 256 bytes of
-    /// a tag, there are none.
-    pub(super) fn scalars(tag: &str, value: &Value) -> Vec<Self> {
-        let mut values = Vec::new();
-        collect(tag, value, &mut values);
-        values
-    }
-}
 
 /// The file of one learner epoch.
 #[derive(Debug)]
@@ -138,6 +66,17 @@ impl Events {
             Ok::<_, std::io::Error>(Self { file, spent, budget: BUDGET, skipped_lines: 0, skipped_pictures: 0 })
         };
         open().map_err(Error::file("write", &path))
+    }
+
+    /// Writes the experiment: a row of TensorBoard's table of runs, and its text. An epoch begins with it.
+    ///
+    /// # Errors
+    /// When the disk refuses, or the experiment has a number that TOML cannot write.
+    pub(crate) fn write_experiment(&mut self, environment_steps: u64, experiment: &Experiment) -> Result<()> {
+        let wall_time = now();
+        let values = experiment::values(experiment, wall_time)?;
+        let record = summary(wall_time, step(environment_steps), values);
+        self.append(&record).map_err(Error::system("the file cannot be written"))
     }
 
     /// Writes every number of a line, by its path within the line, over environment steps. The larger the files are, the more
@@ -198,7 +137,7 @@ fn opening(wall_time: f64, step: i64) -> Vec<u8> {
 
 fn scalars(wall_time: f64, line: &Value) -> Vec<u8> {
     let step = line["environment_steps"].as_i64().unwrap_or_default();
-    summary(wall_time, step, SummaryValue::scalars("", line))
+    summary(wall_time, step, points("", line))
 }
 
 fn summary(wall_time: f64, step: i64, values: Vec<SummaryValue>) -> Vec<u8> {
@@ -212,6 +151,14 @@ fn step(environment_steps: u64) -> i64 {
 
 fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
+}
+
+/// A point for each number below `value`, by its path within `value` below `tag`. Beyond 4,096 points, or 256 bytes of a tag,
+/// there are none.
+pub(super) fn points(tag: &str, value: &Value) -> Vec<SummaryValue> {
+    let mut values = Vec::new();
+    collect(tag, value, &mut values);
+    values
 }
 
 fn collect(path: &str, value: &Value, values: &mut Vec<SummaryValue>) {
@@ -252,6 +199,7 @@ pub(super) fn read(run: &Path, epoch: u64) -> Vec<(i64, Vec<SummaryValue>)> {
 
 #[cfg(test)]
 mod tests {
+    use bytes::Bytes;
     use serde_json::json;
 
     use super::*;
@@ -331,8 +279,8 @@ mod tests {
     fn a_report_cannot_make_a_record_large() {
         let wide: serde_json::Map<String, Value> =
             (0..5000).map(|number| (number.to_string(), json!(number))).collect();
-        assert_eq!(SummaryValue::scalars("evaluation", &json!(wide)).len(), MOST_VALUES);
+        assert_eq!(points("evaluation", &json!(wide)).len(), MOST_VALUES);
         let deep = json!({ ("x".repeat(LONGEST_TAG)): wide, "reward": 1 });
-        assert_eq!(SummaryValue::scalars("", &deep), [SummaryValue::scalar("reward".into(), 1.0)]);
+        assert_eq!(points("", &deep), [SummaryValue::scalar("reward".into(), 1.0)]);
     }
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use comic_experiment::{Learner, TaskSpec};
+use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::v1::{EpisodeEnd, UnrollHeader};
 use comic_replay::{AccountingByTask, Batch};
 use serde_json::{Map, Value, json};
@@ -42,12 +42,12 @@ impl Reports {
     ///
     /// # Errors
     /// When their file cannot be opened.
-    pub(super) fn open(run: &Path, spec: &TaskSpec, learner: &Learner, service: TrainerHandle) -> Result<Self> {
+    pub(super) fn open(run: &Path, experiment: &Experiment, spec: &TaskSpec, service: TrainerHandle) -> Result<Self> {
         Ok(Self {
-            metrics: MetricsFile::open(run, spec)?,
+            metrics: MetricsFile::open(run, experiment, spec)?,
             prometheus: service.prometheus.clone(),
             service,
-            interval: learner.metrics_seconds,
+            interval: experiment.learner.metrics_seconds,
             tasks: spec.tasks.iter().map(|task| task.name.clone()).collect(),
             losses: Map::new(),
             deferred: None,
@@ -59,6 +59,11 @@ impl Reports {
     /// Begins a learner epoch at this progress.
     pub(super) fn begin(&mut self, progress: &Progress, accounting: AccountingByTask) {
         self.metrics.begin(progress.epoch, progress.environment_steps, accounting);
+    }
+
+    /// Ends the learner epoch; the run is `over`, or was stopped.
+    pub(super) fn end(&mut self, over: bool) {
+        self.metrics.end(over);
     }
 
     /// Counts the rows and episodes of a batch that was used, and returns its environment steps.
@@ -148,7 +153,7 @@ impl Reports {
     /// Writes the evaluations that actors reported since the last time, and returns what they say of checkpoints.
     pub(super) fn take_evaluations(&mut self) -> Vec<Evaluated> {
         let evaluations = self.service.take_evaluations();
-        evaluations.iter().for_each(|evaluation| self.metrics.keep_evaluation(evaluation));
+        self.metrics.keep_evaluations(&evaluations);
         evaluations.iter().filter_map(|evaluation| evaluation.evaluated()).collect()
     }
 

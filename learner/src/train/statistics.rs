@@ -189,7 +189,7 @@ impl Statistics {
 mod tests {
     use std::sync::Arc;
 
-    use comic_experiment::{TaskPart, resolve};
+    use comic_experiment::{Experiment, TaskPart, resolve};
     use comic_proto::v1::UnrollHeader;
     use comic_proto::{UnrollBuffer, UnrollLayout, UnrollShape};
 
@@ -264,7 +264,7 @@ mod tests {
     #[test]
     fn the_metrics_count_every_tasks_steps_and_padding() {
         let (spec, run) = (spec(), tempfile::tempdir().unwrap());
-        let mut metrics = MetricsFile::open(run.path(), &spec).unwrap();
+        let mut metrics = MetricsFile::open(run.path(), &Experiment::default(), &spec).unwrap();
         let rows = |environment_steps, padding| Rows { rows: 3, environment_steps, padding };
         assert_eq!(metrics.count_rows(&batch(&spec)), [rows(3, 0), rows(1, 1)]);
         let position = Position { environment_steps: 4, updates: 1, ..Position::default() };

@@ -75,7 +75,7 @@ impl Trainer {
         if let Some(snapshot) = &resume {
             state.restore(snapshot, service.id(), epoch).map_err(|error| incompatible(&run, error))?;
         }
-        let mut reports = Reports::open(&run, &spec, &experiment.learner, service.clone())?;
+        let mut reports = Reports::open(&run, &experiment, &spec, service.clone())?;
         reports.begin(&state.progress, batcher.accounting_by_task());
         let mut experience = algorithms::experience(parts, batcher.layout())?;
         let saved_replay = experiment.replay.save.then(|| SavedReplay::of(&run));
@@ -129,6 +129,7 @@ impl Trainer {
         if let Some(saved) = &self.saved_replay {
             saved.remove_earlier(self.state.progress.updates)?;
         }
+        self.reports.end(ending == Ending::Budget);
         Ok(ending)
     }
 

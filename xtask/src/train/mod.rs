@@ -79,6 +79,7 @@ pub(crate) fn run(options: Options) -> Result<()> {
     outcome?;
     let evaluations = job.evaluate(&mut display, &interrupt)?;
     println!("{}\nkept in {}", evaluation::table(&evaluations), job.path().display());
+    println!("page: {}", job.directory.page().display());
     Ok(())
 }
 

@@ -7,7 +7,8 @@ use anyhow::{Context, Result, bail};
 
 use crate::{evaluations, workspace};
 
-/// A run's directory: checkpoints, metrics.jsonl, evaluations.jsonl, tensorboard, logs, the evaluation and the pictures.
+/// A run's directory: checkpoints, metrics.jsonl, evaluations.jsonl, the page, tensorboard, logs, the evaluation and
+/// the pictures.
 pub(super) struct RunDirectory(PathBuf);
 
 impl RunDirectory {
@@ -49,6 +50,11 @@ impl RunDirectory {
 
     pub(super) fn evaluations(&self) -> PathBuf {
         self.0.join(evaluations::FILE)
+    }
+
+    /// The page that the learner writes.
+    pub(super) fn page(&self) -> PathBuf {
+        self.0.join("index.html")
     }
 
     pub(super) fn log(&self, name: &str) -> PathBuf {

@@ -57,7 +57,8 @@ impl<'a> Supervisor<'a> {
         command.arg("--run").arg(job.directory.path());
         let mut learner = Process::start("comic-learner", &mut command, job.directory.log("learner"))?;
         await_serving(&mut learner, interrupt)?;
-        display.event("learner serves", &[("address", format!("127.0.0.1:{port}"))]);
+        let page = job.directory.page().display().to_string();
+        display.event("learner serves", &[("address", format!("127.0.0.1:{port}")), ("page", page)]);
         let (actors, evaluator) = (Vec::new(), None);
         let mut supervisor = Self { job, port, learner, actors, evaluator, metrics, evaluations, log };
         for number in 0..usize::from(job.actors) {
