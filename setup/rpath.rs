@@ -1,5 +1,6 @@
 //! The build script of every crate whose programs or tests link libmujoco or libtorch. It writes the directories of these
-//! libraries into the programs' run path, so that a program runs without `LD_LIBRARY_PATH`.
+//! libraries into the programs' run path, so that a program runs without `LD_LIBRARY_PATH`. `COMIC_RUN_PATH` names another
+//! run path: `$ORIGIN/../lib` makes programs that can be moved together with their libraries.
 
 use std::path::PathBuf;
 
@@ -8,8 +9,13 @@ fn main() {
 }
 
 pub(crate) fn write_run_path() {
+    println!("cargo:rerun-if-env-changed=COMIC_RUN_PATH");
     println!("cargo:rerun-if-env-changed=LIBTORCH");
     println!("cargo:rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
+    if let Ok(path) = std::env::var("COMIC_RUN_PATH") {
+        println!("cargo:rustc-link-arg=-Wl,-rpath,{path}");
+        return;
+    }
     let directories =
         [std::env::var("LIBTORCH").map(|root| format!("{root}/lib")), std::env::var("MUJOCO_DYNAMIC_LINK_DIR")];
     for directory in directories.into_iter().flatten() {

@@ -58,6 +58,11 @@ impl Options {
     }
 }
 
+/// The version and the SHA-256 (hexadecimal) of the pinned wheel `name`.
+pub fn pin(name: &str) -> Option<(&'static str, &'static str)> {
+    wheels().find(|wheel| wheel.name == name).map(|wheel| (wheel.version, wheel.sha256))
+}
+
 /// Brings the directory `dependencies` to the state that the pins describe. Takes less than a second if it is already.
 ///
 /// # Errors

@@ -9,7 +9,7 @@
 //! - [`train`] runs one learner and its actors on this machine and shows their progress.
 //! - [`sweep`] trains with varied fields of an experiment, and compares the runs.
 //! - [`mod@bench`] measures; [`python`] runs other people's code for comparison.
-//! - [`wheel`] builds the Python package.
+//! - [`wheel`] builds the Python package, and [`dist`] all files of a release.
 //! - [`plot`] draws learning curves; [`metrics`] and [`evaluations`] read the files that it draws.
 //! - [`film`] makes the film of the README, and [`low_level`] the built-in low level.
 //!
@@ -17,6 +17,7 @@
 
 mod bench;
 mod check;
+mod dist;
 mod documentation;
 mod durations;
 mod evaluations;
@@ -87,6 +88,8 @@ enum Command {
     LowLevel(low_level::Options),
     /// Set up, and build the Python package as a wheel in target/wheels
     Wheel,
+    /// Set up, build, and make all files of a release: archives, wheel, bills of materials, notes and checksums
+    Dist(dist::Options),
     /// Make the tests' fixtures again with the scripts in tests/python
     Fixtures(python::FixtureOptions),
     /// Become a program that gets SIGTERM when the process PARENT ends
@@ -108,6 +111,7 @@ fn main() -> ExitCode {
         Command::Film(options) => film::run(&options),
         Command::LowLevel(options) => low_level::run(options),
         Command::Wheel => wheel::build().map(|wheel| println!("{}", wheel.display())),
+        Command::Dist(options) => dist::run(&options),
         Command::Fixtures(options) => python::fixtures(&options),
         Command::Child(options) => train::child::run(&options),
     };

@@ -13,6 +13,12 @@ const LICENCES: [&str; 3] = ["LICENSE-APACHE", "LICENSE-MIT", "NOTICE"];
 
 /// Builds the wheel and returns its path. Its tag says the oldest libc that it runs with: the build machine decides.
 pub(crate) fn build() -> Result<PathBuf> {
+    build_with(&[])
+}
+
+/// The same with these variables of the environment. With `SOURCE_DATE_EPOCH` equal sources give equal bytes.
+pub(crate) fn build_with(variables: &[(&str, String)]) -> Result<PathBuf> {
+    let variables = || variables.iter().map(|(name, value)| (name, value));
     setup::run(&setup::Options::default())?;
     let wheels = workspace::root().join("target/wheels");
     let built = wheels.join("built");
@@ -25,11 +31,11 @@ pub(crate) fn build() -> Result<PathBuf> {
     }
     let mut maturin = python::tool("maturin", REQUIREMENTS)?;
     maturin.args(["build", "--release", "--locked", "--auditwheel", "skip", "--manifest-path", "python/Cargo.toml"]);
-    workspace::run(maturin.arg("--out").arg(&built))?;
+    workspace::run(maturin.arg("--out").arg(&built).envs(variables()))?;
     // libmujoco comes from the package `mujoco`.
     let mut auditwheel = python::tool("auditwheel", REQUIREMENTS)?;
     auditwheel.args(["repair", "--exclude", "libmujoco.so*", "--wheel-dir"]).arg(&wheels);
-    workspace::run(auditwheel.arg(only_wheel(&built)?))?;
+    workspace::run(auditwheel.arg(only_wheel(&built)?).envs(variables()))?;
     only_wheel(&wheels)
 }
 

@@ -14,7 +14,7 @@ pub(super) const WHEELS: [Wheel; 5] = [
         native: true,
         part: Part::Mujoco,
         from: Extent::Cpu,
-        place: |file, _| (file == "mujoco/libmujoco.so.3.17.0").then(|| "mujoco/lib/libmujoco.so.3.17.0".into()),
+        place: mujoco,
         links: &[("mujoco/lib/libmujoco.so", "libmujoco.so.3.17.0")],
     },
     Wheel {
@@ -63,6 +63,18 @@ pub(super) const WHEELS: [Wheel; 5] = [
     },
 ];
 
+/// The place of a licence's text: `licences/WHEEL/FILE`. Who passes a library on passes its licence on, too.
+fn licence(file: &str) -> Option<PathBuf> {
+    let (wheel, inside) = file.split_once(".dist-info/")?;
+    let name = inside.strip_prefix("licenses/").unwrap_or(inside);
+    let texts = ["LICENSE", "LICENSES_THIRD_PARTY.md", "License.txt", "NOTICE"];
+    texts.contains(&name).then(|| format!("licences/{}/{name}", wheel.split('-').next().unwrap_or(wheel)).into())
+}
+
+fn mujoco(file: &str, _extent: Extent) -> Option<PathBuf> {
+    (file == "mujoco/libmujoco.so.3.17.0").then(|| "mujoco/lib/libmujoco.so.3.17.0".into()).or_else(|| licence(file))
+}
+
 fn dm_control(file: &str, _extent: Extent) -> Option<PathBuf> {
     let wanted = [
         "dm_control/composer/arena.xml",
@@ -71,7 +83,7 @@ fn dm_control(file: &str, _extent: Extent) -> Option<PathBuf> {
         "dm_control/locomotion/mocap/test_trajectories.h5",
     ];
     let name = file.rsplit('/').next()?;
-    wanted.contains(&file).then(|| format!("dm_control/{name}").into())
+    wanted.contains(&file).then(|| format!("dm_control/{name}").into()).or_else(|| licence(file))
 }
 
 /// torch-sys links CUDA only where `libtorch_cuda.so` exists. These four libraries and the headers are a CPU libtorch.
@@ -83,7 +95,7 @@ fn nvidia(file: &str, wanted: &str, extent: Extent) -> Option<PathBuf> {
         return Some(format!("python/{file}").into());
     }
     let name = wanted.rsplit('/').next()?;
-    (file == wanted).then(|| format!("libtorch/lib/{name}").into())
+    (file == wanted).then(|| format!("libtorch/lib/{name}").into()).or_else(|| licence(file))
 }
 
 fn torch(file: &str, extent: Extent) -> Option<PathBuf> {
@@ -91,7 +103,7 @@ fn torch(file: &str, extent: Extent) -> Option<PathBuf> {
     if extent > Extent::Cpu && (file.starts_with("torchgen/") || file.starts_with("functorch/")) {
         return Some(format!("python/{file}").into());
     }
-    let inside = file.strip_prefix("torch/")?;
+    let Some(inside) = file.strip_prefix("torch/") else { return licence(file) };
     let on_cpu =
         inside.starts_with("include/") || inside.strip_prefix("lib/").is_some_and(|name| CPU_LIBRARIES.contains(&name));
     (extent > Extent::Cpu || on_cpu).then(|| format!("libtorch/{inside}").into())
@@ -109,6 +121,20 @@ mod tests {
         assert_eq!(torch("torch/include/ATen/ATen.h", Extent::Cpu), Some("libtorch/include/ATen/ATen.h".into()));
         assert_eq!(torch("functorch/dim.py", Extent::Cpu), None);
         assert_eq!(torch("torchgen/model.py", Extent::Xla), Some("python/torchgen/model.py".into()));
+    }
+
+    #[test]
+    fn the_text_of_a_licence_is_kept_below_the_name_of_its_wheel() {
+        let nvidia = |file| nvidia(file, "nvidia/cuda_runtime/lib/libcudart.so.12", Extent::Cpu);
+        for (found, place) in [
+            (mujoco("mujoco-3.17.0.dist-info/licenses/LICENSE", Extent::Cpu), "mujoco/LICENSE"),
+            (dm_control("dm_control-1.0.49.dist-info/licenses/LICENSE", Extent::Cpu), "dm_control/LICENSE"),
+            (torch("torch-2.9.0.dist-info/licenses/NOTICE", Extent::Cuda), "torch/NOTICE"),
+            (nvidia("nvidia_cuda_runtime_cu12-12.8.90.dist-info/License.txt"), "nvidia_cuda_runtime_cu12/License.txt"),
+        ] {
+            assert_eq!(found, Some(PathBuf::from("licences").join(place)));
+        }
+        assert_eq!(torch("torch-2.9.0.dist-info/METADATA", Extent::Cpu), None);
     }
 
     #[test]
