@@ -72,7 +72,7 @@ fn chosen(clips: &[ClipStarts], options: &RolloutSettings) -> Vec<Start> {
     let mut rng = Pcg64::seed_from_u64(derive(options.seed, u64::MAX));
     let mut chosen = Vec::new();
     let mut add = |clip: &ClipStarts, starts: &mut dyn Iterator<Item = usize>| {
-        chosen.extend(starts.map(|start| Start { clip: clip.clip, start }));
+        chosen.extend(starts.map(|start| (clip.clip, start)));
     };
     match options.starts {
         Starts::Every => clips.iter().for_each(|clip| add(clip, &mut clip.frames.clone())),
@@ -90,7 +90,7 @@ fn chosen(clips: &[ClipStarts], options: &RolloutSettings) -> Vec<Start> {
             }
         }
     }
-    chosen
+    Start::numbered(chosen)
 }
 
 /// `0..whole` in `count` parts whose lengths differ by at most 1.

@@ -13,7 +13,8 @@
 //! - [`run`] is the actor process made of these parts.
 //! - [`evaluate`] measures a policy over the starts of clips; [`checkpoint`] reads the learner's checkpoints.
 //! - [`latents`] collects latents for a prior, and [`assess`] measures a low level before anything is learned with it.
-//! - [`film`] draws and writes films; [`render`] films a policy, or shows it in a window.
+//! - [`film`] draws and writes films, and [`page`] writes pages for a browser; [`render`] makes one of a policy, or shows it in a
+//!   window.
 //! - [`clips`] is `comic-actor clips`: motion capture from files and from the network.
 //!
 //! No loss is computed here. All memory is bounded: full unrolls wait in a bounded channel, unrolls without
@@ -31,6 +32,7 @@ pub mod forward_pass;
 pub mod latents;
 pub mod liveness;
 pub mod mailbox;
+mod output_file;
 pub mod page;
 pub mod policy;
 pub mod render;

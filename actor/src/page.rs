@@ -10,6 +10,13 @@ pub mod recorder;
 
 use std::path::Path;
 
+/// The last two parts of a path: they tell which run or checkpoint it is, and not where it lies.
+pub(crate) fn short(path: &Path) -> String {
+    let parts: Vec<_> = path.iter().collect();
+    let last: std::path::PathBuf = parts.iter().skip(parts.len().saturating_sub(2)).collect();
+    last.display().to_string()
+}
+
 /// Whether a file's name is that of a page: it ends in `.html`.
 pub fn is_page(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html"))

@@ -1,5 +1,5 @@
-//! Pages, as a user asks for them: `comic-actor render --out FILE.html` and `evaluate --html FILE`. Nothing is drawn, so no
-//! OpenGL is needed. `python/tests/test_pages.py` looks at pages in a browser.
+//! Pages, as a user asks for them: `comic-actor render --out FILE.html` and `evaluate --html FILE`. OpenGL is hidden from the
+//! program. `python/tests/test_pages.py` looks at pages in a browser.
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
@@ -14,6 +14,8 @@ use serde_json::Value;
 
 fn actor(arguments: &[&str], out: &Path) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_comic-actor"));
+    // Nothing of a page is drawn: EGL finds no library to draw with.
+    command.env("__EGL_VENDOR_LIBRARY_DIRS", "/nonexistent");
     command.args(arguments).arg(out).env_remove("RUST_LOG").output().unwrap()
 }
 
@@ -90,8 +92,39 @@ fn a_page_has_as_many_episodes_as_asked_from_starts_that_are_spread_evenly() {
 }
 
 #[test]
+fn more_episodes_than_starts_are_each_start_once_from_the_given_one_on() {
+    let arguments = ["render", "--task", "tracking", "--clip", "builtin:walk", "--start", "70", "--episodes", "500"];
+    let page = page(&[&arguments[..], &["--fps", "1", "--out"]].concat());
+    let names = texts(&page["episodes"], "name");
+    let starts: Vec<usize> = names.iter().map(|name| name.rsplit(' ').next().unwrap().parse().unwrap()).collect();
+    assert_eq!(starts, (70..72).chain(0..70).collect::<Vec<_>>());
+}
+
+/// With a pose every tenth of a second, the last pose is still that of the last step.
+#[test]
+fn a_page_of_fewer_poses_has_the_end_of_the_episode() {
+    let arguments = ["render", "--task", "tracking", "--clip", "builtin:walk"];
+    let every_step = &page(&[&arguments[..], &["--out"]].concat())["episodes"][0];
+    let fewer = &page(&[&arguments[..], &["--fps", "7", "--out"]].concat())["episodes"][0];
+    assert_eq!((fewer["every"].as_u64(), &fewer["steps"]), (Some(5), &every_step["steps"]));
+    let (all, some) = (places(&every_step["poses"]), places(&fewer["poses"]));
+    let bodies = every_step["poses"]["bodies"].as_u64().unwrap() as usize;
+    let steps = every_step["steps"].as_u64().unwrap() as usize;
+    assert!(!steps.is_multiple_of(5), "the last step would have a pose anyway");
+    assert_eq!(some.len() / bodies, steps.div_ceil(5) + 1);
+    for (one, other) in all[all.len() - bodies..].iter().zip(&some[some.len() - bodies..]) {
+        for axis in 0..3 {
+            assert!((one[axis] - other[axis]).abs() < 1e-3, "{one:?} {other:?}");
+        }
+    }
+    assert_eq!(fewer["rewards"], every_step["rewards"], "the reward of each step is there");
+}
+
+#[test]
 fn every_task_has_a_page_with_its_shapes() {
-    for (task, wanted) in [("go-to-target", "plane"), ("gaps", "box"), ("walls", "box"), ("ball-catch", "sphere")] {
+    for (task, wanted) in
+        [("go-to-target", "plane"), ("gaps", "box"), ("walls", "box"), ("get-up", "plane"), ("ball-catch", "sphere")]
+    {
         let page = page(&["render", "--task", task, "--seconds", "0.3", "--out"]);
         let shapes = page["scenes"][0]["shapes"].as_array().unwrap();
         let humanoid = shapes.iter().filter(|shape| shape["form"] == "capsule").count();
@@ -105,14 +138,19 @@ fn every_task_has_a_page_with_its_shapes() {
 
 #[test]
 fn an_evaluation_has_a_page_of_its_worst_its_median_and_its_best_start_with_its_own_numbers() {
-    let page = page(&["evaluate", "--preset", "quickstart", "--servo", "--html"]);
+    // Every episode's noise is its own, so what is played is what was evaluated, also with noise.
+    for policy in [&["--servo"][..], &["--untrained", "--deterministic"], &["--untrained"]] {
+        compare(&page(&[&["evaluate", "--preset", "quickstart"], policy, &["--html"]].concat()));
+    }
+}
+
+fn compare(page: &Value) {
     let names = texts(&page["episodes"], "name");
     let first: Vec<&str> = names.iter().filter_map(|name| name.split(' ').next()).collect();
     assert_eq!(first, ["worst", "median", "best"]);
     let number = |text: &str| text.split(['(', ')']).nth(1).unwrap().parse::<f64>().unwrap();
     let said: Vec<f64> = names.iter().map(|name| number(name)).collect();
     assert!(said.is_sorted() && said[0] < said[2], "{said:?}");
-    // What is played is what was evaluated.
     for (name, note) in names.iter().zip(texts(&page["episodes"], "note")) {
         assert!(note.ends_with(&format!("normalised reward {:.3}", number(name))), "{name}: {note}");
     }

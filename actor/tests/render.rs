@@ -62,7 +62,7 @@ fn opengl_tracking_is_filmed_with_a_ghost_and_an_evaluation_films_its_first_epis
 fn wrong_arguments_are_refused_before_anything_is_built() {
     let directory = tempfile::tempdir().unwrap();
     for (arguments, name, message) in [
-        (&["--task", "gaps"][..], "film.avi", "known are .gif, .webp, .mp4"),
+        (&["--task", "gaps"][..], "film.avi", "known are .html (a page), .gif"),
         (&["--task", "gaps", "--preset", "walls"], "film.gif", "its task is walls, not gaps"),
         (&["--task", "gaps", "--start", "64"], "film.gif", "only at 0 to 63"),
         (&["--task", "gaps", "--checkpoint", "/nowhere"], "film.gif", "checkpoint /nowhere"),

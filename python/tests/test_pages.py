@@ -69,16 +69,23 @@ def test_its_episodes_its_reference_and_its_camera_can_be_chosen(browser: Browse
     browser.page.mouse.move(700, 380)
     browser.page.mouse.up()
     assert picture(browser) != alone
+    first = browser.page.locator("#note").inner_text()
     browser.page.locator("#episode").select_option(label=names[2])
-    browser.page.wait_for_function("document.getElementById('note').textContent.includes('steps')")
+    browser.page.wait_for_function("first => document.getElementById('note').textContent !== first", arg=first)
+    assert browser.page.url.endswith("#3")
     seek(browser, 5)
-    assert picture(browser) != alone
+    third = picture(browser)
+    browser.page.reload()
+    seek(browser, 5)
+    browser.page.locator("#ghost").select_option("off")
+    assert picture(browser) != alone, "another start"
+    assert third != alone
 
 
 def test_it_shows_the_reward_of_the_step_and_each_of_its_terms(browser: Browser, walk: Path) -> None:
     browser.page.goto(walk.as_uri())
     seek(browser, 5)
-    labels = browser.page.locator("#strips span:not(.value)").all_inner_texts()[2:]
+    labels = [text.split()[0] for text in browser.page.locator("#strips span:not(.value)").all_inner_texts()[2:]]
     values = [float(value) for value in browser.page.locator("#strips .value").all_inner_texts()]
     assert labels[0] == "reward"
     assert len(labels) == len(values) == 6
@@ -88,6 +95,16 @@ def test_it_shows_the_reward_of_the_step_and_each_of_its_terms(browser: Browser,
 
 def test_a_clip_takes_less_than_two_megabytes(walk: Path) -> None:
     assert walk.stat().st_size < 2 * MEGABYTE
+
+
+def test_a_negative_reward_is_shown(browser: Browser, tmp_path: Path) -> None:
+    out = tmp_path / "page.html"
+    programs.run("comic-actor", ["render", "--task", "ball-catch", "--out", str(out)])
+    browser.page.goto(out.as_uri())
+    label = browser.page.locator("#strips span", has_text="failure")
+    assert label.inner_text().split() == ["failure", "-1", "to", "0"]
+    seek(browser, int(browser.page.locator("#slider").get_attribute("max") or 0))
+    assert "-1.000" in browser.page.locator("#strips .value").all_inner_texts()
 
 
 @pytest.mark.parametrize("task", ["go-to-target", "gaps", "walls", "get-up", "ball-catch"])

@@ -7,10 +7,10 @@ use std::time::Duration;
 
 use clap::Args;
 use comic_clips::Catalogue;
-use comic_experiment::{Experiment, Transfer};
+use comic_experiment::{Experiment, TaskName, Transfer};
 use comic_proto::v1::EvaluationReport;
-use comic_proto::{Access, UnrollShape};
-use comic_tasks::{Simulated, Step, Task};
+use comic_proto::{Access, UnrollShape, chain};
+use comic_tasks::{Ghost, Simulated, Step, Task};
 
 use super::delivery::deliver;
 use super::settings::{RolloutSettings, Starts};
@@ -20,7 +20,8 @@ use crate::acting_loop::Controller;
 use crate::checkpoint::{self, Checkpoint, Position};
 use crate::film::encode::Format;
 use crate::film::recorder::{Look, Recorder};
-use crate::page::is_page;
+use crate::output_file::OutputFile;
+use crate::page;
 use crate::policy::TorchPolicy;
 
 const JSON_HELP: &str = "\
@@ -124,7 +125,7 @@ pub struct Evaluate {
     video: Option<PathBuf>,
     #[command(flatten)]
     look: Look,
-    /// Writes a page for any browser that plays the worst, the median and the best start.
+    /// Writes a page for any browser that plays the episodes with the lowest, the median and the highest normalised reward.
     #[arg(long, value_name = "FILE", help_heading = "Film")]
     html: Option<PathBuf>,
 }
@@ -178,14 +179,15 @@ impl Evaluate {
 
     /// The report, and the result of the film.
     fn evaluate(&self, subject: Subject) -> Result<(Report, Result<(), Error>), Error> {
-        let Subject { mut experiment, parameters, low_level, .. } = subject;
+        let Subject { mut experiment, parameters, low_level, position } = subject;
         if self.servo {
             // The servo action is a command, not a latent.
             experiment.transfer = Transfer::default();
         }
-        if let Some(out) = self.html.as_ref().filter(|out| !is_page(out)) {
+        if let Some(out) = self.html.as_ref().filter(|out| !page::is_page(out)) {
             return Err(Error::Usage(format!("--html {}: name it .html", out.display())));
         }
+        let page_ghost = if self.video.is_none() && self.html.is_some() { self.look.of_page()? } else { None };
         if let Some(out) = &self.video {
             Format::of(out)?;
             self.look.suits(experiment.task)?;
@@ -208,6 +210,13 @@ impl Evaluate {
         let mut controller = policy.as_mut().map_or(Controller::Servo, Controller::Policy);
         let recorder =
             self.video.as_ref().map(|out| Recorder::new(&self.look, out, task.control_timestep())).transpose()?;
+        let page = self.html.as_ref().map(|out| {
+            let file = OutputFile::create(out).map_err(Error::file(out))?;
+            let ghost = page_ghost.or((experiment.task == TaskName::Tracking).then_some(Ghost::On));
+            let (title, every) = (self.title(&experiment, position.updates), self.look.every(task.control_timestep()));
+            Ok::<_, Error>((file, super::page::Look { title, ghost, every }))
+        });
+        let page = page.transpose()?;
         let mut follower = Follower { recorder, failed: None };
         let finished = evaluate(&mut controller, &task, &shape, &options, &mut follower)?;
         let report = Report::new(task.spec(), &finished, &options);
@@ -218,11 +227,24 @@ impl Evaluate {
             (Some(error), _) => Err(error),
             (None, recorder) => recorder.map_or(Ok(()), Recorder::finish),
         };
-        let page = self.html.as_ref().map_or(Ok(()), |out| {
-            let title = format!("{}, {} episodes", experiment.task, finished.len());
-            super::page::write(out, title, &mut controller, &task, &shape, &finished, &options)
+        let page = page.map_or(Ok(()), |(file, look)| {
+            let document = super::page::make(look, &mut controller, &task, &shape, &finished, &options)?;
+            document.write(file)
         });
-        Ok((report, film.and(page)))
+        Ok((report, both(film, page)))
+    }
+
+    /// What is evaluated, in words.
+    fn title(&self, experiment: &Experiment, updates: u64) -> String {
+        let tasks: Vec<&str> = experiment.tasks().iter().map(|(task, _)| task.name()).collect();
+        let policy = match &self.checkpoint {
+            _ if self.servo => "servo action".into(),
+            _ if self.untrained => "untrained".into(),
+            Some(path) => format!("{} after {updates} updates", page::short(path)),
+            None => String::new(),
+        };
+        let noise = if self.deterministic && self.noise == 0.0 { "without noise" } else { "with noise" };
+        format!("{} · {policy}, {noise}", tasks.join(", "))
     }
 
     /// The experiment, and the parameters when there is a checkpoint.
@@ -290,6 +312,14 @@ impl Audience<Box<dyn Simulated>> for Follower {
     fn count(&mut self, done: usize, all: usize) {
         show_progress(done, all);
     }
+}
+
+/// Both results as one: the first error, and a line of the log for another one.
+fn both(film: Result<(), Error>, page: Result<(), Error>) -> Result<(), Error> {
+    if let (Err(_), Err(error)) = (&film, &page) {
+        tracing::error!("{}", chain(error));
+    }
+    film.and(page)
 }
 
 fn noise(text: &str) -> Result<f32, String> {

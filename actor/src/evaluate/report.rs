@@ -8,10 +8,13 @@ use serde::{Deserialize, Serialize};
 
 use super::settings::RolloutSettings;
 use super::tracking_errors::TrackingSums;
+use crate::page::recorder::Ending;
 
 /// An episode that is over.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Finished {
+    /// The number of its start.
+    pub number: usize,
     /// The clip's index.
     pub clip: usize,
     /// Frame within the clip.
@@ -36,6 +39,12 @@ impl Finished {
     /// Number of steps.
     pub fn steps(&self) -> usize {
         self.rewards.len()
+    }
+
+    /// What a page says of its end.
+    pub(crate) fn ending(&self, spec: &TaskSpec, remark: String) -> Ending {
+        let (number, outcome) = (self.number, self.outcome);
+        Ending { number, remark, outcome, normalised_reward: self.normalised_reward(spec) }
     }
 
     /// Return / (largest reward of a step × steps left at the start).
@@ -223,7 +232,18 @@ mod tests {
         let tracking = TrackingSums { position, local_position, velocity: 0.0, steps };
         let rewards = vec![0.0; steps];
         let achievement = Achievement::new(outcome == Outcome::Truncated);
-        Finished { clip, start: 0, steps_left, rewards, returns, head_heights, tracking, achievement, outcome }
+        Finished {
+            number: 0,
+            clip,
+            start: 0,
+            steps_left,
+            rewards,
+            returns,
+            head_heights,
+            tracking,
+            achievement,
+            outcome,
+        }
     }
 
     #[test]

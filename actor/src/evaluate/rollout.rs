@@ -1,9 +1,9 @@
 //! Rolling out a list of starts, many environments in one forward pass.
 
-use std::iter::Enumerate;
 use std::ops::ControlFlow;
 use std::slice::Iter;
 
+use comic_experiment::seed::derive;
 use comic_proto::UnrollShape;
 use comic_tasks::{Environment, Outcome, Step};
 use rand::SeedableRng as _;
@@ -19,7 +19,7 @@ use crate::forward_pass::{ActingRow, ForwardPass};
 /// Watches a rollout, to show its progress or to film it.
 pub trait Audience<E> {
     /// Called at an episode's begin, without a step, and after each of its steps, except a step that diverged. `number`
-    /// is the place of the episode's start among all starts. `Break` ends the rollout.
+    /// is the start's. `Break` ends the rollout.
     ///
     /// # Errors
     /// An error ends the rollout.
@@ -46,6 +46,16 @@ pub struct Start {
     pub clip: usize,
     /// Frame within the clip.
     pub start: usize,
+    /// Its number, which decides the noise of its episode together with the seed: the same start with the same number and
+    /// seed has the same noise, whatever else is rolled out.
+    pub number: usize,
+}
+
+impl Start {
+    /// Starts by clip and frame, with the numbers 0, 1, …
+    pub fn numbered(starts: impl IntoIterator<Item = (usize, usize)>) -> Vec<Self> {
+        starts.into_iter().enumerate().map(|(number, (clip, start))| Self { clip, start, number }).collect()
+    }
 }
 
 /// Rolls out every start, or until the audience breaks; episodes are in the order in which they end.
@@ -59,14 +69,15 @@ pub(super) fn run<E: Environment, F: ForwardPass>(
 ) -> Result<Vec<Finished>, Error> {
     let mut acting = ActingLoop::new(environments, shape, controller.low_level());
     let mut recorder = EpisodeRecorder {
-        running: vec![Running::default(); acting.rollouts.len()],
-        queue: starts.iter().enumerate(),
+        running: vec![Running::new(Start::default(), options.seed); acting.rollouts.len()],
+        queue: starts.iter(),
         all: starts.len(),
+        seed: options.seed,
+        sees: matches!(controller, Controller::Policy(_)),
         finished: Vec::with_capacity(starts.len()),
         deterministic: options.deterministic,
         noise: options.noise,
         errors: Vec::new(),
-        rng: Pcg64::seed_from_u64(options.seed),
         audience,
     };
     for (index, rollout) in acting.rollouts.iter_mut().enumerate() {
@@ -85,28 +96,38 @@ pub(super) fn run<E: Environment, F: ForwardPass>(
 /// Collects episodes, begins the next ones, and shows them to the audience.
 struct EpisodeRecorder<'a, E> {
     running: Vec<Running>,
-    queue: Enumerate<Iter<'a, Start>>,
+    queue: Iter<'a, Start>,
     all: usize,
+    /// The seed of all noise.
+    seed: u64,
+    /// Whether anything reads the camera images. Drawing needs OpenGL.
+    sees: bool,
     finished: Vec<Finished>,
     deterministic: bool,
     /// Standard deviation of the noise on commands without other noise.
     noise: f32,
     /// Scratch: the bodies' position errors after a step.
     errors: Vec<[f64; 3]>,
-    /// The noise of all environments.
-    rng: Pcg64,
     audience: &'a mut dyn Audience<E>,
 }
 
 /// The episode of one environment.
-#[derive(Clone, Default)]
+#[derive(Clone)]
 struct Running {
-    /// The place of its start among all starts.
-    number: usize,
     start: Start,
+    /// The noise of this episode.
+    rng: Pcg64,
     /// The reward of each step so far.
     rewards: Vec<f64>,
     tracking: TrackingErrors,
+}
+
+impl Running {
+    fn new(start: Start, seed: u64) -> Self {
+        // Another generator than those of the environments and of random starts, which have seeds derived once.
+        let rng = Pcg64::seed_from_u64(derive(derive(seed, u64::MAX), start.number as u64));
+        Self { start, rng, rewards: Vec::new(), tracking: TrackingErrors::default() }
+    }
 }
 
 impl<E: Environment> EpisodeRecorder<'_, E> {
@@ -117,22 +138,23 @@ impl<E: Environment> EpisodeRecorder<'_, E> {
         rollout: &mut Rollout<E>,
         row: &mut ActingRow<'_>,
     ) -> Result<ControlFlow<()>, Error> {
-        let Some((number, start)) = self.queue.next() else { return Ok(ControlFlow::Continue(())) };
+        let Some(start) = self.queue.next() else { return Ok(ControlFlow::Continue(())) };
         rollout.environment.reset_to(start.clip, start.start)?;
         rollout.environment.position_errors(&mut self.errors);
         let tracking = TrackingErrors::at_start(&self.errors);
-        self.running[index] = Running { number, start: *start, rewards: Vec::new(), tracking };
+        self.running[index] = Running { tracking, ..Running::new(*start, self.seed) };
         rollout.begin_episode(row);
-        self.audience.watch(number, &mut rollout.environment, None)
+        self.audience.watch(start.number, &mut rollout.environment, None)
     }
 
     fn finish(&mut self, index: usize, rollout: &Rollout<E>, outcome: Outcome) {
-        let Running { start, rewards, tracking, .. } = std::mem::take(&mut self.running[index]);
+        let Running { start, rewards, tracking, .. } = &mut self.running[index];
         self.finished.push(Finished {
+            number: start.number,
             clip: start.clip,
             start: start.start,
             steps_left: rollout.episode.steps_left,
-            rewards,
+            rewards: std::mem::take(rewards),
             returns: rollout.returns,
             head_heights: rollout.head_heights,
             tracking: tracking.sums(),
@@ -145,24 +167,24 @@ impl<E: Environment> EpisodeRecorder<'_, E> {
 
 impl<E: Environment> Recorder<E> for EpisodeRecorder<'_, E> {
     fn observe(&mut self, _index: usize, rollout: &mut Rollout<E>, row: &mut ActingRow<'_>) -> Result<(), Error> {
-        if !rollout.ended {
+        if self.sees && !rollout.ended {
             rollout.environment.draw(row.image)?;
         }
         Ok(())
     }
 
-    fn draw_latent_noise(&mut self, _index: usize, row: &mut ActingRow<'_>) {
+    fn draw_latent_noise(&mut self, index: usize, row: &mut ActingRow<'_>) {
         // Without noise the latent is its mean.
         if !self.deterministic {
-            row.draw_latent_noise(&mut self.rng);
+            row.draw_latent_noise(&mut self.running[index].rng);
         }
     }
 
-    fn choose(&mut self, _index: usize, rollout: &Rollout<E>, row: &mut ActingRow<'_>) {
+    fn choose(&mut self, index: usize, rollout: &Rollout<E>, row: &mut ActingRow<'_>) {
         match (rollout.ended, self.deterministic) {
             (true, _) => {}
             (false, true) => row.take_mode(),
-            (false, false) => row.sample(&mut self.rng),
+            (false, false) => row.sample(&mut self.running[index].rng),
         }
     }
 
@@ -176,16 +198,16 @@ impl<E: Environment> Recorder<E> for EpisodeRecorder<'_, E> {
             return Ok(ControlFlow::Continue(()));
         }
         if self.deterministic {
-            row.disturb_command(self.noise, &mut self.rng);
+            row.disturb_command(self.noise, &mut self.running[index].rng);
         }
         let step = rollout.step(row);
         rollout.environment.position_errors(&mut self.errors);
-        let Running { number, rewards, tracking, .. } = &mut self.running[index];
+        let Running { start, rewards, tracking, .. } = &mut self.running[index];
         rewards.push(step.reward_terms.iter().sum());
         tracking.add(&self.errors);
         let mut flow = ControlFlow::Continue(());
         if step.outcome != Outcome::Diverged {
-            flow = self.audience.watch(*number, &mut rollout.environment, Some(&step))?;
+            flow = self.audience.watch(start.number, &mut rollout.environment, Some(&step))?;
         }
         if rollout.ended {
             self.finish(index, rollout, step.outcome);
@@ -280,7 +302,7 @@ mod tests {
 
     fn episodes(controller: &mut Controller<'_, Quarter>, environments: usize) -> Vec<(usize, usize, f64)> {
         let environments = (0..environments).map(|_| Fixed { start: 0, step: 0 }).collect();
-        let starts: Vec<Start> = (0..7).map(|start| Start { clip: 0, start }).collect();
+        let starts = Start::numbered((0..7).map(|start| (0, start)));
         let options = RolloutSettings { deterministic: true, ..RolloutSettings::default() };
         let finished = run(controller, environments, &SHAPE, &starts, &options, &mut |_: usize, _: usize| ()).unwrap();
         assert!(finished.iter().all(|episode| episode.achievement.success == (episode.steps() == 10)));
@@ -323,7 +345,7 @@ mod tests {
 
     #[test]
     fn the_audience_watches_every_state_of_every_episode_and_may_break_at_any() {
-        let starts = [1, 3, 2].map(|start| Start { clip: 0, start });
+        let starts = Start::numbered([1, 3, 2].map(|start| (0, start)));
         let steps = |number, last| (0..=last).map(move |step| (number, step));
         let all: Vec<_> = steps(0, 3).chain(steps(1, 3)).chain(steps(2, 10)).collect();
         for (patience, episodes) in [(1, 0), (3, 0), (4, 1), (5, 1), (8, 2), (100, 3)] {

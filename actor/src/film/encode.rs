@@ -7,13 +7,12 @@ mod webp;
 
 use std::fs::File;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
-use comic_tasks::film::Size;
-use tempfile::NamedTempFile;
-
 use crate::Error;
+use crate::output_file::OutputFile;
+use comic_tasks::film::Size;
 
 /// The format of a film.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,7 +40,8 @@ impl Format {
             "mp4" => Ok(Self::Mp4),
             "png" => Ok(Self::Png),
             _ => Err(Error::Usage(format!(
-                "{}: its extension names no film; known are .gif, .webp, .mp4 (through ffmpeg) and .png (a contact sheet)",
+                "{}: its extension names no film; known are .html (a page), .gif, .webp, .mp4 (through ffmpeg) and .png (a \
+                 contact sheet)",
                 path.display()
             ))),
         }
@@ -68,10 +68,9 @@ trait Encoder {
 /// A film that is being written. The pictures go to a temporary file in the same directory. It gets its name when the film
 /// is finished, and is removed when the film is dropped before.
 pub struct Movie {
-    out: PathBuf,
     // Declared before the file, so that it is dropped before the file is removed.
     encoder: Box<dyn Encoder>,
-    file: NamedTempFile,
+    file: OutputFile,
 }
 
 impl Movie {
@@ -81,24 +80,15 @@ impl Movie {
     /// [`Error::Usage`] for an unknown extension or a missing ffmpeg, [`Error::File`] when the file cannot be made.
     pub fn create(out: &Path, size: Size, frame_time: Duration) -> Result<Self, Error> {
         let format = Format::of(out)?;
-        let directory = out.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".comic-film-");
-        #[cfg(unix)]
-        {
-            use std::os::unix::fs::PermissionsExt as _;
-            // The process's umask applies, as for other files.
-            builder.permissions(std::fs::Permissions::from_mode(0o666));
-        }
-        let file = builder.tempfile_in(directory).map_err(Error::file(out))?;
-        let writer = || file.as_file().try_clone().map_err(Error::file(out));
+        let file = OutputFile::create(out).map_err(Error::file(out))?;
+        let writer = || file.file().try_clone().map_err(Error::file(out));
         let encoder: Box<dyn Encoder> = match format {
             Format::Gif => Box::new(gif::Gif::new(writer()?, size, frame_time).map_err(Error::file(out))?),
             Format::WebP => Box::new(webp::WebP::new(writer()?, size, frame_time).map_err(Error::file(out))?),
             Format::Png => Box::new(sheet::Sheet::new(writer()?, size)),
             Format::Mp4 => Box::new(mp4::Mp4::new(file.path(), size, frame_time)?),
         };
-        Ok(Self { out: out.to_path_buf(), encoder, file })
+        Ok(Self { encoder, file })
     }
 
     /// Adds a picture.
@@ -106,7 +96,7 @@ impl Movie {
     /// # Errors
     /// [`Error::File`] when it cannot be written.
     pub fn frame(&mut self, picture: &[u8]) -> Result<(), Error> {
-        self.encoder.frame(picture).map_err(Error::file(&self.out))
+        self.encoder.frame(picture).map_err(Error::file(self.file.out()))
     }
 
     /// Finishes the film and gives the file its name.
@@ -114,11 +104,10 @@ impl Movie {
     /// # Errors
     /// [`Error::File`] when it cannot be written.
     pub fn finish(self) -> Result<(), Error> {
-        let Self { out, encoder, file } = self;
+        let Self { encoder, file } = self;
+        let out = file.out().to_path_buf();
         encoder.finish().map_err(Error::file(&out))?;
-        file.as_file().sync_all().map_err(Error::file(&out))?;
-        file.persist(&out).map_err(|error| Error::file(&out)(error.error))?;
-        Ok(())
+        file.finish().map_err(Error::file(&out))
     }
 }
 

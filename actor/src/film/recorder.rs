@@ -10,7 +10,6 @@ use comic_tasks::{Ghost, Simulated};
 
 use super::encode::{Format, Movie};
 use crate::Error;
-use crate::page::document::GhostPlace;
 
 /// How a film looks.
 #[derive(Args, Clone, Debug)]
@@ -70,21 +69,15 @@ impl Look {
         self.fps.map_or(1, |fps| ((1.0 / (f64::from(fps) * step)) - 1e-9).ceil().max(1.0) as usize)
     }
 
-    /// Where a page has the reference at first.
+    /// Where a page has the reference at first; `None` hides it.
     ///
     /// # Errors
     /// A size or a camera: who looks at the page chooses them.
-    pub(crate) fn of_page(&self) -> Result<GhostPlace, Error> {
+    pub(crate) fn of_page(&self) -> Result<Option<Ghost>, Error> {
         let refused = match (self.size, self.camera) {
             (Some(_), _) => "--size",
             (None, Place::Egocentric | Place::Side) => "--camera",
-            (None, Place::Tracking) => {
-                return Ok(match self.ghost {
-                    None => GhostPlace::Off,
-                    Some(Ghost::On) => GhostPlace::On,
-                    Some(Ghost::Beside) => GhostPlace::Beside,
-                });
-            }
+            (None, Place::Tracking) => return Ok(self.ghost),
         };
         Err(Error::Usage(format!("{refused}: a page has none, who looks at it turns and zooms: leave the option out")))
     }

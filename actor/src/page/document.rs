@@ -1,16 +1,18 @@
 //! The page's file: `viewer/page.html` with the style sheet, the programs and the data in it.
 
 use std::io::Write as _;
-use std::path::Path;
 
 use serde::Serialize;
 
 use crate::Error;
+use crate::output_file::OutputFile;
 
 const TEMPLATE: &str = include_str!("viewer/page.html");
 const STYLE: &str = include_str!("viewer/page.css");
 const VIEWER: &str = include_str!("viewer/page.js");
 const THREE: &str = include_str!("../../data/three/three.js");
+/// Every copy of three.js must have its licence.
+const LICENCE: &str = include_str!("../../data/three/LICENSE");
 
 /// What a page shows.
 #[derive(Clone, Debug, Serialize)]
@@ -21,24 +23,12 @@ pub struct Document {
     pub step: f64,
     /// The names of the reward's terms.
     pub terms: Vec<String>,
-    /// Where the reference is at first.
-    pub ghost: GhostPlace,
+    /// Where the reference is at first: `off`, `on` (at its own position) or `beside` (a metre to the right in the picture).
+    pub ghost: &'static str,
     /// The scenes, which the episodes name.
     pub scenes: Vec<Scene>,
     /// The episodes, in the order of the list.
     pub episodes: Vec<Episode>,
-}
-
-/// Where the reference is drawn.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum GhostPlace {
-    /// Nowhere.
-    Off,
-    /// At its own position.
-    On,
-    /// A metre to the right in the picture.
-    Beside,
 }
 
 /// The shapes of a model.
@@ -57,7 +47,7 @@ pub struct Shape {
     pub size: [f32; 3],
     /// Red, green, blue and opacity, 0 to 1.
     pub colour: [f32; 4],
-    /// Its body's place among the poses; absent for the world.
+    /// Its body's place among the poses; `null` for the world.
     pub body: Option<usize>,
     /// x, y and z in the frame of the body, m.
     pub position: [f32; 3],
@@ -74,11 +64,13 @@ pub struct Episode {
     pub note: String,
     /// Its scene.
     pub scene: usize,
-    /// Control steps from one pose to the next.
+    /// Its control steps.
+    pub steps: usize,
+    /// Control steps from one pose to the next; the last pose is that of the last step.
     pub every: usize,
     /// The poses of the bodies.
     pub poses: Poses,
-    /// The poses of the reference's bodies, which are the first of the bodies; absent in a task without a reference.
+    /// The poses of the reference's bodies, which are the first of the bodies; `null` in a task without a reference.
     pub reference: Option<Poses>,
     /// The target's place on the floor at each pose, x and y, m; empty without a target.
     pub targets: Vec<[f32; 2]>,
@@ -86,8 +78,8 @@ pub struct Episode {
     pub rewards: Vec<Vec<f32>>,
 }
 
-/// Poses in 14 bytes each, as base64: three positions (little-endian u16, from `low` to `high`), and a unit quaternion w, x, y,
-/// z (little-endian i16, in 1/32767).
+/// Poses in 14 bytes each, as base64: x, y and z (little-endian u16, from `low` to `high`), and a unit quaternion w, x, y, z
+/// (little-endian i16, in 1/32767).
 #[derive(Clone, Debug, Serialize)]
 pub struct Poses {
     /// Bodies of a frame.
@@ -101,20 +93,15 @@ pub struct Poses {
 }
 
 impl Document {
-    /// Writes the page. The file is whole or absent.
+    /// Writes the page.
     ///
     /// # Errors
     /// [`Error::File`] when it cannot be written.
-    pub fn write(&self, out: &Path) -> Result<(), Error> {
+    pub(crate) fn write(&self, file: OutputFile) -> Result<(), Error> {
         let html = self.html()?;
-        let directory = out.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let write = || {
-            let mut file =
-                tempfile::Builder::new().prefix(".comic-page-").permissions(permissions()).tempfile_in(directory)?;
-            file.write_all(html.as_bytes())?;
-            file.persist(out).map_err(|error| error.error)
-        };
-        write().map(drop).map_err(Error::file(out))?;
+        let out = file.out().to_path_buf();
+        file.file().write_all(html.as_bytes()).map_err(Error::file(&out))?;
+        file.finish().map_err(Error::file(&out))?;
         tracing::info!(file = %out.display(), episodes = self.episodes.len(), bytes = html.len(), "page written");
         Ok(())
     }
@@ -125,7 +112,7 @@ impl Document {
             .map_err(|error| Error::Usage(format!("cannot write the page's data as JSON: {error}")))?;
         // Within a script element only `<` can end the element. In JSON it stands only in strings.
         let data = data.replace('<', "\\u003c");
-        let parts = [("STYLE", STYLE), ("THREE", THREE), ("DATA", &data), ("VIEWER", VIEWER)];
+        let parts = [("STYLE", STYLE), ("LICENCE", LICENCE), ("THREE", THREE), ("DATA", &data), ("VIEWER", VIEWER)];
         let mut html = String::with_capacity(TEMPLATE.len() + parts.iter().map(|(_, text)| text.len()).sum::<usize>());
         let mut rest = TEMPLATE;
         for (name, text) in parts {
@@ -140,12 +127,6 @@ impl Document {
     }
 }
 
-/// The process's umask applies, as for other files.
-fn permissions() -> std::fs::Permissions {
-    use std::os::unix::fs::PermissionsExt as _;
-    std::fs::Permissions::from_mode(0o666)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -157,7 +138,7 @@ mod tests {
             title: hostile.into(),
             step: 0.03,
             terms: vec![hostile.into()],
-            ghost: GhostPlace::Off,
+            ghost: "off",
             scenes: Vec::new(),
             episodes: Vec::new(),
         };
@@ -176,12 +157,12 @@ mod tests {
             title: "a walk".into(),
             step: 0.03,
             terms: Vec::new(),
-            ghost: GhostPlace::On,
+            ghost: "on",
             scenes: Vec::new(),
             episodes: Vec::new(),
         };
         let html = document.html().unwrap();
-        for part in [STYLE, THREE, VIEWER, r#""title":"a walk""#] {
+        for part in [STYLE, LICENCE, THREE, VIEWER, r#""title":"a walk""#] {
             assert_eq!(html.matches(part).count(), 1);
         }
         for outside in ["src=", "href=", "@import", "fetch(", "import("] {

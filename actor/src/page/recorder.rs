@@ -6,9 +6,9 @@ use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
 use comic_experiment::TaskSpec;
 use comic_tasks::geometry::{Form, Geometry, Pose, ReferencePoses};
-use comic_tasks::{Outcome, Simulated, Step};
+use comic_tasks::{Ghost, Outcome, Simulated, Step};
 
-use super::document::{Document, Episode, GhostPlace, Poses, Scene, Shape};
+use super::document::{Document, Episode, Poses, Scene, Shape};
 use crate::Error;
 
 /// Records episodes.
@@ -16,9 +16,9 @@ pub struct PageRecorder<'a> {
     spec: &'a TaskSpec,
     /// Control steps from one pose to the next.
     every: usize,
-    /// The geometry of each scene, and its reference's poses.
-    geometries: Vec<(Geometry, ReferencePoses)>,
-    /// By the place of the episode's start among all starts.
+    /// The shapes of each model, and where the reference is in it.
+    geometries: Vec<(Geometry, Option<ReferencePoses>)>,
+    /// By the number of the episode's start.
     recordings: BTreeMap<usize, Recording>,
 }
 
@@ -33,24 +33,49 @@ struct Recording {
     targets: Vec<[f32; 2]>,
     /// The terms of each step.
     rewards: Vec<Vec<f64>>,
-    outcome: Outcome,
+}
+
+/// How an episode ended.
+pub struct Ending {
+    /// The number of its start.
+    pub number: usize,
+    /// What the list says of it before its clip and its start; empty for nothing.
+    pub remark: String,
+    /// Why it ended.
+    pub outcome: Outcome,
+    /// Its normalised reward.
+    pub normalised_reward: f64,
 }
 
 impl<'a> PageRecorder<'a> {
-    /// Records a pose every `every` control steps, and the rewards of all.
+    /// Records a pose every `every` control steps and at an episode's end, and the rewards of all steps.
     pub fn new(spec: &'a TaskSpec, every: usize) -> Self {
         Self { spec, every: every.max(1), geometries: Vec::new(), recordings: BTreeMap::new() }
     }
 
-    /// The page of the episodes, in the order of their starts, with control steps of `step` seconds. `remarks` are said of
-    /// the first ones in the list of episodes.
-    pub fn document(self, title: String, step: f64, ghost: GhostPlace, remarks: &[String]) -> Document {
-        let Self { spec, every, geometries, recordings } = self;
-        let scenes = geometries.iter().map(|(geometry, _)| scene(geometry)).collect();
-        let episodes = recordings
-            .into_iter()
-            .map(|(number, recording)| recording.episode(spec, every, remarks.get(number).map(String::as_str)));
-        Document { title, step, terms: spec.reward_terms.clone(), ghost, scenes, episodes: episodes.collect() }
+    /// Records the present state of an environment: an episode's begin, without a step, or what is after a step. `number` is
+    /// that of the episode's start.
+    ///
+    /// # Errors
+    /// A model without the humanoid.
+    pub fn record(&mut self, number: usize, environment: &dyn Simulated, step: Option<&Step>) -> Result<(), Error> {
+        let mut recording = match self.recordings.remove(&number) {
+            Some(recording) => recording,
+            None => self.begin(environment)?,
+        };
+        if let Some(step) = step {
+            recording.rewards.push(step.reward_terms.iter().take(self.spec.reward_terms.len()).copied().collect());
+        }
+        let last = step.is_some_and(|step| step.outcome != Outcome::Running);
+        if let Some((geometry, reference)) = self.geometries.get_mut(recording.scene)
+            && (last || recording.rewards.len().is_multiple_of(self.every))
+        {
+            recording.poses.push(geometry.poses(environment));
+            recording.reference.extend(reference.as_mut().map(|reference| reference.poses(geometry, environment)));
+            recording.targets.extend(environment.scenery().target.map(|target| target.map(|place| place as f32)));
+        }
+        self.recordings.insert(number, recording);
+        Ok(())
     }
 
     fn begin(&mut self, environment: &dyn Simulated) -> Result<Recording, Error> {
@@ -58,9 +83,9 @@ impl<'a> PageRecorder<'a> {
         let scene = match known {
             Some(scene) => scene,
             None => {
-                let geometry = Geometry::new(environment)?;
-                let reference = ReferencePoses::new(&geometry);
-                self.geometries.push((geometry, reference));
+                let has_reference = environment.scenery().reference.is_some();
+                let reference = has_reference.then(|| ReferencePoses::new(environment));
+                self.geometries.push((Geometry::new(environment)?, reference));
                 self.geometries.len() - 1
             }
         };
@@ -74,61 +99,60 @@ impl<'a> PageRecorder<'a> {
             reference: Vec::new(),
             targets: Vec::new(),
             rewards: Vec::new(),
-            outcome: Outcome::Running,
         })
     }
 
-    /// Records the present state of an environment: an episode's begin, without a step, or what is after a step. `number` is the
-    /// place of the episode's start among all starts.
-    ///
-    /// # Errors
-    /// A model without the humanoid.
-    pub fn record(&mut self, number: usize, environment: &dyn Simulated, step: Option<&Step>) -> Result<(), Error> {
-        let mut recording = match self.recordings.remove(&number) {
-            Some(recording) => recording,
-            None => self.begin(environment)?,
+    /// The page, with control steps of `step` seconds. It has the episodes that have ended, in the order of `endings`, and then
+    /// those that have not.
+    pub fn document(mut self, title: String, step: f64, ghost: Option<Ghost>, endings: &[Ending]) -> Document {
+        let mut episodes = Vec::new();
+        for ending in endings {
+            let recording = self.recordings.remove(&ending.number);
+            episodes.extend(recording.map(|recording| recording.episode(self.spec, self.every, Some(ending))));
+        }
+        episodes.extend(self.recordings.into_values().map(|recording| recording.episode(self.spec, self.every, None)));
+        let scenes = self.geometries.iter().map(|(geometry, _)| scene(geometry)).collect();
+        let ghost = match ghost {
+            None => "off",
+            Some(Ghost::On) => "on",
+            Some(Ghost::Beside) => "beside",
         };
-        if let Some(step) = step {
-            recording.rewards.push(step.reward_terms.iter().take(self.spec.reward_terms.len()).copied().collect());
-            recording.outcome = step.outcome;
-        }
-        if let Some((geometry, reference)) = self.geometries.get_mut(recording.scene)
-            && recording.rewards.len().is_multiple_of(self.every)
-        {
-            recording.poses.push(geometry.poses(environment));
-            recording.reference.push(reference.poses(geometry, environment));
-            recording.targets.extend(environment.scenery().target.map(|target| target.map(|place| place as f32)));
-        }
-        self.recordings.insert(number, recording);
-        Ok(())
+        Document { title, step, terms: self.spec.reward_terms.clone(), ghost, scenes, episodes }
     }
 }
 
 impl Recording {
-    fn episode(self, spec: &TaskSpec, every: usize, remark: Option<&str>) -> Episode {
-        let sum: f64 = self.rewards.iter().flatten().sum();
-        let most = spec.max_reward(self.clip) * self.steps_left as f64;
-        let normalised = if most > 0.0 { sum / most } else { 0.0 };
+    fn episode(mut self, spec: &TaskSpec, every: usize, ending: Option<&Ending>) -> Episode {
+        // The last steps have no pose if the film ended there.
+        self.rewards.truncate(self.poses.len().saturating_sub(1) * every);
+        let steps = self.rewards.len();
         let clip = spec.clips.get(self.clip).map_or("", String::as_str);
-        let ended = match self.outcome {
-            // The film ends, or the next step diverged.
-            Outcome::Running | Outcome::Diverged => "cut off",
-            Outcome::Terminated => "failed",
-            Outcome::Truncated => "to the end",
+        let place = format!("{clip} from {}", self.start);
+        let name = match ending {
+            Some(ending) if !ending.remark.is_empty() => format!("{}: {place}", ending.remark),
+            _ => place,
         };
-        let (start, steps, all) = (self.start, self.rewards.len(), self.steps_left);
-        let place = format!("{clip} from {start}");
-        let name = remark.map_or_else(|| place.clone(), |remark| format!("{remark}: {place}"));
-        let note = format!("{steps} of {all} steps, {ended}, normalised reward {normalised:.3}");
+        let length = format!("{steps} of {} steps", self.steps_left);
+        let note = match ending {
+            None => format!("{length}, the film ends"),
+            Some(Ending { outcome, normalised_reward, .. }) => {
+                let end = match outcome {
+                    Outcome::Terminated => "failed",
+                    Outcome::Diverged => "the simulation diverged",
+                    Outcome::Running | Outcome::Truncated => "to the end",
+                };
+                format!("{length}, {end}, normalised reward {normalised_reward:.3}")
+            }
+        };
         let term = |term: usize| self.rewards.iter().map(|terms| terms[term] as f32).collect();
-        let has_reference = self.reference.iter().any(|poses| !poses.is_empty());
         Episode {
             name,
             note,
             scene: self.scene,
+            steps,
             every,
             poses: packed(&self.poses),
-            reference: has_reference.then(|| packed(&self.reference)),
+            reference: (!self.reference.is_empty()).then(|| packed(&self.reference)),
             targets: self.targets,
             rewards: (0..spec.reward_terms.len()).map(term).collect(),
         }

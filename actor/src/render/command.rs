@@ -14,8 +14,8 @@ use crate::Error;
 use crate::evaluate::Audience;
 use crate::film::encode::Format;
 use crate::film::recorder::{Look, Recorder};
+use crate::output_file::OutputFile;
 use crate::page;
-use crate::page::document::GhostPlace;
 use crate::page::recorder::PageRecorder;
 
 /// The most seconds of an episode that are filmed unless asked for.
@@ -40,7 +40,7 @@ pub struct Render {
     /// Seconds to film, episode after episode; the first episode, 10 s of it at most, unless given.
     #[arg(long, value_name = "S", value_parser = seconds, help_heading = "Film")]
     seconds: Option<f64>,
-    /// Whole episodes to film, whose starts are spread evenly over the clip from --start on.
+    /// Whole episodes to film, at most one for each start, spread evenly over the clip's starts; --start is the first.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MOST_EPISODES))]
     #[arg(conflicts_with = "seconds", help_heading = "Film")]
     episodes: Option<u16>,
@@ -58,22 +58,24 @@ impl Render {
         // Errors of the film's options are reported before the task is built.
         self.look.suits(self.scene.task())?;
         let is_page = page::is_page(&self.out);
-        let place = if is_page { self.look.of_page()? } else { Format::of(&self.out).map(|_| GhostPlace::Off)? };
+        let ghost = if is_page { self.look.of_page()? } else { Format::of(&self.out).map(|_| None)? };
         let most = if is_page { MOST_PAGE_SECONDS } else { MOST_SECONDS };
         if self.seconds.is_some_and(|seconds| seconds > most) {
             return Err(Error::Usage(format!("--seconds: a page holds {most} s at most: ask for fewer")));
         }
         let mut cast = self.scene.cast()?;
         let (task, step) = (Arc::clone(&cast.task), cast.task.control_timestep());
+        let spec = task.spec();
         let seconds = self.seconds.unwrap_or(if self.episodes.is_some() { most } else { USUAL_SECONDS });
         let steps = (seconds / step - 1e-9).ceil() as usize;
-        let camera = if is_page {
-            Camera::Page(PageRecorder::new(task.spec(), self.look.every(step)))
+        let target = if is_page {
+            let file = OutputFile::create(&self.out).map_err(Error::file(&self.out))?;
+            Target::Page(PageRecorder::new(spec, self.look.every(step)), file)
         } else {
-            Camera::Film(Recorder::new(&self.look, &self.out, step)?)
+            Target::Film(Recorder::new(&self.look, &self.out, step)?)
         };
-        let mut filming = Filming { camera, left: steps, bar: bar(steps) };
-        match (self.episodes, self.seconds) {
+        let mut filming = Filming { target, left: steps, bar: bar(steps) };
+        let mut finished = match (self.episodes, self.seconds) {
             (Some(episodes), _) => cast.play_spread(episodes.into(), &mut filming)?,
             // Every episode has at least one step, so there are enough episodes.
             (None, Some(_)) => cast.play(steps, &mut filming)?,
@@ -82,22 +84,33 @@ impl Render {
         if let Some(bar) = filming.bar {
             bar.finish_and_clear();
         }
-        match filming.camera {
-            Camera::Film(recorder) => recorder.finish(),
-            Camera::Page(recorder) => recorder.document(self.scene.title(), step, place, &[]).write(&self.out),
+        if self.episodes.is_some() && filming.left == 0 {
+            tracing::warn!(
+                episodes = finished.len(),
+                seconds,
+                "no more fits: the last episodes are left out or cut off"
+            );
+        }
+        match filming.target {
+            Target::Film(recorder) => recorder.finish(),
+            Target::Page(recorder, file) => {
+                finished.sort_by_key(|episode| episode.number);
+                let endings: Vec<_> = finished.iter().map(|episode| episode.ending(spec, String::new())).collect();
+                recorder.document(self.scene.title(), step, ghost, &endings).write(file)
+            }
         }
     }
 }
 
 /// What records the steps.
-enum Camera<'a> {
+enum Target<'a> {
     Film(Recorder),
-    Page(PageRecorder<'a>),
+    Page(PageRecorder<'a>, OutputFile),
 }
 
 /// Records every step until the time is over.
 struct Filming<'a> {
-    camera: Camera<'a>,
+    target: Target<'a>,
     /// Steps to record.
     left: usize,
     bar: Option<ProgressBar>,
@@ -110,14 +123,16 @@ impl Audience<Box<dyn Simulated>> for Filming<'_> {
         environment: &mut Box<dyn Simulated>,
         step: Option<&Step>,
     ) -> Result<ControlFlow<()>, Error> {
-        match &mut self.camera {
-            Camera::Film(recorder) => recorder.shoot(environment.as_mut())?,
-            Camera::Page(recorder) => recorder.record(number, environment.as_ref(), step)?,
+        match &mut self.target {
+            Target::Film(recorder) => recorder.shoot(environment.as_mut())?,
+            Target::Page(recorder, _) => recorder.record(number, environment.as_ref(), step)?,
         }
         self.left = self.left.saturating_sub(1);
         match &self.bar {
             Some(bar) => bar.inc(1),
-            None if self.left > 0 && self.left.is_multiple_of(STEPS_A_LINE) => tracing::info!(steps_left = self.left, "filming"),
+            None if self.left > 0 && self.left.is_multiple_of(STEPS_A_LINE) => {
+                tracing::info!(steps_left = self.left, "filming")
+            }
             None => {}
         }
         Ok(if self.left > 0 { ControlFlow::Continue(()) } else { ControlFlow::Break(()) })

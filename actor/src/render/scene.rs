@@ -13,6 +13,7 @@ use crate::Error;
 use crate::acting_loop::Controller;
 use crate::checkpoint::{self, Checkpoint};
 use crate::evaluate::{Audience, Finished, RolloutSettings, Start, roll_out};
+use crate::page;
 use crate::policy::TorchPolicy;
 
 /// The preset of tracking; every other task's preset has the task's name.
@@ -55,7 +56,8 @@ pub(super) struct Cast {
     policy: Option<TorchPolicy>,
     shape: UnrollShape,
     name: TaskName,
-    starts: Vec<Start>,
+    /// Clip and frame of all starts, the wanted one first.
+    starts: Vec<(usize, usize)>,
     options: RolloutSettings,
 }
 
@@ -73,8 +75,13 @@ impl Scene {
 
     /// What is shown, in words.
     pub(super) fn title(&self) -> String {
-        let policy = self.checkpoint.as_ref().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
-        policy.map_or_else(|| self.task.to_string(), |policy| format!("{}, {policy}", self.task))
+        let policy = match &self.checkpoint {
+            Some(path) if self.deterministic => format!("{}, without noise", page::short(path)),
+            Some(path) => format!("{}, with noise of seed {}", page::short(path), self.seed),
+            None if self.task == TaskName::Tracking => "servo action".into(),
+            None => "zero action".into(),
+        };
+        format!("{} · {policy}", self.task)
     }
 
     /// Reads experiment, checkpoint and clips, and builds the task.
@@ -130,7 +137,7 @@ impl Scene {
     }
 
     /// All starts of the first clip that has any, the wanted one first.
-    fn starts(&self, task: &dyn Task) -> Result<Vec<Start>, Error> {
+    fn starts(&self, task: &dyn Task) -> Result<Vec<(usize, usize)>, Error> {
         let spec = task.spec();
         let is_own = |clip: usize| spec.tasks.get(spec.task_of(clip)).is_some_and(|part| part.name == self.task.name());
         let clip = task.starts().iter().find(|clip| is_own(clip.clip) && !clip.frames.is_empty());
@@ -141,7 +148,7 @@ impl Scene {
             return Err(Error::Usage(format!("--start {first}: no episode starts there, only at {from} to {to}")));
         }
         let frames = (first..clip.frames.end).chain(clip.frames.start..first);
-        Ok(frames.map(|start| Start { clip: clip.clip, start }).collect())
+        Ok(frames.map(|start| (clip.clip, start)).collect())
     }
 }
 
@@ -155,10 +162,11 @@ impl Cast {
         episodes: usize,
         audience: &mut dyn Audience<Box<dyn Simulated>>,
     ) -> Result<Vec<Finished>, Error> {
-        self.roll_out(1, episodes, audience)
+        self.roll_out(&Start::numbered(self.starts.iter().copied().cycle().take(episodes)), audience)
     }
 
-    /// Rolls out `episodes` episodes, whose starts are spread evenly over all starts, or fewer if the audience breaks.
+    /// Rolls out `episodes` episodes whose starts are spread evenly over all starts, or every start if there are fewer, or fewer
+    /// if the audience breaks.
     ///
     /// # Errors
     /// As for [`play`](Self::play).
@@ -167,22 +175,25 @@ impl Cast {
         episodes: usize,
         audience: &mut dyn Audience<Box<dyn Simulated>>,
     ) -> Result<Vec<Finished>, Error> {
-        self.roll_out((self.starts.len() / episodes.max(1)).max(1), episodes, audience)
+        let starts = self.starts.len();
+        let count = episodes.min(starts);
+        if count < episodes {
+            tracing::warn!(episodes, starts, "there are fewer starts than episodes: each start has one");
+        }
+        let spread = (0..count).filter_map(|place| self.starts.get(place * starts / count).copied());
+        self.roll_out(&Start::numbered(spread), audience)
     }
 
-    /// Rolls out every `stride`-th start until there are so many episodes.
     fn roll_out(
         &mut self,
-        stride: usize,
-        episodes: usize,
+        starts: &[Start],
         audience: &mut dyn Audience<Box<dyn Simulated>>,
     ) -> Result<Vec<Finished>, Error> {
-        let starts: Vec<Start> = self.starts.iter().copied().step_by(stride).cycle().take(episodes).collect();
         let mut controller = match &mut self.policy {
             Some(policy) => Controller::Policy(policy),
             None if self.name == TaskName::Tracking => Controller::Servo,
             None => Controller::Zero,
         };
-        roll_out(&mut controller, &self.task, &self.shape, &starts, &self.options, audience)
+        roll_out(&mut controller, &self.task, &self.shape, starts, &self.options, audience)
     }
 }

@@ -1,6 +1,6 @@
-//! The shapes of an environment and the poses of its bodies as numbers, for a viewer that has neither MuJoCo nor OpenGL.
+//! The shapes of an environment and the poses of its bodies as numbers, for viewers without MuJoCo.
 
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 
 use mujoco_rs::prelude::*;
 
@@ -58,7 +58,8 @@ pub struct Shape {
 /// What is drawn of a model.
 #[derive(Clone, Debug)]
 pub struct Geometry {
-    model: Arc<MjModel>,
+    /// Not kept in memory: a corridor has a model for each episode.
+    model: Weak<MjModel>,
     shapes: Vec<Shape>,
     /// MuJoCo's numbers of the bodies that have a shape, the humanoid's first.
     bodies: Vec<usize>,
@@ -83,22 +84,17 @@ impl Geometry {
         bodies.dedup();
         let humanoid = bodies.iter().filter(|body| model.body_rootid()[**body] == root).count();
         let shapes = drawn.into_iter().filter_map(|geom| shape(&model, geom, &bodies)).collect();
-        Ok(Self { model, shapes, bodies, humanoid })
+        Ok(Self { model: Arc::downgrade(&model), shapes, bodies, humanoid })
     }
 
     /// Whether these are the shapes of the environment's present model.
     pub fn is_of(&self, environment: &dyn Simulated) -> bool {
-        Arc::ptr_eq(&self.model, &environment.model())
+        self.model.upgrade().is_some_and(|model| Arc::ptr_eq(&model, &environment.model()))
     }
 
     /// The shapes.
     pub fn shapes(&self) -> &[Shape] {
         &self.shapes
-    }
-
-    /// How many bodies there are.
-    pub fn bodies(&self) -> usize {
-        self.bodies.len()
     }
 
     /// The poses of the bodies in the world, the humanoid's first.
@@ -121,18 +117,17 @@ pub struct ReferencePoses {
 }
 
 impl ReferencePoses {
-    /// For environments with the model of `geometry`.
-    pub fn new(geometry: &Geometry) -> Self {
-        Self { simulation: Simulation::new(Arc::clone(&geometry.model)) }
+    /// For environments with the same model as this one.
+    pub fn new(environment: &dyn Simulated) -> Self {
+        Self { simulation: Simulation::new(environment.model()) }
     }
 
-    /// The poses of the humanoid's bodies in the present frame of the reference; none in a task without a reference.
+    /// The poses of the humanoid's bodies in the present frame of the reference; those before if there is no such frame.
     pub fn poses(&mut self, geometry: &Geometry, environment: &dyn Simulated) -> Vec<Pose> {
         let reference = environment.scenery().reference.unwrap_or_default();
-        if reference.is_empty() || reference.len() != self.simulation.qpos().len() {
-            return Vec::new();
+        if reference.len() == self.simulation.qpos().len() {
+            self.simulation.qpos_mut().copy_from_slice(&reference);
         }
-        self.simulation.qpos_mut().copy_from_slice(&reference);
         self.simulation.kinematics();
         geometry.poses_in(&self.simulation, geometry.humanoid)
     }

@@ -12,36 +12,34 @@ const TURN = 35 * Math.PI / 180;
 const ASIDE = 1.0;
 const GHOST_COLOUR = 0x59bfff;
 // Side of the floor that is drawn of a plane, and of one of its tiles, m. A plane has no end for contacts.
-const FLOOR = 80;
+const FLOOR = 160;
 const TILE = 1;
-const TILE_COLOURS = { light: ["#d3dae1", "#c3ccd5"], dark: ["#55616d", "#4a5560"] };
+const TILE_COLOURS = { light: ["#b3bdc7", "#a2adb8"], dark: ["#55616d", "#4a5560"] };
+// How long the end is shown before an episode begins again, s.
+const HOLD = 0.8;
 // Distinct also for most people who are colour-blind (Okabe and Ito, 2008).
 const STRIP_COLOURS = ["#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00"];
 
 // ---------------------------------------------------------------- data
 
-// Reads poses: a list of frames, each a list of {position, rotation}.
-function unpack(poses) {
-  const bytes = Uint8Array.from(atob(poses.data), (letter) => letter.charCodeAt(0));
-  const view = new DataView(bytes.buffer);
-  const place = (at, axis) => {
-    const level = view.getUint16(at + 2 * axis, true) / 65535;
-    return poses.low[axis] + level * (poses.high[axis] - poses.low[axis]);
-  };
-  const part = (at, index) => view.getInt16(at + 6 + 2 * index, true) / 32767;
-  const frames = [];
-  for (let at = 0; at < bytes.length; at += 14 * poses.bodies) {
-    const frame = [];
-    for (let body = 0; body < poses.bodies; body++) {
-      const start = at + 14 * body;
-      frame.push({
-        position: new THREE.Vector3(place(start, 0), place(start, 1), place(start, 2)),
-        rotation: new THREE.Quaternion(part(start, 1), part(start, 2), part(start, 3), part(start, 0)).normalize(),
-      });
-    }
-    frames.push(frame);
+// Poses of frames, which are read one by one.
+class Poses {
+  constructor(poses) {
+    const bytes = Uint8Array.from(atob(poses.data), (letter) => letter.charCodeAt(0));
+    this.view = new DataView(bytes.buffer);
+    this.bodies = poses.bodies;
+    this.low = poses.low;
+    this.range = poses.high.map((high, axis) => high - poses.low[axis]);
+    this.frames = poses.bodies ? bytes.length / (14 * poses.bodies) : 0;
   }
-  return frames;
+
+  read(frame, body, position, rotation) {
+    const at = 14 * (frame * this.bodies + body);
+    const place = (axis) => this.low[axis] + (this.view.getUint16(at + 2 * axis, true) / 65535) * this.range[axis];
+    const part = (index) => this.view.getInt16(at + 6 + 2 * index, true) / 32767;
+    position.set(place(0), place(1), place(2));
+    rotation.set(part(1), part(2), part(3), part(0)).normalize();
+  }
 }
 
 // The sum of all terms of each step, then each term.
@@ -152,7 +150,7 @@ function openView() {
   renderer.shadowMap.type = THREE.PCFSoftShadowMap;
   const scene = new THREE.Scene();
   scene.add(new THREE.HemisphereLight(0xffffff, 0x9aa0a8, 0.85));
-  const sun = new THREE.DirectionalLight(0xffffff, 0.55);
+  const sun = new THREE.DirectionalLight(0xffffff, 0.5);
   sun.castShadow = true;
   sun.shadow.mapSize.set(2048, 2048);
   Object.assign(sun.shadow.camera, { left: -4, right: 4, top: 4, bottom: -4, near: 1, far: 20 });
@@ -181,14 +179,14 @@ class Player {
     const { scene } = this.view;
     if (this.built) scene.remove(this.built.all);
     this.episode = episode;
-    this.frames = unpack(episode.poses);
-    this.reference = episode.reference ? unpack(episode.reference) : [];
+    this.poses = new Poses(episode.poses);
+    this.reference = episode.reference ? new Poses(episode.reference) : null;
     this.lines = rewardLines(episode);
-    this.end = Math.max((this.frames.length - 1) * episode.every, 0);
+    this.end = episode.steps;
     this.built = build(data.scenes[episode.scene], episode);
     scene.add(this.built.all);
     element("note").textContent = episode.note;
-    element("ghost-label").hidden = !this.reference.length;
+    element("ghost-label").hidden = !this.reference;
     element("slider").max = this.end;
     this.step = 0;
     this.look();
@@ -197,7 +195,8 @@ class Player {
 
   // Behind the right shoulder, as in a film. The humanoid's own z points forward.
   look() {
-    const root = this.frames[0][0];
+    const root = { position: new THREE.Vector3(), rotation: new THREE.Quaternion() };
+    this.poses.read(0, 0, root.position, root.rotation);
     const forward = new THREE.Vector3(0, 0, 1).applyQuaternion(root.rotation);
     const azimuth = Math.atan2(forward.y, forward.x) + TURN;
     const { camera, controls } = this.view;
@@ -209,27 +208,37 @@ class Player {
     controls.update();
   }
 
-  // Puts groups into the poses at the present time, between two frames.
-  place(groups, frames, offset) {
-    const at = Math.min(this.step / this.episode.every, frames.length - 1);
-    const before = Math.floor(at);
-    const after = Math.min(before + 1, frames.length - 1);
+  // The frames before and after the present time, and how far it is from one to the other, 0 to 1. Frames are `every` steps
+  // apart, but for the last one, which is at the end.
+  between(frames) {
+    const { every } = this.episode;
+    const before = Math.min(Math.floor(this.step / every), Math.max(frames - 2, 0));
+    const [from, to] = [before * every, Math.min((before + 1) * every, this.end)];
+    const share = to > from ? Math.min((this.step - from) / (to - from), 1) : 0;
+    return [before, Math.min(before + 1, frames - 1), share];
+  }
+
+  // Puts groups into the poses at the present time.
+  place(groups, poses, offset) {
+    const [before, after, share] = this.between(poses.frames);
+    const [position, rotation] = [new THREE.Vector3(), new THREE.Quaternion()];
     groups.forEach((group, body) => {
-      const [one, other] = [frames[before][body], frames[after][body]];
-      group.position.copy(one.position).lerp(other.position, at - before);
+      poses.read(before, body, group.position, group.quaternion);
+      poses.read(after, body, position, rotation);
+      group.position.lerp(position, share);
+      group.quaternion.slerp(rotation, share);
       if (offset) group.position.add(offset);
-      THREE.Quaternion.slerp(one.rotation, other.rotation, group.quaternion, at - before);
     });
-    return before;
   }
 
   show() {
     const { built, view, episode } = this;
-    const frame = this.place(built.bodies, this.frames, null);
+    this.place(built.bodies, this.poses, null);
     const mode = element("ghost").value;
     for (const ghost of built.ghosts) ghost.visible = mode !== "off";
-    if (this.reference.length) this.place(built.ghosts, this.reference, mode === "beside" ? this.aside : null);
+    if (this.reference) this.place(built.ghosts, this.reference, mode === "beside" ? this.aside : null);
     if (episode.targets.length) {
+      const [frame] = this.between(this.poses.frames);
       const [x, y] = episode.targets[Math.min(frame, episode.targets.length - 1)];
       built.target.position.set(x, y, 0.01);
     }
@@ -246,7 +255,6 @@ class Player {
     }
     view.sun.target.position.copy(root);
     view.sun.position.copy(root).add(new THREE.Vector3(2, -3, 7));
-    view.controls.update();
     this.write();
     this.draw();
   }
@@ -282,21 +290,23 @@ class Player {
   play(playing) {
     this.playing = playing;
     this.last = null;
+    this.held = 0;
     if (playing && this.step >= this.end) this.step = 0;
     this.write();
-    if (playing) requestAnimationFrame((now) => this.tick(now));
+    cancelAnimationFrame(this.request);
+    if (playing) this.request = requestAnimationFrame((now) => this.tick(now));
   }
 
   tick(now) {
-    if (!this.playing) return;
-    if (this.last !== null) {
-      const steps = ((now - this.last) / 1000 / data.step) * Number(element("speed").value);
-      // Again from the start. An episode of one frame stands still.
-      this.step = this.end ? (this.step + steps) % this.end : 0;
-    }
+    const passed = this.last === null ? 0 : (now - this.last) / 1000;
     this.last = now;
+    if (this.step < this.end) {
+      this.step = Math.min(this.step + (passed / data.step) * Number(element("speed").value), this.end);
+    } else if ((this.held += passed) > HOLD) {
+      [this.step, this.held] = [0, 0];
+    }
     this.show();
-    requestAnimationFrame((next) => this.tick(next));
+    this.request = requestAnimationFrame((next) => this.tick(next));
   }
 }
 
@@ -304,19 +314,23 @@ class Player {
 
 class Strip {
   constructor(name, term, colour) {
-    // The same scale for all episodes of the page.
     this.term = term;
     this.colour = colour;
-    this.most = data.episodes.reduce(
-      (most, episode) => rewardLines(episode)[term].reduce((high, reward) => Math.max(high, reward), most),
-      1e-9,
-    );
+    // The same scale for all episodes of the page. It has 0.
+    [this.low, this.high] = [0, 0];
+    for (const episode of data.episodes) {
+      for (const reward of rewardLines(episode)[term]) {
+        this.low = Math.min(this.low, reward);
+        this.high = Math.max(this.high, reward);
+      }
+    }
     this.canvas = document.createElement("canvas");
     this.value = document.createElement("span");
     this.value.className = "value";
     const label = document.createElement("span");
-    label.textContent = name;
-    label.title = `0 to ${this.most.toPrecision(3)}`;
+    const range = document.createElement("small");
+    range.textContent = ` ${Number(this.low.toPrecision(2))} to ${Number(this.high.toPrecision(2))}`;
+    label.append(name, range);
     element("strips").append(label, this.canvas, this.value);
     const seek = (event) => {
       if (event.buttons) player.seek((event.offsetX / this.canvas.clientWidth) * player.end);
@@ -351,14 +365,15 @@ class Strip {
     const paint = picture.getContext("2d");
     paint.fillStyle = this.colour;
     paint.globalAlpha = 0.85;
+    const row = (reward) => (height * (this.high - reward)) / (this.high - this.low || 1);
+    const column = (step) => (step / (end || 1)) * width;
     paint.beginPath();
-    paint.moveTo(0, height);
+    paint.moveTo(0, row(0));
     line.forEach((reward, step) => {
-      const top = height * (1 - Math.max(reward, 0) / this.most);
-      paint.lineTo((step / (end || 1)) * width, top);
-      paint.lineTo(((step + 1) / (end || 1)) * width, top);
+      paint.lineTo(column(step), row(reward));
+      paint.lineTo(column(step + 1), row(reward));
     });
-    paint.lineTo((line.length / (end || 1)) * width, height);
+    paint.lineTo(column(line.length), row(0));
     paint.fill();
     return picture;
   }
@@ -389,7 +404,7 @@ function start() {
   try {
     player = new Player(openView());
   } catch (error) {
-    return fail(`This browser cannot draw: ${error.message}. The page needs WebGL.`);
+    return fail(`This page needs WebGL, and this browser has none (${error.message}).`);
   }
   // A single term is the reward itself.
   const names = data.terms.length > 1 ? ["reward", ...data.terms] : ["reward"];
@@ -400,7 +415,11 @@ function start() {
     player.choose(index);
   };
   element("episode").addEventListener("change", (event) => {
-    location.hash = Number(event.target.value) + 1;
+    // The address names the episode. It is no new page to go back from.
+    history.replaceState(null, "", `#${Number(event.target.value) + 1}`);
+    choose(chosen());
+    // The arrow keys belong to the film again.
+    event.target.blur();
   });
   window.addEventListener("hashchange", () => choose(chosen()));
   element("play").addEventListener("click", () => player.play(!player.playing));
@@ -410,7 +429,8 @@ function start() {
   player.view.controls.addEventListener("change", () => player.draw());
   window.addEventListener("resize", () => player.show());
   document.addEventListener("keydown", (event) => {
-    if (event.target.matches("select, button, input")) return;
+    const control = event.target.matches("select, button, input:not([type=range])");
+    if (control || event.repeat && event.key === " " || event.altKey || event.ctrlKey || event.metaKey) return;
     const keys = { " ": () => player.play(!player.playing) };
     keys.ArrowLeft = () => player.seek(Math.ceil(player.step) - 1);
     keys.ArrowRight = () => player.seek(Math.floor(player.step) + 1);
