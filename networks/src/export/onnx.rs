@@ -9,6 +9,7 @@ mod operators;
 mod proto;
 
 use prost::Message as _;
+use tch::TchError;
 
 use super::file::{Exported, KEY};
 use super::spec::{IMAGE, Vector};
@@ -34,7 +35,8 @@ impl Exported {
         let (module, examples) = self.trace()?;
         let file = tempfile::Builder::new().prefix("policy").suffix(".pt").tempfile().map_err(Error::File)?;
         module.save(file.path())?;
-        let graph = Graph::read(file.path(), &examples)?;
+        let unread = |error: TchError| Error::Onnx { problem: format!("its trace cannot be read: {error}") };
+        let graph = Graph::read(file.path(), &examples).map_err(unread)?;
         let mut writer = Writer::default();
         let mut inputs = Vec::new();
         for (vector, value) in self.spec.inputs.iter().zip(&graph.inputs).filter(|(vector, _)| vector.size > 0) {

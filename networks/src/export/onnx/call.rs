@@ -47,6 +47,12 @@ impl Call<'_> {
         integers.collect()
     }
 
+    /// Two integers, for the two axes of an image. libtorch also takes one for both, or none for a default.
+    pub(super) fn pair(&self, name: &str) -> Result<Vec<i64>, Error> {
+        let integers = self.integers(name)?;
+        if integers.len() == 2 { Ok(integers) } else { Err(self.unexpected(name)) }
+    }
+
     pub(super) fn number(&self, name: &str) -> Result<f64, Error> {
         match self.argument(name)? {
             Argument::Integer(integer) => Ok(*integer as f64),

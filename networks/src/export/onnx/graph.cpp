@@ -67,6 +67,11 @@ Values run(const torch::jit::Graph& graph, const std::vector<at::Tensor>& inputs
     } else {
       node->getOperation()(stack);
     }
+    // The trace had one row: a list of all rows would be longer now.
+    if (stack.size() != node->outputs().size()) {
+      throw std::runtime_error(std::string{"the number of results of "} + node->kind().toQualString() +
+                               " depends on the number of rows");
+    }
     for (size_t index = 0; index < stack.size(); ++index) {
       values[node->outputs()[index]] = stack[index];
     }
@@ -242,16 +247,16 @@ extern "C" Graph* comic_graph_read(const char* path, const at::Tensor* const* in
 }
 
 // The graph as JSON, which lives as long as the graph.
-extern "C" const char* comic_graph_json(const Graph* graph, size_t* length) {
+extern "C" const char* comic_graph_json(const Graph* graph, size_t* length) noexcept {
   *length = graph->json.size();
   return graph->json.data();
 }
 
-extern "C" size_t comic_graph_constants(const Graph* graph) { return graph->constants.size(); }
+extern "C" size_t comic_graph_constants(const Graph* graph) noexcept { return graph->constants.size(); }
 
 // A constant, owned by the caller. `index` is less than the number of constants.
-extern "C" at::Tensor* comic_graph_constant(const Graph* graph, size_t index) {
+extern "C" at::Tensor* comic_graph_constant(const Graph* graph, size_t index) noexcept {
   return new at::Tensor{graph->constants[index]};
 }
 
-extern "C" void comic_graph_free(Graph* graph) { delete graph; }
+extern "C" void comic_graph_free(Graph* graph) noexcept { delete graph; }

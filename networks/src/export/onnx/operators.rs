@@ -137,13 +137,15 @@ impl Writer {
             }
             "aten::_convolution" => self.convolution(call)?,
             "aten::max_pool2d" => {
-                let pads = call.integers("padding")?.repeat(2);
+                // Rounding up is another rule there.
+                if call.truth("ceil_mode")? {
+                    return Err(call.unexpected("ceil_mode"));
+                }
                 let attributes = [
-                    Attribute::of_integers("kernel_shape", call.integers("kernel_size")?),
-                    Attribute::of_integers("strides", call.integers("stride")?),
-                    Attribute::of_integers("pads", pads),
-                    Attribute::of_integers("dilations", call.integers("dilation")?),
-                    Attribute::of_integer("ceil_mode", call.truth("ceil_mode")?.into()),
+                    Attribute::of_integers("kernel_shape", call.pair("kernel_size")?),
+                    Attribute::of_integers("strides", call.pair("stride")?),
+                    Attribute::of_integers("pads", call.pair("padding")?.repeat(2)),
+                    Attribute::of_integers("dilations", call.pair("dilation")?),
                 ];
                 self.function("MaxPool", call, attributes)?
             }
@@ -176,6 +178,9 @@ impl Writer {
             }
             "aten::narrow" => {
                 let (start, length) = (call.integer("start")?, call.integer("length")?);
+                if start < 0 {
+                    return Err(call.unexpected("start"));
+                }
                 let operand = self.tensor(call, "self")?;
                 let bounds = [start, start + length, call.integer("dim")?].map(|number| self.integers(&[number]));
                 self.put("Slice", [operand].into_iter().chain(bounds), [])
@@ -245,9 +250,9 @@ impl Writer {
         }
         let inputs = [self.float(call, "input")?, self.float(call, "weight")?, self.float(call, "bias")?];
         let attributes = [
-            Attribute::of_integers("strides", call.integers("stride")?),
-            Attribute::of_integers("pads", call.integers("padding")?.repeat(2)),
-            Attribute::of_integers("dilations", call.integers("dilation")?),
+            Attribute::of_integers("strides", call.pair("stride")?),
+            Attribute::of_integers("pads", call.pair("padding")?.repeat(2)),
+            Attribute::of_integers("dilations", call.pair("dilation")?),
             Attribute::of_integer("group", call.integer("groups")?),
         ];
         Ok(self.put("Conv", inputs, attributes))
