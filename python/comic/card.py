@@ -117,13 +117,13 @@ def card(
             "## How it was made",
             *_made(description, experiment),
             "## Licence and terms",
-            f"Weights: {_code(licence)}, chosen by who published them.",
+            f"Weights: {_code(licence)}, the choice of who published them, or the default of `comic.hub`.",
             f"Motion capture: {_text(given) if (given := terms or own.get('terms')) else _terms(experiment)}",
             "It was made and measured in simulation only, for research. Nothing here was tried on a robot.",
             "## Citation",
             f"```bibtex\n{_CITATION}\n```",
         ]
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise _native.Error(
             f"{repo_id}: no card can be made: {type(error).__name__}: {error}; export the file again with this release, and "
             f"give an evaluation that `comic-actor evaluate --json` printed"
@@ -318,16 +318,19 @@ def _sources(experiment: Mapping[str, Any]) -> list[str]:
 
 
 def _terms(experiment: Mapping[str, Any]) -> str:
-    sources = _sources(experiment)
-    if all(source.startswith("builtin:") for source in sources):
+    """CMU's, if all that was learned from is built in: the clips, and in transfer the low level."""
+    low_level = experiment.get("transfer", {}).get("low_level", "")
+    sources = _sources(experiment) + ([] if low_level in ("", "builtin") else [low_level])
+    if sources and all(source.startswith("builtin:") for source in sources):
         return CMU
-    files = list(dict.fromkeys(_code(file_name(source).partition("#")[0]) for source in sources))
-    named = ", ".join(files[:_NAMED_SOURCES])
+    files = list(dict.fromkeys(_code(file_name(source)) for source in sources))
+    named = ", ".join(files[:_NAMED_SOURCES]) or "files that it does not name"
     return f"recordings of {named}. Who published the weights did not say under which terms they may be used."
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [[cell.replace("|", "\\|") for cell in line] for line in [heads, ["---"] * len(heads), *rows]]
+    # No other mark would end a cell, and a mark before it could be escaped itself.
+    lines = [[cell.replace("|", "¦") for cell in line] for line in [heads, ["---"] * len(heads), *rows]]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -340,8 +343,8 @@ def _code(value: object) -> str:
 
 
 def _text(value: object) -> str:
-    """A paragraph whose letters mean no HTML, no link and no picture."""
-    return _line(value).translate({ord(mark): f"\\{mark}" for mark in "<>[]*_#`"})
+    """A paragraph whose letters mean no HTML and no picture, and no link but an address that can be read."""
+    return _line(value).translate({ord(mark): f"\\{mark}" for mark in "\\<>[]*_#`!"})
 
 
 def _fenced(lines: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 
 from comic import _native
 
-__all__ = ["LONGEST", "describe", "file_name", "parse", "without_directories"]
+__all__ = ["LONGEST", "describe", "file_name", "low_level", "parse", "without_directories"]
 
 LONGEST = 1 << 30
 """Bytes of the longest file that the programs read."""
@@ -70,27 +70,38 @@ def without_directories(content: bytes) -> bytes:
     for name in _names(text):
         new = new.replace(_quoted(name), _quoted(file_name(name)))
     length = int.from_bytes(content[:8], "little")
-    if _LOW_LEVEL_FILE in header:
+    if (inside := low_level(content)) is not None:
+        if low_level(inside) is not None:
+            raise _native.Error("the low level inside has a low level: it is no file of `comic-learner export`")
         first, end = (8 + length + offset for offset in header[_LOW_LEVEL_FILE]["data_offsets"])
-        inside = without_directories(content[first:end])
+        inside = without_directories(inside)
         new = new.replace(hashlib.sha256(content[first:end]).hexdigest(), hashlib.sha256(inside).hexdigest())
         content = content[:first] + inside + content[end:]
-    if new == text:
-        return content
-    # The experiment is a text in the description, and the description is a text in the header.
-    old_header = content[8 : 8 + length].decode()
-    new_header = old_header.replace(_quoted(_quoted(text)[1:-1])[1:-1], _quoted(_quoted(new)[1:-1])[1:-1])
-    content = content[:8] + new_header.encode().ljust(length) + content[8 + length :]
+    if new != text:
+        # The experiment is a text in the description, and the description is a text in the header.
+        old_header = content[8 : 8 + length].decode()
+        new_header = old_header.replace(_quoted(_quoted(text)[1:-1])[1:-1], _quoted(_quoted(new)[1:-1])[1:-1])
+        content = content[:8] + new_header.encode().ljust(length) + content[8 + length :]
+    # TOML writes a name with quotation marks in another way, which is not replaced.
     left = [name for name in _names(parse(content, len(content))["experiment"]) if name != file_name(name)]
     if left:
         raise _native.Error(f"its experiment names the directory of {left[0]!r}, which cannot be removed: rename the file")
     return content
 
 
+def low_level(content: bytes) -> bytes | None:
+    """The file of the frozen low level in the policy of a transfer; ``None`` in any other file."""
+    place = _header(content, len(content)).get(_LOW_LEVEL_FILE)
+    if place is None:
+        return None
+    start = 8 + int.from_bytes(content[:8], "little")
+    first, end = place["data_offsets"]
+    return content[start + first : start + end]
+
+
 def file_name(source: str) -> str:
-    """A path or a source of clips without directories: ``/home/me/walks.h5#CMU_007_01`` is ``walks.h5#CMU_007_01``."""
-    path, mark, clips = source.partition("#")
-    return path.rstrip("/").rpartition("/")[2] + mark + clips
+    """The path of a file of clips or of a low level without its directories: ``/home/me/walks.h5`` is ``walks.h5``."""
+    return source.rstrip("/").rpartition("/")[2]
 
 
 def _header(start: bytes, size: int) -> dict[str, Any]:

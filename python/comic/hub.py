@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -88,6 +89,7 @@ def pull(repo_id: str, revision: str | None = None) -> Path:
             )
         # By the same name of the revision: the cache finds it again by that name when there is no network.
         path = Path(hub.hf_hub_download(repo_id, FILE, revision=revision))
+    # If the branch has moved meanwhile, a file that is too long is refused here.
     try:
         exported.describe(path)
     except _native.Error as error:
@@ -99,7 +101,7 @@ def contents(
     source: str | PathLike[str],
     repo_id: str,
     *,
-    part: str = "policy",
+    part: str | None = None,
     licence: str = LICENCE,
     terms: str | None = None,
     evaluation: str | PathLike[str] | None = None,
@@ -114,7 +116,8 @@ def contents(
         source: A ``.safetensors`` file of ``comic-learner export``; or a run's directory or one of its checkpoints, which
             the program exports first.
         repo_id: The repository: ``NAME/REPOSITORY``.
-        part: What is exported of a run: ``policy``, ``policy:TASK``, ``low-level`` or ``encoder:TASK``.
+        part: What is exported of a run: ``policy`` (unless given), ``policy:TASK``, ``low-level`` or ``encoder:TASK``. A file
+            has one part.
         licence: Licence of the weights, by a hub's name of it. It is yours to choose.
         terms: Terms of the motion capture, or ``cmu`` for those of the CMU database; by default those in the file, or CMU's
             if all clips are built in.
@@ -129,9 +132,13 @@ def contents(
         file = source
         if source.is_dir():
             file = Path(directory) / FILE
-            arguments = ["export", "--checkpoint", str(source), "--part", part, "--out", str(file)]
+            arguments = ["export", "--checkpoint", str(source), "--part", part or "policy", "--out", str(file)]
             programs.run("comic-learner", arguments)
         description = exported.describe(file)
+        if part is not None and part != description["part"]:
+            raise _native.Error(
+                f"{source}: it holds the part {description['part']}, not {part}: export that part, or name the run's directory"
+            )
         try:
             weights = exported.without_directories(file.read_bytes())
         except _native.Error as error:
@@ -156,9 +163,10 @@ def contents(
         film="film.gif" if "film.gif" in files else None,
     )
     files["README.md"] = readme.encode()
-    home = f"{Path.home()}/".encode()
-    for name in (FILE, "README.md"):
-        if home in files[name]:
+    home = f"{os.path.expanduser('~')}/".encode()
+    for name in (FILE, "README.md", "experiment.toml"):
+        # In a container the home directory may be the root, which says nothing of anybody.
+        if home not in (b"/", b"//", b"~/") and home in files[name]:
             raise _native.Error(
                 f"{source}: {name} would name your home directory, in a card's command or terms: write another card by "
                 f"`comic-learner low-level FILE --made-by COMMAND --out FILE`"
@@ -182,7 +190,7 @@ def _evaluation(run: Path, exported_from: Mapping[str, Any]) -> tuple[Any, str]:
         return _json(last).get("trained"), ""
     found: tuple[int, Any] = (-1, None)
     lines = run / "evaluations.jsonl"
-    for line in lines.read_text(errors="replace").splitlines() if lines.exists() else []:
+    for line in lines.read_text(encoding="utf-8", errors="replace").split("\n") if lines.exists() else []:
         try:
             entry = json.loads(line)
             place, evaluation = int(entry["updates"]), entry["evaluation"]
@@ -260,7 +268,10 @@ def _explained(repo_id: str, action: str) -> Iterator[None]:
         raise
     # Errors of the network are those of the library's HTTP client, which is another package from release to release.
     except Exception as error:
-        otherwise = "the hub cannot be reached: check the network, HF_ENDPOINT and HF_HUB_OFFLINE"
+        package = type(error).__module__.partition(".")[0]
+        is_network = isinstance(error, OSError) or package not in ("builtins", "huggingface_hub")
+        unreachable = "the hub cannot be reached: check the network, HF_ENDPOINT and HF_HUB_OFFLINE"
+        otherwise = unreachable if is_network else "huggingface_hub cannot do it: try another release of it"
         remedy = next((text for kind, text in remedies.items() if isinstance(error, kind)), otherwise)
         # The hub's own words may be among it: a terminal must not obey them.
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]
@@ -279,7 +290,7 @@ def main(arguments: list[str] | None = None) -> None:
     for command in pushes:
         command.add_argument("source", help="a run's directory, a checkpoint, or a .safetensors file of an export")
         command.add_argument("repository", help="NAME/REPOSITORY")
-        command.add_argument("--part", default="policy", help="policy, policy:TASK, low-level or encoder:TASK of a run")
+        command.add_argument("--part", help="policy, policy:TASK, low-level or encoder:TASK of a run [default: policy]")
         command.add_argument("--licence", default=LICENCE, help="of the weights [default: %(default)s]")
         command.add_argument("--terms", help="of the motion capture; `cmu` for those of the CMU database")
         command.add_argument("--evaluation", help="what `comic-actor evaluate --json` printed [default: the run's]")

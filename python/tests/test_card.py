@@ -138,6 +138,21 @@ def test_directories_are_removed_from_card_experiment_and_file(tmp_path: Path) -
     assert "wälks.h5#CMU_007_01" in comic.programs.run("comic-learner", ["low-level", str(file)])
 
 
+def test_a_directory_that_cannot_be_removed_is_refused(tmp_path: Path) -> None:
+    # TOML writes a name with quotation marks in single ones.
+    experiment = experiment_of(POLICY.read_bytes()).replace('"builtin:CMU_007_01"', "'/data/me/my \"walks\".h5'")
+    assert "/data/me" in experiment
+    file = tmp_path / "policy.safetensors"
+    file.write_bytes(changed(POLICY.read_bytes(), experiment=experiment))
+    with pytest.raises(comic.Error, match="names the directory of"):
+        comic.hub.contents(file, REPOSITORY)
+
+
+def test_another_part_than_that_of_the_file_is_refused() -> None:
+    with pytest.raises(comic.Error, match="it holds the part policy, not low-level"):
+        comic.hub.contents(POLICY, REPOSITORY, part="low-level")
+
+
 def test_directories_are_removed_from_the_low_level_inside_a_policy() -> None:
     inside = with_private_clips(LOW_LEVEL.read_bytes())
     digest = hashlib.sha256(inside).hexdigest()
@@ -161,7 +176,7 @@ def test_a_home_directory_in_a_files_own_card_is_refused(tmp_path: Path) -> None
 
 
 def test_names_in_a_file_cannot_change_the_card(tmp_path: Path) -> None:
-    evil = "`|<script>\n# title\n![](http://example.org/x.png)\x1b"
+    evil = "`|<script>\n# title\n![](http://example.org/x.png)\x1b \\<b\\> \\|"
     row = {"clip": evil, "episodes": 1, "normalised_reward": 0.5, "fraction_survived": float("nan")}
     measured = tmp_path / "evaluation.json"
     measured.write_text(json.dumps({"deterministic": True, "clips": [row], "overall": row}))
@@ -169,12 +184,32 @@ def test_names_in_a_file_cannot_change_the_card(tmp_path: Path) -> None:
     file = tmp_path / "policy.safetensors"
     file.write_bytes(changed(POLICY.read_bytes(), source=source))
     card = comic.hub.contents(file, REPOSITORY, evaluation=measured, terms=evil)["README.md"].decode()
-    shown = "`'\\|<script> # title ![](http://example.org/x.png)`"
+    shown = "`'¦<script> # title ![](http://example.org/x.png) \\<b\\> \\¦`"
     assert f"| {shown} | 1 | 0.500 |" in card and f"| run | {shown}, " in card
-    assert "\\<script\\> \\# title !\\[\\]" in card
+    assert "\\<script\\> \\# title \\!\\[\\]" in card
+    assert "\\\\\\<b\\\\\\>" in card, "a backslash is escaped, too"
     assert "\x1b" not in card
     for line in ["<script>", "# title"]:
         assert not any(found.startswith(line) for found in card.splitlines())
+
+
+def test_weights_that_were_learned_from_other_recordings_are_not_said_to_be_under_cmus_terms(tmp_path: Path) -> None:
+    text = experiment_of(POLICY.read_bytes())
+    for low_level, terms in [("", "mocap.cs.cmu.edu"), ("builtin", "mocap.cs.cmu.edu"), ("mine.safetensors", "did not say")]:
+        file = tmp_path / "policy.safetensors"
+        experiment = text.replace('low_level = ""', f'low_level = "{low_level}"')
+        file.write_bytes(changed(POLICY.read_bytes(), experiment=experiment))
+        card = comic.hub.contents(file, REPOSITORY)["README.md"].decode()
+        (said,) = [line for line in card.splitlines() if line.startswith("Motion capture:")]
+        assert terms in said, low_level
+
+
+def test_a_number_beyond_every_float_is_refused(tmp_path: Path) -> None:
+    row = {"clip": "walk", "episodes": 10**400, "normalised_reward": 10**400}
+    measured = tmp_path / "evaluation.json"
+    measured.write_text(json.dumps({"deterministic": True, "clips": [row], "overall": row}))
+    with pytest.raises(comic.Error, match="no card can be made"):
+        comic.hub.contents(POLICY, REPOSITORY, evaluation=measured)
 
 
 def changed_text(text: str) -> bytes:
