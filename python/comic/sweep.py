@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from comic import _native, experiment, files, programs, training
+from comic.environments import whole
 from comic.experiment import Clips, Preset
 
 if TYPE_CHECKING:
@@ -84,10 +85,14 @@ def search(
             another process uses it.
     """
     _optuna()
+    trials = whole("trials", trials, 0, None)
+    report_every = whole("report_every", report_every, 1, None)
+    actors = whole("actors", actors, 1, 1024)
+    evaluate_every = _minutes("evaluate_every", evaluate_every)
     if minutes is not None:
-        fields["budget.minutes"] = float(minutes)
+        fields["budget.minutes"] = _minutes("minutes", minutes)
     base = experiment.resolve(preset, clips=clips, **fields)
-    _check(base, space)
+    distributions = _distributions(base, space)
     for program in ("comic-learner", "comic-actor"):
         programs.find(program)
     directory = Path(directory).absolute()
@@ -108,10 +113,13 @@ def search(
         study.set_user_attr("definition", definition)
         _take_back(study)
         while _has_waiting(study) or len(_directories(study)) < trials:
-            trial = study.ask()
+            try:
+                trial = study.ask(distributions)
+            except (TypeError, ValueError) as error:
+                raise _native.Error(f"Optuna cannot choose values: {error}: look at the arguments of the sampler") from error
             name = trial.user_attrs.get("directory", f"trial-{len(_directories(study)):04}")
             trial.set_user_attr("directory", name)
-            values = {field: _suggest(trial, field, tried) for field, tried in space.items()}
+            values = {field: _value(tried, trial.params[field]) for field, tried in space.items()}
             run = _Run(trial, directory / name, actors, report_every, evaluate_every)
             run.end(study, base, values)
             _write(study, directory, space)
@@ -125,14 +133,14 @@ def curve(run: Path) -> tuple[list[int], list[float]]:
     rewards: list[float] = []
     path = run / "evaluations.jsonl"
     # The learner may be writing the last line.
-    for text in path.read_text().split("\n")[:-1] if path.exists() else []:
+    for text in path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []:
         try:
             line = json.loads(text)
             step, evaluation = int(line["environment_steps"]), line["evaluation"]
             reward = float(evaluation["overall"]["normalised_reward"])
             if not evaluation["deterministic"] or (step == 0 and line["updates"] > 0):
                 continue
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             # The learner keeps whatever is reported to it.
             continue
         # A learner that resumes repeats the steps after its last checkpoint. The newer evaluations replace the older ones.
@@ -162,7 +170,7 @@ class _Run:
                 self._train(base, values)
                 asked = ["evaluate", "--checkpoint", str(self.path), "--deterministic", "--json"]
                 files.replace(ended, [json.dumps({"trained": json.loads(programs.run("comic-actor", asked))})])
-            value = json.loads(ended.read_text())["trained"]["overall"]["normalised_reward"]
+            value = json.loads(ended.read_text(encoding="utf-8"))["trained"]["overall"]["normalised_reward"]
             study.tell(self.trial, value)
             self._say(f"normalised reward {value:.4f}")
         except optuna.TrialPruned:
@@ -201,7 +209,7 @@ class _Run:
 
         It has the priority of the actors, because on a busy machine no trial would be pruned otherwise.
         """
-        log = (self.path / "learner.log").read_text(errors="replace")
+        log = (self.path / "learner.log").read_text(encoding="utf-8", errors="replace")
         # The line in which the newest learner says where it listens.
         said = [json.loads(line) for line in log.splitlines() if line.startswith("{") and '"listening"' in line]
         arguments = ["evaluate", "--learner", f"http://{said[-1]['listening']}", "--watch", "--nice", "0"]
@@ -224,31 +232,57 @@ def reports(steps: list[int], rewards: list[float], every: int) -> Iterator[tupl
             yield step, float(np.interp(step, steps, rewards))
 
 
-def _suggest(trial: Any, name: str, values: Mapping[str, Any] | Sequence[Any]) -> Any:
-    if isinstance(values, Mapping):
-        whole = all(isinstance(values[end], int) for end in ("low", "high"))
-        return (trial.suggest_int if whole else trial.suggest_float)(name, **values)
-    # Optuna stores no lists.
-    stored = [value if isinstance(value, (bool, int, float, str)) else json.dumps(value) for value in values]
-    return values[stored.index(trial.suggest_categorical(name, stored))]
-
-
-def _check(base: experiment.Experiment, space: Space) -> None:
-    """Refuses what an experiment would refuse before the first trial begins."""
-    if not space:
+def _distributions(base: experiment.Experiment, space: Space) -> dict[str, Any]:
+    """The space for Optuna. Refuses what it or an experiment would refuse, before the first trial begins."""
+    if not isinstance(space, Mapping) or not space:
         raise _native.Error("the space has no field, so there is nothing to search for")
+    distributions = {}
     for name, values in space.items():
+        try:
+            json.dumps(values)
+        except (TypeError, ValueError, RecursionError) as error:
+            remedy = "give Python's own numbers, texts and lists"
+            raise _native.Error(f"{name}: {values!r} cannot be stored with the study ({error}): {remedy}") from error
         if isinstance(values, Mapping):
             if not {"low", "high"} <= set(values) <= _RANGE:
                 given = ", ".join(values)
                 raise _native.Error(f"{name}: a range has low and high, and perhaps log or step, not {given}")
             tried = [values["low"], values["high"]]
-        elif isinstance(values, str) or not values:
+        elif not isinstance(values, Sequence) or isinstance(values, str) or not values:
             raise _native.Error(f"{name}: {values!r}; give a range or a list of values")
         else:
             tried = list(values)
         for value in tried:
             experiment.resolve(base, **{name: value})
+        try:
+            distributions[name] = _distribution(values)
+        except (TypeError, ValueError) as error:
+            raise _native.Error(f"{name}: {error}") from error
+    return distributions
+
+
+def _distribution(values: Mapping[str, Any] | Sequence[Any]) -> Any:
+    kinds = _optuna().distributions
+    if isinstance(values, Mapping):
+        integers = all(isinstance(values[end], int) for end in ("low", "high"))
+        return (kinds.IntDistribution if integers else kinds.FloatDistribution)(**values)
+    return kinds.CategoricalDistribution([_stored(value) for value in values])
+
+
+def _value(values: Mapping[str, Any] | Sequence[Any], chosen: Any) -> Any:
+    """The value that Optuna chose."""
+    return chosen if isinstance(values, Mapping) else values[[_stored(value) for value in values].index(chosen)]
+
+
+def _stored(value: Any) -> Any:
+    """A value of a list as Optuna stores it. It stores no lists."""
+    return value if isinstance(value, (bool, int, float, str)) else json.dumps(value)
+
+
+def _minutes(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < np.inf:
+        raise _native.Error(f"{name}: {value!r}; give a number of minutes")
+    return float(value)
 
 
 def _take_back(study: Any) -> None:
@@ -289,7 +323,7 @@ def _write(study: Any, directory: Path, space: Space) -> None:
     best = max(newest.values(), key=_reward, default=None)
     if best is not None and _reward(best) > -np.inf:
         document = directory / best.user_attrs["directory"] / "experiment.toml"
-        files.replace(directory / "best.toml", [document.read_text()])
+        files.replace(directory / "best.toml", [document.read_text(encoding="utf-8")])
 
 
 def _reward(trial: Any) -> float:
@@ -313,22 +347,28 @@ def _optuna() -> Any:
 # The keys of a file that are arguments of `search` as they are.
 _ARGUMENTS = {"preset", "trials", "report_every", "evaluate_every", "actors", "minutes", "clips"}
 _TABLES = {"set", "search", "sampler", "pruner"}
+# The names of arguments of `search`, which are no fields.
+_RESERVED = {*_ARGUMENTS, "directory", "space", "sampler", "pruner"}
+_LARGEST_SEED = 2**31
 
 
 def _read(path: Path, trained: int) -> dict[str, Any]:
     """The arguments of `search` that a file describes, for a directory with so many trials."""
     try:
-        document = tomllib.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
         raise _native.Error(f"{path}: {error}") from error
     unknown = set(document) - _ARGUMENTS - _TABLES
     if unknown or not {"trials", "search"} <= set(document):
         known = f"trials and search, and perhaps {', '.join(sorted((_ARGUMENTS | _TABLES) - {'trials', 'search'}))}"
         raise _native.Error(f"{path}: it has {', '.join(sorted(document)) or 'nothing'}; a study has {known}")
+    for name in sorted(_TABLES & set(document)):
+        if not isinstance(document[name], Mapping):
+            raise _native.Error(f"{path}: {name}: {document[name]!r}; it is a table, such as [{name}]")
     arguments = {key: value for key, value in document.items() if key in _ARGUMENTS}
     fields = document.get("set", {})
-    if fields.keys() & _ARGUMENTS:
-        raise _native.Error(f"{path}: set: write {', '.join(fields.keys() & _ARGUMENTS)} above the tables, not here")
+    if reserved := sorted(fields.keys() & _RESERVED):
+        raise _native.Error(f"{path}: set: {', '.join(reserved)}: it is no field; write it outside of [set], or not at all")
     for kind in ("sampler", "pruner"):
         if kind in document:
             arguments[kind] = _choice(kind, document[kind], trained)
@@ -341,11 +381,11 @@ def _choice(kind: str, table: Mapping[str, Any], trained: int) -> Any:
     module = {"sampler": optuna.samplers, "pruner": optuna.pruners}[kind]
     arguments = dict(table)
     name = arguments.pop("class", None)
-    if name not in module.__all__:
+    if not isinstance(name, str) or name not in module.__all__:
         raise _native.Error(f"{kind}.class: {name!r}; choose one of {', '.join(module.__all__)}")
     if "seed" in arguments:
         # Otherwise a study that continues would draw its first values again.
-        arguments["seed"] += trained
+        arguments["seed"] = trained + whole(f"{kind}.seed", arguments["seed"], 0, _LARGEST_SEED)
     try:
         return getattr(module, name)(**arguments)
     except (TypeError, ValueError) as error:
@@ -367,9 +407,10 @@ def main() -> None:
         search(out, **_read(asked.study, len(list(out.glob("trial-*")))))
     except KeyboardInterrupt:
         sys.exit("interrupted; the same command resumes the study")
-    except _native.Error as error:
+    # For instance a directory that cannot be made.
+    except (_native.Error, OSError) as error:
         sys.exit(f"error: {error}")
-    print((out / "table.md").read_text(), end="")
+    print((out / "table.md").read_text(encoding="utf-8"), end="")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import comic
+import numpy as np
 import pytest
 from comic import sweep
 from conftest import SMALL
@@ -82,6 +83,13 @@ def test_without_optuna_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.
         ({"vmpo.epsilon_mean": {"low": -1.0, "high": 1.0}}, "vmpo.epsilon_mean"),
         ({"vmpo.epsilon_maen": [1.0]}, "vmpo.epsilon_mean"),
         ({"vmpo.gradient_steps": []}, "give a range or a list of values"),
+        ({"vmpo.gradient_steps": 3}, "give a range or a list of values"),
+        ({"vmpo.epsilon_mean": {"low": 1.0, "high": 0.5}}, "vmpo.epsilon_mean: .*low"),
+        ({"vmpo.epsilon_mean": {"low": 0.1, "high": 1.0, "log": True, "step": 0.1}}, "vmpo.epsilon_mean: .*step"),
+        ({"vmpo.gradient_steps": {"low": 1, "high": 4, "step": 0}}, "vmpo.gradient_steps: .*step"),
+        ({"vmpo.gradient_steps": {"low": 1, "high": 4, "step": "x"}}, "vmpo.gradient_steps: "),
+        ({"vmpo.gradient_steps": range(1, 4)}, "vmpo.gradient_steps: .*cannot be stored with the study"),
+        ({"vmpo.gradient_steps": [np.int64(3)]}, "vmpo.gradient_steps: .*cannot be stored with the study"),
         ({}, "nothing to search for"),
     ],
 )
@@ -99,7 +107,16 @@ def test_a_wrong_space_is_refused_before_the_first_trial(tmp_path: Path, change:
         (FILE.replace("actors", "actor"), "it has actor, "),
         (FILE.replace("RandomSampler", "Random"), "sampler.class: 'Random'; choose one of .*TPESampler"),
         (FILE.replace("seed", "sede"), "sampler: .*sede"),
-        (FILE.replace("[set]", '[set]\nclips = ["x"]'), "set: write clips above the tables"),
+        (FILE.replace("[set]", '[set]\nclips = ["x"]'), "set: clips: it is no field"),
+        (FILE.replace("[set]", '[set]\nspace = "x"'), "set: space: it is no field"),
+        (FILE.replace("[set]", '[set]\ndirectory = "x"'), "set: directory: it is no field"),
+        (FILE.replace("[set]", '[set]\npruner = "x"'), "set: pruner: it is no field"),
+        (FILE.replace('{ class = "RandomSampler", seed = 1 }', '"RandomSampler"'), "sampler: 'RandomSampler'; it is a table"),
+        (FILE.replace("seed = 1", 'seed = "x"'), "sampler.seed: 'x'; give a whole number"),
+        (FILE.replace("trials = 2", 'trials = "2"'), "trials: '2'; give a whole number"),
+        (FILE.replace("trials = 2", "trials = 2\nreport_every = 0"), "report_every: 0; give a whole number from 1"),
+        (FILE.replace("trials = 2", "trials = 2\nminutes = 'x'"), "minutes: 'x'; give a number of minutes"),
+        (FILE.replace("low = 0.1", "low = 2.0"), "vmpo.epsilon_mean: .*low"),
         ("[", "study.toml: "),
     ],
 )

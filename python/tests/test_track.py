@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import multiprocessing
@@ -10,14 +11,17 @@ import signal
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import comic
 import pytest
 from comic import track
 from comic.track.points import Point
+from comic.track.position import Batch, Position
 
 GIF = b"GIF89a and so on;"
 
@@ -184,7 +188,7 @@ def test_what_a_tracker_took_and_lost_is_copied_again(run: Directory, recorder: 
     run.metrics(3, 4)
     run.evaluations(4)
     recorder.end = None  # type: ignore[assignment]
-    with pytest.raises(TypeError):
+    with pytest.raises(comic.Error, match="the tracker recorder cannot store everything: TypeError"):
         track.follow(run.path, recorder, once=True)
     lines = recorder.path.read_text().splitlines(keepends=True)
     recorder.path.write_text("".join(lines[:3]))
@@ -192,6 +196,89 @@ def test_what_a_tracker_took_and_lost_is_copied_again(run: Directory, recorder: 
     del recorder.end
     track.follow(run.path, recorder, once=True)
     assert copied(recorder) == [("metrics", number) for number in (1, 2, 3, 4)] + [("evaluation", 4), ("metrics", 5)]
+
+
+@pytest.mark.parametrize(("kept", "more"), [(1, 0), (0, 0), (2, 1)])
+def test_a_tracker_with_other_points_than_were_copied_is_refused(
+    run: Directory, recorder: Recorder, kept: int, more: int
+) -> None:
+    run.metrics(1, 2)
+    track.follow(run.path, recorder, once=True)
+    lines = recorder.path.read_text().splitlines(keepends=True)
+    found = lines[:kept] + more * lines[:1]
+    recorder.path.write_text("".join(found))
+    run.metrics(3)
+    message = f"track-recorder.jsonl: 2 points were copied, .* now it has {kept + more}: start this as before .* or remove"
+    for _ in range(2):
+        with pytest.raises(comic.Error, match=message):
+            track.follow(run.path, recorder, once=True)
+    assert recorder.path.read_text() == "".join(found)
+    # The two remedies: the store as it was, and everything again to a new run.
+    recorder.path.write_text("".join(lines))
+    assert track.follow(run.path, recorder, once=True) == 3
+    (run.path / "track-recorder.jsonl").unlink()
+    recorder.path.unlink()
+    assert track.follow(run.path, recorder, once=True) == 3
+    assert copied(recorder) == [("metrics", number) for number in (1, 2, 3)]
+
+
+@pytest.mark.parametrize("call", ["begin", "log", "checkpoint", "end"])
+def test_what_a_tracker_could_not_do_is_said_with_the_remedy(run: Directory, recorder: Recorder, call: str) -> None:
+    def fail(*_: Any) -> None:
+        raise RuntimeError("no route to the server")
+
+    run.metrics(1)
+    run.checkpoint("initial")
+    setattr(recorder, call, fail)
+    message = "the tracker recorder cannot .*: RuntimeError: no route to the server\nsee that you are logged in"
+    with pytest.raises(comic.Error, match=message):
+        track.follow(run.path, recorder, once=True, checkpoints="all")
+
+
+def test_a_directory_that_cannot_be_written_is_named(run: Directory, recorder: Recorder) -> None:
+    run.metrics(1)
+    # A directory in the place of the file: permissions do not stop root.
+    (run.path / "track-recorder.lock").mkdir()
+    with pytest.raises(comic.Error, match="track-recorder.lock: it cannot be written .*: check the directory's permissions"):
+        track.follow(run.path, recorder, once=True)
+
+
+def test_what_was_copied_is_not_kept_in_memory(run: Directory) -> None:
+    with Position.open(run.path / "track-recorder.jsonl") as position:
+        planned = []
+        for number in range(100):
+            batch = Batch(first=number, end=number + 1, metrics=(number, number + 1), evaluations=(0, 0))
+            planned.append(weakref.ref(batch))
+            position.plan(batch)
+        del batch
+        gc.collect()
+        assert [batch for batch in planned[:-1] if batch() is not None] == []
+    with Position.open(run.path / "track-recorder.jsonl") as position:
+        assert [batch.first for batch in position.confirm(97)] == [97, 98, 99]
+    with Position.open(run.path / "track-recorder.jsonl") as position:
+        assert (position.start.points, position.next().first) == (97, 100)
+        position.finish()
+        assert len(position.path.read_text().splitlines()) == 1
+
+
+def test_trackers_get_no_directories_of_this_machine(run: Directory, recorder: Recorder) -> None:
+    run.metrics(1)
+    experiment = run.path / "experiment.toml"
+    clips = '[[clips]]\nsource = "/home/me/walks.h5#A,B"\n[[clips]]\nsource = "builtin:walk"\n'
+    experiment.write_text(f'name = "x"\n{clips}[transfer]\nlow_level = "/home/me/walk.low-level"\n')
+    track.follow(run.path, recorder, once=True)
+    about = recorder.about
+    assert about is not None
+    assert about.configuration == {
+        "name": "x",
+        "clips": [{"source": "walks.h5#A,B"}, {"source": "builtin:walk"}],
+        "transfer.low_level": "walk.low-level",
+    }
+    assert about.experiment == experiment.read_text().replace("/home/me/", "")
+    # A name that TOML writes in another way.
+    experiment.write_text("[[clips]]\nsource = '/home/\"me\"/walks.h5'\n")
+    with pytest.raises(comic.Error, match="experiment.toml: the directory of .* cannot be removed: rename the file"):
+        track.follow(run.path, recorder, once=True)
 
 
 def test_half_a_line_waits_for_its_other_half(run: Directory, recorder: Recorder) -> None:
@@ -227,6 +314,7 @@ def test_a_learner_that_resumes_goes_back_in_steps_and_every_line_is_copied(run:
 
 def test_lines_that_are_no_point_are_left_out(run: Directory, recorder: Recorder, capsys: Any) -> None:
     with (run.path / "metrics.jsonl").open("a") as file:
+        file.write(f'{"[" * 100_000}\n{{"environment_steps":1e299}}\n{{"environment_steps":-1}}\n{{"seconds":1e17}}\n')
         file.write('nonsense\n[1]\n{"updates":1,"environment_steps":10,"a":1e999,"b":NaN,"c":true,"d":"x"}\n')
     # An evaluation that was started by hand does not know its environment steps.
     by_hand = '{"updates":1,"environment_steps":0,"evaluation":{}}\n{"evaluation":3}\n'
@@ -234,7 +322,7 @@ def test_lines_that_are_no_point_are_left_out(run: Directory, recorder: Recorder
     run.settle()
     assert track.follow(run.path, recorder, once=True) == 1
     assert recorder.points() == [{"steps": 10, "film": False, "updates": 1, "environment_steps": 10}]
-    assert capsys.readouterr().err.count("no JSON object") == 2
+    assert capsys.readouterr().err.count("no JSON object") == 3
 
 
 def test_a_film_that_is_not_whole_is_left_out(run: Directory, recorder: Recorder) -> None:
@@ -316,6 +404,16 @@ def test_a_tracker_that_is_unknown_or_not_installed_is_refused_with_the_remedy(
         monkeypatch.setitem(sys.modules, name, None)
         with pytest.raises(comic.Error, match=rf"pip install comic-rl\[{name}\]"):
             track.follow(run.path, name)
+
+
+def test_a_release_of_trackio_that_cannot_be_asked_is_refused_with_the_one_that_can(
+    run: Directory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run.metrics(1)
+    other = SimpleNamespace(init=lambda **_: SimpleNamespace())
+    monkeypatch.setitem(sys.modules, "trackio", other)
+    with pytest.raises(comic.Error, match=r"how many points it has: pip install trackio==0\.\d+"):
+        track.follow(run.path, "trackio", once=True)
 
 
 def test_importing_the_package_imports_no_tracker() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -215,7 +216,7 @@ def test_mlflow_has_every_point_once(followed: Followed) -> None:
 
 
 @pytest.mark.parametrize("tracker", TRACKERS)
-def test_so_is_every_film(followed: Followed, tracker: str) -> None:
+def test_every_film_is_there(followed: Followed, tracker: str) -> None:
     places = {
         "wandb": "wandb/offline-run-*/files/media/videos/evaluation/*.gif",
         "mlflow": "mlruns/*/*/artifacts/films/*.gif",
@@ -234,6 +235,91 @@ def test_mlflow_has_the_experiment_and_the_best_checkpoint(followed: Followed) -
     assert {part.name: part.read_bytes() for part in copy.iterdir()} == {
         part.name: part.read_bytes() for part in best.iterdir()
     }
+
+
+def test_weights_and_biases_and_trackio_have_the_best_checkpoint(followed: Followed) -> None:
+    from comic.track import offline
+
+    best = (followed.run / "checkpoints" / "best").resolve()
+    parts = {part.name: part.read_bytes() for part in best.iterdir()}
+    records = offline.records(followed.store / "wandb", followed.identity("wandb"))
+    artifacts = [record.artifact for record in records if record.WhichOneof("record_type") == "artifact"]
+    [artifact] = [artifact for artifact in artifacts if best.name in artifact.aliases][-1:]
+    assert {part.path: Path(part.local_path).read_bytes() for part in artifact.manifest.contents} == parts
+    stored = [path.read_bytes() for path in (followed.store / "trackio").rglob("*") if path.is_file()]
+    assert all(part in stored for part in parts.values())
+
+
+def copy_once(run: Path, tracker: str, environment: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "comic.track", str(run), "--to", tracker, "--once"]
+    ended = subprocess.run(command, env=environment, cwd=run.parent, capture_output=True, text=True, check=False)
+    assert "Traceback" not in ended.stderr, ended.stderr
+    return ended
+
+
+@pytest.mark.parametrize("tracker", ["wandb", "trackio"])
+def test_another_store_than_before_is_refused(tracker: str, tmp_path: Path) -> None:
+    run = Directory(tmp_path / "run")
+    run.metrics(1, 2)
+    stores = [tmp_path / "first", tmp_path / "second"]
+    for store in stores:
+        store.mkdir()
+    assert copy_once(run.path, tracker, store_in(stores[0])).returncode == 0
+    run.metrics(3)
+    refused = copy_once(run.path, tracker, store_in(stores[1]))
+    assert refused.returncode == 1
+    assert f"track-{tracker}.jsonl: 2 points were copied" in refused.stderr, refused.stderr
+    ended = copy_once(run.path, tracker, store_in(stores[0]))
+    assert ended.returncode == 0 and ended.stdout.startswith("the tracker has 3 points\n"), ended.stderr
+
+
+def test_weights_and_biases_get_no_name_of_the_machine_or_its_directories(tmp_path: Path) -> None:
+    from comic.track import offline
+
+    run = Directory(tmp_path / "run")
+    run.metrics(1)
+    with (run.path / "experiment.toml").open("a") as file:
+        file.write(f'[[clips]]\nsource = "{tmp_path}/walks.h5"\n')
+    assert copy_once(run.path, "wandb", store_in(tmp_path)).returncode == 0
+    records = list(offline.records(tmp_path / "wandb", Followed(run.path, tmp_path).identity("wandb")))
+    kinds = {record.WhichOneof("record_type") for record in records}
+    assert {"run", "history"} <= kinds and not {"environment", "output"} & kinds
+    assert {record.run.host for record in records} == {""}
+    text = "".join(map(str, records))
+    assert "walks.h5" in text and str(tmp_path) not in text and sys.prefix not in text
+
+
+def test_mlflow_takes_the_reward_of_a_clip_of_any_name(tmp_path: Path) -> None:
+    run = Directory(tmp_path / "run")
+    run.metrics(1)
+    clips = [{"clip": name, "normalised_reward": 0.5} for name in ("..", "a//b", "./x", "", "/", "gehen, schön", "x" * 999)]
+    line = {"updates": 1, "environment_steps": 10, "seconds": 1.0, "evaluation": {"overall": {}, "clips": clips}}
+    (run.path / "evaluations.jsonl").write_text(json.dumps(line) + "\n")
+    run.settle()
+    ended = copy_once(run.path, "mlflow", store_in(tmp_path))
+    assert ended.stdout == "the tracker has 2 points\n", ended.stderr
+    [copy] = mlflow_runs(tmp_path, Followed(run.path, tmp_path).identity("mlflow"))
+    names = {name.split("/", 1)[1] for name in copy.data.metrics if name.startswith("evaluation_clips/")}
+    rewards = {f"{name}/normalised_reward" for name in ("_", "a/_/b", "_/x", "_/_", "gehen_ sch_n", "x" * 200)}
+    assert names == rewards
+
+
+def test_a_tracker_that_refuses_the_run_says_why(tmp_path: Path) -> None:
+    run = Directory(tmp_path / "run")
+    run.metrics(1)
+    environment = store_in(tmp_path)
+    assert copy_once(run.path, "mlflow", environment).returncode == 0
+    client = mlflow_client(tmp_path)
+    client.delete_experiment(client.get_experiment_by_name("comic").experiment_id)
+    refusals = {
+        "mlflow": (environment, "deleted"),
+        "wandb": (environment | {"WANDB_MODE": "online", "WANDB_API_KEY": "", "HOME": str(tmp_path)}, "[Aa][Pp][Ii].key"),
+    }
+    for tracker, (where, reason) in refusals.items():
+        ended = copy_once(run.path, tracker, where)
+        assert ended.returncode == 1
+        message = rf"the tracker {tracker} cannot begin its run: .*{reason}[^$]*see that you are logged in"
+        assert re.search(message, ended.stderr), ended.stderr
 
 
 # The tracker has taken every point, and may not have stored the last ones.

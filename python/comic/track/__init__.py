@@ -17,7 +17,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from itertools import chain
 from os import PathLike
 from pathlib import Path
 from typing import Literal
@@ -66,8 +68,8 @@ def follow(
         stop: Ends soon after this event is set, when what was read is copied.
 
     Raises:
-        comic.Error: The tracker is unknown or not installed; another process copies this run to it; a file is damaged;
-            there was nothing new for too long.
+        comic.Error: The tracker is unknown, not installed, or fails; it has fewer points than it had; another process
+            copies this run to it; a file is damaged or cannot be written; there was nothing new for too long.
     """
     run, stop = Path(run).absolute(), stop or threading.Event()
     if checkpoints not in CHECKPOINTS:
@@ -77,7 +79,7 @@ def follow(
         return 0
     with Position.open(run / f"track-{tracker.name}.jsonl") as position:
         about = About(
-            position.start.identity, name or run.name, project, points.configuration(run), run / "experiment.toml"
+            position.start.identity, name or run.name, project, points.configuration(run), points.experiment(run)
         )
         copy = _Copy(run, tracker, position, checkpoints)
         copy.begin(about)
@@ -118,7 +120,8 @@ class _Copy:
 
     def begin(self, about: About) -> None:
         """Begins the tracker's run, and copies what was planned before and did not arrive."""
-        stored = self._tracker.begin(about)
+        with self._asked("begin its run"):
+            stored = self._tracker.begin(about)
         for batch in self._position.confirm(stored):
             first = max(stored, batch.first)
             self._log(first, list(self._points(batch))[first - batch.first :])
@@ -143,22 +146,33 @@ class _Copy:
 
     def end(self, over: bool) -> int:
         """Waits until the tracker has everything, and returns how many points it has."""
-        self._tracker.end(over)
+        with self._asked("store everything"):
+            self._tracker.end(over)
         self._position.start.checkpoints = self._copied
-        points = self._position.next().end
-        self._position.confirm(points)
-        return points
+        self._position.finish()
+        return self._position.start.points
 
     def _log(self, first: int, found: list[Point]) -> None:
         if found:
-            self._tracker.log(first, found)
+            with self._asked("store points"):
+                self._tracker.log(first, found)
+
+    @contextmanager
+    def _asked(self, what: str) -> Iterator[None]:
+        """Says what the tracker was asked for when it fails. Each tracker has errors of its own."""
+        try:
+            yield
+        except _native.Error:
+            raise
+        except Exception as error:
+            remedy = "see that you are logged in, that the store is there, and that it can be written; then start this again"
+            problem = f"the tracker {self._tracker.name} cannot {what}: {type(error).__name__}: {error}"
+            raise _native.Error(f"{self._run}: {problem}\n{remedy}") from error
 
     def _points(self, batch: Batch) -> Iterator[Point]:
-        yield from map(points.metrics, self._metrics.read(*batch.metrics))
-        for line in self._evaluations.read(*batch.evaluations):
-            point = points.evaluations(self._run, line)
-            if point is not None:
-                yield point
+        found = map(points.metrics, self._metrics.read(*batch.metrics))
+        evaluated = (points.evaluations(self._run, line) for line in self._evaluations.read(*batch.evaluations))
+        yield from (point for point in chain(found, evaluated) if point is not None)
 
     def _copy_checkpoints(self) -> bool:
         news = False
@@ -170,7 +184,8 @@ class _Copy:
                 copy = Path(directory) / checkpoint.name
                 if not _duplicate(checkpoint, copy):
                     continue
-                self._tracker.checkpoint(copy)
+                with self._asked(f"store {checkpoint.name}"):
+                    self._tracker.checkpoint(copy)
             self._copied[checkpoint.name] = written
             news = True
         # Names of checkpoints that were removed are not needed any more.
@@ -210,6 +225,6 @@ def _duplicate(checkpoint: Path, copy: Path) -> bool:
             shutil.copyfile(checkpoint / part, copy / part)
     except FileNotFoundError:
         return False
-    except (OSError, ValueError, AttributeError) as error:
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise _native.Error(f"{checkpoint}: it cannot be copied: {error}") from error
     return all(hashlib.sha256((copy / part).read_bytes()).hexdigest() == parts[part] for part in parts)

@@ -39,7 +39,8 @@ def main() -> None:
         signal.signal(number, lambda *_: stop.set())
     try:
         points = track.follow(arguments.pop("run"), arguments.pop("to"), stop=stop, **arguments)
-    except comic.Error as error:
+    # For instance a file of the run that may not be read.
+    except (comic.Error, OSError) as error:
         sys.exit(f"error: {error}")
     print(f"the tracker has {points} points")
 

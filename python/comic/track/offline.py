@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-__all__ = ["history", "points"]
+__all__ = ["history", "points", "records"]
 
 _HEADER = 7
 _BLOCK = 32 * 1024
@@ -30,12 +30,17 @@ def points(directory: Path, identity: str) -> int:
 
 def history(directory: Path, identity: str) -> Iterator[dict[str, Any]]:
     """The rows of a run's history in the order in which they were logged."""
+    for record in records(directory, identity):
+        if record.WhichOneof("record_type") == "history":
+            items = record.history.item
+            yield {"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in items}
+
+
+def records(directory: Path, identity: str) -> Iterator[Any]:
+    """What is stored of a run, as the records of Weights & Biases' own format."""
     protocol = importlib.import_module("wandb.proto.wandb_internal_pb2")
     for path in sorted(directory.glob(f"offline-run-*-{identity}/run-{identity}.wandb")):
-        for record in map(protocol.Record.FromString, _records(path.read_bytes())):
-            if record.WhichOneof("record_type") == "history":
-                items = record.history.item
-                yield {"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in items}
+        yield from map(protocol.Record.FromString, _records(path.read_bytes()))
 
 
 def _records(log: bytes) -> Iterator[bytes]:

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from comic import _native
+from comic.exported import file_name
 
-__all__ = ["Lines", "Point", "configuration", "evaluations", "is_over", "metrics"]
+__all__ = ["Lines", "Point", "configuration", "evaluations", "experiment", "is_over", "metrics"]
 
 # The longest line is an evaluation of many clips. The learner accepts reports of 1 MiB.
 _LONGEST_LINE = 16 << 20
@@ -27,6 +28,10 @@ _MOST_CLIP_CURVES = 64
 _LARGEST_FILM = 1 << 20
 # Trackers store double precision.
 _LARGEST = 1e300
+# Updates, environment steps and seconds at most: MLflow's database has whole numbers of 64 bits, and milliseconds.
+_LARGEST_PLACE = 2**53
+# The most levels of names in names. The learner writes three.
+_DEEPEST = 8
 # The learner writes an evaluation's film right after its line.
 _FILM_DELAY = 2.0
 
@@ -72,7 +77,8 @@ class Lines:
             begin += len(line)
             try:
                 value = json.loads(line)
-            except ValueError:
+            # Brackets in brackets exhaust the stack.
+            except (ValueError, RecursionError):
                 value = None
             if isinstance(value, dict):
                 yield value
@@ -89,7 +95,7 @@ class Lines:
             *whole, _ = file.read(_END).split(b"\n")
         try:
             value = json.loads(whole[-1])
-        except (IndexError, ValueError):
+        except (IndexError, ValueError, RecursionError):
             return {}
         return value if isinstance(value, dict) else {}
 
@@ -116,8 +122,8 @@ class Lines:
                 begin += len(line)
 
 
-def metrics(line: Mapping[str, Any]) -> Point:
-    """The point of a line of ``metrics.jsonl``."""
+def metrics(line: Mapping[str, Any]) -> Point | None:
+    """The point of a line of ``metrics.jsonl``. ``None`` if its place in the run is not known."""
     values = dict(_numbers("", line))
     return _point(line, values)
 
@@ -138,32 +144,74 @@ def evaluations(run: Path, line: Mapping[str, Any]) -> Point | None:
     return _point(line, values, run / "films")
 
 
-def _point(line: Mapping[str, Any], values: dict[str, float], films: Path | None = None) -> Point:
-    place = dict(_numbers("", line))
-    film = None if films is None else films / f"{int(place.get('updates', 0)):010}.gif"
-    return Point(int(place.get("environment_steps", 0)), place.get("seconds", 0.0), values, film)
+def _point(line: Mapping[str, Any], values: dict[str, float], films: Path | None = None) -> Point | None:
+    numbers = dict(_numbers("", line))
+    updates, steps, seconds = (numbers.get(name, 0) for name in ("updates", "environment_steps", "seconds"))
+    if not all(0 <= number <= _LARGEST_PLACE for number in (updates, steps, seconds)):
+        return None
+    film = None if films is None else films / f"{int(updates):010}.gif"
+    return Point(int(steps), seconds, values, film)
 
 
 def _numbers(prefix: str, value: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
     for key, inner in value.items():
         if isinstance(inner, Mapping):
-            yield from _numbers(f"{prefix}{key}/", inner)
+            if prefix.count("/") < _DEEPEST:
+                yield from _numbers(f"{prefix}{key}/", inner)
         # Also leaves out numbers that are not finite.
         elif isinstance(inner, (int, float)) and not isinstance(inner, bool) and -_LARGEST < inner < _LARGEST:
             yield f"{prefix}{key}", inner
 
 
 def configuration(run: Path) -> dict[str, Any]:
-    """The fields of the run's experiment with their values: ``vmpo.epsilon_eta``."""
-    return dict(_fields("", _experiment(run)))
+    """The fields of the run's experiment with their values: ``vmpo.epsilon_eta``. Files have no directories."""
+    return dict(_fields("", tomllib.loads(experiment(run))))
 
 
-def _experiment(run: Path) -> dict[str, Any]:
-    path = run / "experiment.toml"
+def experiment(run: Path) -> str:
+    """The run's ``experiment.toml``. The names of its clips and of its low level have no directories.
+
+    Raises:
+        comic.Error: It is no experiment, or a name cannot be replaced.
+    """
+    text = _text(run)
+    for name in _paths(run, text):
+        text = text.replace(_quoted(name), _quoted(file_name(name)))
+    # TOML writes a name with quotation marks or a backslash in another way, which is not replaced.
+    left = [name for name in _paths(run, text) if name != file_name(name)]
+    if left:
+        problem = f"the directory of {left[0]!r} is not for a tracker, and cannot be removed: rename the file"
+        raise _native.Error(f"{run / 'experiment.toml'}: {problem}")
+    return text
+
+
+def _text(run: Path) -> str:
     try:
-        return tomllib.loads(path.read_text())
+        return (run / "experiment.toml").read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
-        raise _native.Error(f"{path}: it is no experiment of a run: {error}") from error
+        raise _native.Error(f"{run / 'experiment.toml'}: it cannot be read: {error}") from error
+
+
+def _fields_of(run: Path, text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise _native.Error(f"{run / 'experiment.toml'}: it is no experiment of a run: {error}") from error
+
+
+def _paths(run: Path, text: str) -> list[str]:
+    """The names in an experiment that can be paths."""
+    fields = _fields_of(run, text)
+    try:
+        names = [*(clip["source"] for clip in fields.get("clips", [])), fields.get("transfer", {}).get("low_level", "")]
+    except (KeyError, TypeError, AttributeError) as error:
+        raise _native.Error(f"{run / 'experiment.toml'}: it is no experiment of a run: {error!r}") from error
+    return [name for name in names if isinstance(name, str)]
+
+
+def _quoted(text: str) -> str:
+    """A string as the learner writes it."""
+    return json.dumps(text, ensure_ascii=False)
 
 
 def _fields(prefix: str, value: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -176,11 +224,11 @@ def _fields(prefix: str, value: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 def is_over(run: Path) -> bool:
     """Whether the last line of metrics has used up the experiment's budget. A run without a budget is never over."""
-    budget = _experiment(run).get("budget", {})
+    budget = dict(_numbers("", _fields_of(run, _text(run))))
     last = dict(_numbers("", Lines(run / "metrics.jsonl").last()))
     used = {
         "minutes": last.get("seconds", 0) / 60,
         "environment_steps": last.get("environment_steps", 0),
         "updates": last.get("updates", 0),
     }
-    return any(0 < budget.get(limit, 0) <= value for limit, value in used.items())
+    return any(0 < budget.get(f"budget/{limit}", 0) <= value for limit, value in used.items())

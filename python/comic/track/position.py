@@ -8,7 +8,6 @@ has written since. How many points there are, the tracker itself says.
 from __future__ import annotations
 
 import json
-import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -51,13 +50,15 @@ class Position:
     """The file, which no other process uses meanwhile."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self.batches: list[Batch] = []
+        self.path = path
+        # What an earlier process planned, until it is known how much of it arrived.
+        self._earlier: list[Batch] = []
         if path.exists():
             self._read()
         else:
             self.start = Start(secrets.token_hex(4))
-        self._write()
+        self._last = self._earlier[-1] if self._earlier else self._confirmed()
+        self._write(self._earlier)
 
     @staticmethod
     @contextmanager
@@ -65,7 +66,7 @@ class Position:
         """Opens the file, or makes it.
 
         Raises:
-            comic.Error: Another process uses it, or it is damaged.
+            comic.Error: Another process uses it, it is damaged, or it cannot be written.
         """
         problem = "another process copies this run to this tracker: stop it first"
         with files.locked(path.with_suffix(".lock"), problem):
@@ -73,41 +74,59 @@ class Position:
 
     def next(self) -> Batch:
         """An empty batch at the end of what was planned."""
-        if self.batches:
-            last = self.batches[-1]
-            return Batch(last.end, last.end, (last.metrics[1],) * 2, (last.evaluations[1],) * 2)
-        start = self.start
-        return Batch(start.points, start.points, (start.metrics,) * 2, (start.evaluations,) * 2)
+        last = self._last
+        return Batch(last.end, last.end, (last.metrics[1],) * 2, (last.evaluations[1],) * 2)
 
     def plan(self, batch: Batch) -> None:
         """Writes down a batch that is going to be copied."""
-        with self._path.open("a") as file:
-            file.write(json.dumps(asdict(batch)) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        self.batches.append(batch)
+        files.append(self.path, json.dumps(asdict(batch)))
+        self._last = batch
 
     def confirm(self, points: int) -> list[Batch]:
-        """Forgets the batches whose points the tracker has all, being told how many it has. Returns the others."""
-        while self.batches and self.batches[0].end <= points:
-            done = self.batches.pop(0)
-            self.start.points, self.start.metrics, self.start.evaluations = done.end, done.metrics[1], done.evaluations[1]
-        self._write()
-        return list(self.batches)
+        """Being told at the start how many points the tracker has, returns the batches that it has not whole.
+
+        Raises:
+            comic.Error: It has fewer points than it once had, or more than were planned.
+        """
+        if not self.start.points <= points <= self._last.end:
+            raise _native.Error(
+                f"{self.path}: {self._last.end} points were copied, of which the tracker had stored at least "
+                f"{self.start.points}, and now it has {points}: start this as before (same working directory, project, "
+                f"name and store), or remove the file to copy everything again, to a new run of the tracker"
+            )
+        earlier, self._earlier = self._earlier, []
+        missing = [batch for batch in earlier if batch.end > points]
+        if len(missing) < len(earlier):
+            self._move_start(earlier[len(earlier) - len(missing) - 1])
+        self._write(missing)
+        return missing
+
+    def finish(self) -> None:
+        """Forgets every batch, because the tracker has all their points."""
+        self._move_start(self._last)
+        self._write([])
+
+    def _confirmed(self) -> Batch:
+        """An empty batch at the end of what the tracker has for certain."""
+        start = self.start
+        return Batch(start.points, start.points, (start.metrics,) * 2, (start.evaluations,) * 2)
+
+    def _move_start(self, last: Batch) -> None:
+        self.start.points, self.start.metrics, self.start.evaluations = last.end, last.metrics[1], last.evaluations[1]
 
     def _read(self) -> None:
-        # A kill may have cut off the last line. Its batch was not copied.
-        whole, _, _ = self._path.read_text().rpartition("\n")
         try:
+            # A kill may have cut off the last line. Its batch was not copied.
+            whole, _, _ = self.path.read_text(encoding="utf-8").rpartition("\n")
             start, *batches = map(json.loads, whole.split("\n"))
             self.start = Start(**start)
             for batch in batches:
                 metrics, evaluations = tuple(batch.pop("metrics")), tuple(batch.pop("evaluations"))
-                self.batches.append(Batch(metrics=metrics, evaluations=evaluations, **batch))
-        except (TypeError, ValueError, AttributeError, KeyError) as error:
+                self._earlier.append(Batch(metrics=metrics, evaluations=evaluations, **batch))
+        except (TypeError, ValueError, AttributeError, KeyError, RecursionError) as error:
             remedy = "remove it, and everything is copied again, to a new run of the tracker"
-            raise _native.Error(f"{self._path}: it is damaged ({error}): {remedy}") from error
+            raise _native.Error(f"{self.path}: it is damaged ({error}): {remedy}") from error
 
-    def _write(self) -> None:
-        lines = [asdict(self.start), *map(asdict, self.batches)]
-        files.replace(self._path, (json.dumps(line) + "\n" for line in lines))
+    def _write(self, batches: list[Batch]) -> None:
+        lines = [asdict(self.start), *map(asdict, batches)]
+        files.replace(self.path, (json.dumps(line) + "\n" for line in lines))

@@ -20,6 +20,9 @@ __all__ = ["TRACKERS", "About", "MLflow", "Tracker", "Trackio", "WeightsAndBiase
 # What MLflow's server accepts in one call.
 _MLFLOW_METRICS = 1000
 _MLFLOW_PARAMETERS = 100
+_MLFLOW_NAME = 250
+# The release of Trackio with which this was tested.
+_TRACKIO = "0.43.0"
 
 
 @dataclass(frozen=True)
@@ -32,8 +35,8 @@ class About:
     project: str
     configuration: dict[str, Any]
     """The experiment's fields by name."""
-    experiment: Path
-    """The file ``experiment.toml``."""
+    experiment: str
+    """The text of ``experiment.toml``. No file in it has a directory, nor has one in the configuration."""
 
 
 class Tracker(Protocol):
@@ -65,8 +68,12 @@ class WeightsAndBiases:
 
     def begin(self, about: About) -> int:
         wandb = self._wandb
-        # Without the standard output and the load of this process, which are not the learner's.
-        settings = wandb.Settings(console="off", x_disable_stats=True, disable_git=True, save_code=False)
+        # Without the output, the load and the packages of this process, which are not the learner's; and without the
+        # names of this machine, its users and its directories.
+        settings = wandb.Settings(
+            console="off", x_disable_stats=True, disable_git=True, save_code=False, x_save_requirements=False,
+            x_disable_meta=True, x_disable_machine_info=True, host="",
+        )  # fmt: skip
         self._run = wandb.init(
             project=about.project, id=about.identity, name=about.name, resume="allow", settings=settings
         )
@@ -120,7 +127,7 @@ class MLflow:
         parameters = [self._entities.Param(name, value) for name, value in values.items()]
         for begin in range(0, len(parameters), _MLFLOW_PARAMETERS):
             self._client.log_batch(self._run, params=parameters[begin : begin + _MLFLOW_PARAMETERS])
-        self._client.log_artifact(self._run, str(about.experiment))
+        self._client.log_text(self._run, about.experiment, "experiment.toml")
         self._client.update_run(self._run, status="RUNNING")
         return int(run.data.tags.get(self._POINTS, 0))
 
@@ -167,8 +174,12 @@ class Trackio:
                 auto_log_cpu=False,
                 auto_log_gpu=False,
             )
-        # What the store has, be it local or not.
-        return int(self._run._next_step)
+        # What the store has, be it local or not. Trackio has no public name for it.
+        try:
+            return int(self._run._next_step)
+        except AttributeError as error:
+            problem = f"this release cannot be asked how many points it has: pip install trackio=={_TRACKIO}"
+            raise _native.Error(f"Trackio: {problem}") from error
 
     def log(self, first: int, points: Sequence[Point]) -> None:
         for number, point in enumerate(points, first):
@@ -225,5 +236,8 @@ def _film(point: Point) -> Iterator[Path | None]:
 
 
 def _allowed(name: str) -> str:
-    """The name of a metric with the characters that MLflow allows; clips may have other ones."""
-    return "".join(letter if letter.isascii() and (letter.isalnum() or letter in "_-. /:") else "_" for letter in name)
+    """A name of a metric that MLflow allows; clips may have any name."""
+    letters = (letter if letter.isascii() and (letter.isalnum() or letter in "_-. /:") else "_" for letter in name)
+    # The name is a path, and must be the shortest one to its place.
+    parts = "".join(letters)[:_MLFLOW_NAME].split("/")
+    return "/".join("_" if part in ("", ".", "..") else part for part in parts)[:_MLFLOW_NAME]
