@@ -72,7 +72,7 @@ impl Render {
             let file = OutputFile::create(&self.out).map_err(Error::file(&self.out))?;
             Target::Page(PageRecorder::new(spec, self.look.every(step)), file)
         } else {
-            Target::Film(Recorder::new(&self.look, &self.out, step)?)
+            Target::Film(Box::new(Recorder::new(&self.look, &self.out, step)?))
         };
         let mut filming = Filming { target, left: steps, bar: bar(steps) };
         let mut finished = match (self.episodes, self.seconds) {
@@ -104,7 +104,7 @@ impl Render {
 
 /// What records the steps.
 enum Target<'a> {
-    Film(Recorder),
+    Film(Box<Recorder>),
     Page(PageRecorder<'a>, OutputFile),
 }
 
