@@ -76,11 +76,11 @@ impl Call<'_> {
     }
 
     /// Refuses another value of an argument that ONNX does not have.
-    pub(super) fn expect(&self, name: &str, value: f64) -> Result<(), Error> {
+    pub(super) fn require(&self, name: &str, value: f64) -> Result<(), Error> {
         if self.number(name)? == value { Ok(()) } else { Err(self.unexpected(name)) }
     }
 
-    pub(super) fn expect_none(&self, name: &str) -> Result<(), Error> {
+    pub(super) fn require_none(&self, name: &str) -> Result<(), Error> {
         if matches!(self.argument(name)?, Argument::None) { Ok(()) } else { Err(self.unexpected(name)) }
     }
 }

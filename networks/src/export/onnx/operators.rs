@@ -62,7 +62,7 @@ impl Writer {
             "aten::mul.Tensor" | "aten::mul.Scalar" => self.arithmetic("Mul", call)?,
             "aten::div.Tensor" | "aten::div.Scalar" => self.arithmetic("Div", call)?,
             "aten::addcmul" => {
-                call.expect("value", 1.0)?;
+                call.require("value", 1.0)?;
                 let factors = [self.float(call, "tensor1")?, self.float(call, "tensor2")?];
                 let product = self.put("Mul", factors, []);
                 let term = self.float(call, "self")?;
@@ -77,14 +77,14 @@ impl Writer {
             "aten::sigmoid" => self.function("Sigmoid", call, [])?,
             "aten::relu" => self.function("Relu", call, [])?,
             "aten::elu" => {
-                call.expect("scale", 1.0)?;
-                call.expect("input_scale", 1.0)?;
+                call.require("scale", 1.0)?;
+                call.require("input_scale", 1.0)?;
                 self.function("Elu", call, [Attribute::of_number("alpha", call.number("alpha")?)])?
             }
             "aten::softplus" => {
                 // Above `threshold` libtorch computes softplus(x) as x, which differs by less than e^−threshold.
-                call.expect("beta", 1.0)?;
-                call.expect("threshold", 20.0)?;
+                call.require("beta", 1.0)?;
+                call.require("threshold", 20.0)?;
                 self.function("Softplus", call, [])?
             }
             "aten::clamp" => {
@@ -94,7 +94,7 @@ impl Writer {
                 self.put("Clip", [operand].into_iter().chain(bounds), [])
             }
             "aten::log_softmax.int" => {
-                call.expect_none("dtype")?;
+                call.require_none("dtype")?;
                 self.function("LogSoftmax", call, [Attribute::of_integer("axis", call.integer("dim")?)])?
             }
             "aten::argmax" => {
@@ -103,12 +103,12 @@ impl Writer {
                 self.function("ArgMax", call, [axis, Attribute::of_integer("keepdims", keep)])?
             }
             "aten::sum.dim_IntList" => {
-                call.expect_none("dtype")?;
+                call.require_none("dtype")?;
                 let inputs = [self.float(call, "self")?, self.integers(&call.integers("dim")?)];
                 self.put("ReduceSum", inputs, [Attribute::of_integer("keepdims", call.truth("keepdim")?.into())])
             }
             "aten::zeros_like" => {
-                call.expect_none("dtype")?;
+                call.require_none("dtype")?;
                 let like = self.float(call, "self")?;
                 let shape = self.put("Shape", [like], []);
                 let zero = self.number(0.0);
@@ -122,8 +122,8 @@ impl Writer {
                 self.put("Gemm", inputs, factors)
             }
             "aten::baddbmm" => {
-                call.expect("alpha", 1.0)?;
-                call.expect("beta", 1.0)?;
+                call.require("alpha", 1.0)?;
+                call.require("beta", 1.0)?;
                 let factors = [self.float(call, "batch1")?, self.float(call, "batch2")?];
                 let product = self.put("MatMul", factors, []);
                 let term = self.float(call, "self")?;
@@ -210,7 +210,7 @@ impl Writer {
     /// An operator with two operands, of which the second may be a number.
     fn arithmetic(&mut self, operator: &str, call: &Call<'_>) -> Result<String, Error> {
         if call.node.arguments.contains_key("alpha") {
-            call.expect("alpha", 1.0)?;
+            call.require("alpha", 1.0)?;
         }
         let first = self.float(call, "self")?;
         let second = match call.argument("other")? {
