@@ -16,6 +16,7 @@ from typing import Any
 from comic import _native
 from comic import experiment as experiments
 from comic.exported import file_name
+from comic.runs import flatten
 
 __all__ = ["CMU", "card"]
 
@@ -296,21 +297,13 @@ def _changes(experiment: Mapping[str, Any]) -> list[str]:
     """``FIELD = VALUE`` for each field that differs from the preset with the experiment's name."""
     if experiment["name"] not in experiments.presets():
         return []
-    preset = dict(_leaves("", experiments.resolve(experiment["name"]).fields))
+    preset = dict(flatten("", experiments.resolve(experiment["name"]).fields))
     skipped = ("seed", "clips", "joint", "budget.", "transfer.sha256")
     return [
         f"{name} = {json.dumps(file_name(value) if name == 'transfer.low_level' else value, ensure_ascii=False)}"
-        for name, value in _leaves("", experiment)
+        for name, value in flatten("", experiment)
         if not name.startswith(skipped) and preset.get(name) != value
     ]
-
-
-def _leaves(prefix: str, value: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    for key, inner in value.items():
-        if isinstance(inner, Mapping):
-            yield from _leaves(f"{prefix}{key}.", inner)
-        else:
-            yield f"{prefix}{key}", inner
 
 
 def _sources(experiment: Mapping[str, Any]) -> list[str]:

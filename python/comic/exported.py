@@ -13,7 +13,15 @@ from typing import Any
 
 from comic import _native
 
-__all__ = ["LONGEST", "describe", "file_name", "low_level", "parse", "without_directories"]
+__all__ = [
+    "LONGEST",
+    "describe",
+    "experiment_without_directories",
+    "file_name",
+    "low_level",
+    "parse",
+    "without_directories",
+]
 
 LONGEST = 1 << 30
 """Bytes of the longest file that the programs read."""
@@ -66,9 +74,7 @@ def without_directories(content: bytes) -> bytes:
     header = _header(content, len(content))
     description = _description(header)
     text: str = description["experiment"]
-    new = text
-    for name in _names(text):
-        new = new.replace(_quoted(name), _quoted(file_name(name)))
+    new = experiment_without_directories(text)
     length = int.from_bytes(content[:8], "little")
     if (inside := low_level(content)) is not None:
         if low_level(inside) is not None:
@@ -82,11 +88,22 @@ def without_directories(content: bytes) -> bytes:
         old_header = content[8 : 8 + length].decode()
         new_header = old_header.replace(_quoted(_quoted(text)[1:-1])[1:-1], _quoted(_quoted(new)[1:-1])[1:-1])
         content = content[:8] + new_header.encode().ljust(length) + content[8 + length :]
-    # TOML writes a name with quotation marks in another way, which is not replaced.
-    left = [name for name in _names(parse(content, len(content))["experiment"]) if name != file_name(name)]
+    return content
+
+
+def experiment_without_directories(toml: str) -> str:
+    """An experiment with other names of clips and low levels: those of the files, without directories.
+
+    Raises:
+        comic.Error: It is no experiment, or a name cannot be replaced.
+    """
+    for name in _names(toml):
+        toml = toml.replace(_quoted(name), _quoted(file_name(name)))
+    # TOML writes a name with quotation marks or a backslash in another way, which is not replaced.
+    left = [name for name in _names(toml) if name != file_name(name)]
     if left:
         raise _native.Error(f"its experiment names the directory of {left[0]!r}, which cannot be removed: rename the file")
-    return content
+    return toml
 
 
 def low_level(content: bytes) -> bytes | None:

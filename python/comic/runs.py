@@ -27,7 +27,7 @@ class Table(Mapping[str, npt.NDArray[Any]]):
     """
 
     def __init__(self, lines: list[dict[str, Any]]) -> None:
-        flat = [dict(_flatten("", line)) for line in lines]
+        flat = [dict(flatten("", line)) for line in lines]
         names = dict.fromkeys(name for line in flat for name in line)
         self._columns = {name: _column([line.get(name) for line in flat]) for name in names}
         self._length = len(lines)
@@ -98,10 +98,11 @@ def _by_clip(line: dict[str, Any]) -> Iterator[dict[str, Any]]:
         yield progress | row
 
 
-def _flatten(prefix: str, value: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def flatten(prefix: str, value: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Each value inside, with a name such as ``losses.latent_kl`` that begins with the prefix."""
     for key, inner in value.items():
         if isinstance(inner, Mapping):
-            yield from _flatten(f"{prefix}{key}.", inner)
+            yield from flatten(f"{prefix}{key}.", inner)
         else:
             yield f"{prefix}{key}", inner
 

@@ -277,7 +277,7 @@ def test_trackers_get_no_directories_of_this_machine(run: Directory, recorder: R
     assert about.experiment == experiment.read_text().replace("/home/me/", "")
     # A name that TOML writes in another way.
     experiment.write_text("[[clips]]\nsource = '/home/\"me\"/walks.h5'\n")
-    with pytest.raises(comic.Error, match="experiment.toml: the directory of .* cannot be removed: rename the file"):
+    with pytest.raises(comic.Error, match="experiment.toml: .* names the directory of .* cannot be removed: rename the file"):
         track.follow(run.path, recorder, once=True)
 
 

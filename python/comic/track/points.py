@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from comic import _native
-from comic.exported import file_name
+from comic.exported import experiment_without_directories
+from comic.runs import flatten
 
 __all__ = ["Lines", "Point", "configuration", "evaluations", "experiment", "is_over", "metrics"]
 
@@ -165,7 +166,7 @@ def _numbers(prefix: str, value: Mapping[str, Any]) -> Iterator[tuple[str, float
 
 def configuration(run: Path) -> dict[str, Any]:
     """The fields of the run's experiment with their values: ``vmpo.epsilon_eta``. Files have no directories."""
-    return dict(_fields("", tomllib.loads(experiment(run))))
+    return dict(flatten("", tomllib.loads(experiment(run))))
 
 
 def experiment(run: Path) -> str:
@@ -174,57 +175,18 @@ def experiment(run: Path) -> str:
     Raises:
         comic.Error: It is no experiment, or a name cannot be replaced.
     """
-    text = _text(run)
-    for name in _paths(run, text):
-        text = text.replace(_quoted(name), _quoted(file_name(name)))
-    # TOML writes a name with quotation marks or a backslash in another way, which is not replaced.
-    left = [name for name in _paths(run, text) if name != file_name(name)]
-    if left:
-        problem = f"the directory of {left[0]!r} is not for a tracker, and cannot be removed: rename the file"
-        raise _native.Error(f"{run / 'experiment.toml'}: {problem}")
-    return text
-
-
-def _text(run: Path) -> str:
+    path = run / "experiment.toml"
     try:
-        return (run / "experiment.toml").read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise _native.Error(f"{run / 'experiment.toml'}: it cannot be read: {error}") from error
-
-
-def _fields_of(run: Path, text: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise _native.Error(f"{run / 'experiment.toml'}: it is no experiment of a run: {error}") from error
-
-
-def _paths(run: Path, text: str) -> list[str]:
-    """The names in an experiment that can be paths."""
-    fields = _fields_of(run, text)
-    try:
-        names = [*(clip["source"] for clip in fields.get("clips", [])), fields.get("transfer", {}).get("low_level", "")]
-    except (KeyError, TypeError, AttributeError) as error:
-        raise _native.Error(f"{run / 'experiment.toml'}: it is no experiment of a run: {error!r}") from error
-    return [name for name in names if isinstance(name, str)]
-
-
-def _quoted(text: str) -> str:
-    """A string as the learner writes it."""
-    return json.dumps(text, ensure_ascii=False)
-
-
-def _fields(prefix: str, value: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    for key, inner in value.items():
-        if isinstance(inner, Mapping):
-            yield from _fields(f"{prefix}{key}.", inner)
-        else:
-            yield f"{prefix}{key}", inner
+        return experiment_without_directories(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise _native.Error(f"{path}: it cannot be read: {error}") from error
+    except ValueError as error:
+        raise _native.Error(f"{path}: {error}") from error
 
 
 def is_over(run: Path) -> bool:
     """Whether the last line of metrics has used up the experiment's budget. A run without a budget is never over."""
-    budget = dict(_numbers("", _fields_of(run, _text(run))))
+    budget = dict(_numbers("", tomllib.loads(experiment(run))))
     last = dict(_numbers("", Lines(run / "metrics.jsonl").last()))
     used = {
         "minutes": last.get("seconds", 0) / 60,
