@@ -33,9 +33,9 @@ const CHECKSUMS: &str = "SHA256SUMS";
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
-    /// Directory for the files
-    #[arg(long, value_name = "DIR", default_value = "target/dist")]
-    out: PathBuf,
+    /// Directory for the files [default: the repository's target/dist]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
     /// Also make the images comic-learner and comic-actor, which contain the same files
     #[arg(long)]
     images: bool,
@@ -46,7 +46,13 @@ pub(crate) fn run(options: &Options) -> Result<()> {
     let changelog = fs::read_to_string(workspace::root().join("CHANGELOG.md")).context("cannot read CHANGELOG.md")?;
     let notes = notes::section(&changelog, VERSION)?;
     let date = date()?;
-    let out = workspace::root().join(&options.out);
+    licences::check(&PROGRAMS)?;
+    warn_of_changes();
+    // A relative directory is the user's, who may be in another one than the repository's.
+    let out = match &options.out {
+        Some(out) => std::path::absolute(out).with_context(|| format!("cannot find {}", out.display()))?,
+        None => workspace::root().join("target/dist"),
+    };
     prepare(&out)?;
     let built = tree::build()?;
     let parent = directory().join("trees");
@@ -103,22 +109,30 @@ fn git(arguments: &[&str]) -> Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }
 
-/// Makes `out`, in which only files of an earlier try at this release may be. Removes their checksums, which are written last.
+/// Says that the release is not what a commit has.
+fn warn_of_changes() {
+    if git(&["status", "--porcelain"]).is_ok_and(|changes| !changes.is_empty()) {
+        eprintln!("warning: files of the repository differ from the last commit: do not publish this release");
+    }
+}
+
+/// Makes `out`, in which only files of an earlier try at this release may be, and removes them: another wheel among them would be
+/// published, too.
 fn prepare(out: &Path) -> Result<()> {
     fs::create_dir_all(out).with_context(|| format!("cannot make {}", out.display()))?;
     let entries = fs::read_dir(out).with_context(|| format!("cannot list {}", out.display()))?;
-    for entry in entries {
-        let name = entry?.file_name().to_string_lossy().into_owned();
+    let paths = entries.map(|entry| Ok(entry?.path())).collect::<Result<Vec<_>>>()?;
+    for path in &paths {
         ensure!(
-            belongs(&name),
+            path.file_name().is_some_and(|name| belongs(&name.to_string_lossy())),
             "{} is not a file of this release: remove it, or choose another directory with --out",
-            out.join(name).display()
+            path.display()
         );
     }
-    match fs::remove_file(out.join(CHECKSUMS)) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error).context("cannot remove old checksums"),
-        _ => Ok(()),
+    for path in paths {
+        fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
     }
+    Ok(())
 }
 
 /// Whether this release has a file with this name.
@@ -156,7 +170,8 @@ mod tests {
         let ours = [archive_name("comic-actor"), format!("comic_rl-{VERSION}-cp310-abi3-linux.whl"), CHECKSUMS.into()];
         ours.iter().for_each(|name| fs::write(out.path().join(name), "").unwrap());
         prepare(out.path()).unwrap();
-        assert!(!out.path().join(CHECKSUMS).exists(), "the checksums of an earlier try are kept");
+        assert_eq!(fs::read_dir(out.path()).unwrap().count(), 0, "files of an earlier try are kept");
+        fs::write(out.path().join(&ours[0]), "").unwrap();
         fs::write(out.path().join("comic-actor-0.0.1-x86_64-unknown-linux-gnu.tar.gz"), "").unwrap();
         let error = prepare(out.path()).unwrap_err().to_string();
         assert!(error.contains("comic-actor-0.0.1") && error.contains("--out"), "{error}");

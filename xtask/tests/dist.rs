@@ -39,6 +39,19 @@ fn a_libtorch_of_ones_own_is_refused() {
 }
 
 #[test]
+fn libraries_without_their_licences_are_refused_before_anything_is_built() {
+    let repository = tempfile::tempdir().unwrap();
+    fs::create_dir_all(repository.path().join(".deps/stamps")).unwrap();
+    // A directory without a text is none.
+    fs::create_dir_all(repository.path().join(".deps/licences/torch")).unwrap();
+    let changelog = format!("## {} - 2026-01-01\n\n- new\n", env!("CARGO_PKG_VERSION"));
+    let error = error(&dist(repository.path(), &changelog, &[]));
+    assert!(error.contains(".deps/licences/torch with a licence is missing"), "{error}");
+    assert!(error.contains("remove .deps/stamps"), "{error}");
+    assert!(!repository.path().join("target").exists(), "it began to write the release");
+}
+
+#[test]
 fn a_time_of_the_release_that_is_no_number_is_refused() {
     let repository = tempfile::tempdir().unwrap();
     let changelog = format!("## {} - 2026-01-01\n\n- new\n", env!("CARGO_PKG_VERSION"));

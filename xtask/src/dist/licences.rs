@@ -33,15 +33,31 @@ pub(super) fn write(program: &str, crates: &BTreeSet<String>, directory: &Path) 
     fs::write(others.join("crates.txt"), texts).with_context(|| format!("cannot write {}", others.display()))
 }
 
+/// Fails if libraries are there without the texts of their licences: set-up did not keep them in earlier releases. Where there are no
+/// libraries yet, set-up fetches both.
+pub(super) fn check(programs: &[&str]) -> Result<()> {
+    if !root().join(".deps/stamps").exists() {
+        return Ok(());
+    }
+    let native = programs.iter().flat_map(|program| libraries::of(program)).map(|library| library.texts);
+    native.chain([HUMANOID]).try_for_each(|texts| list(&root().join(texts)).map(drop))
+}
+
 fn copy_directory(from: &Path, to: &Path) -> Result<()> {
     fs::create_dir_all(to).with_context(|| format!("cannot make {}", to.display()))?;
-    let entries = fs::read_dir(from).with_context(|| {
-        format!("{} with a licence is missing: remove .deps/stamps, and `cargo xtask setup` fetches it", from.display())
-    })?;
-    entries.into_iter().try_for_each(|entry| {
-        let entry = entry?;
-        copy(&entry.path(), &to.join(entry.file_name()))
-    })
+    list(from)?.iter().try_for_each(|file| copy(file, &to.join(file.file_name().unwrap_or_default())))
+}
+
+/// The files of a directory with a licence, which has at least one.
+fn list(directory: &Path) -> Result<Vec<PathBuf>> {
+    let entries = fs::read_dir(directory).and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect());
+    let files: Vec<PathBuf> = entries.unwrap_or_default();
+    ensure!(
+        !files.is_empty(),
+        "{} with a licence is missing: remove .deps/stamps, and `cargo xtask setup` fetches it with the libraries (1 GB)",
+        directory.display()
+    );
+    Ok(files)
 }
 
 fn copy(from: &Path, to: &Path) -> Result<()> {
@@ -72,8 +88,11 @@ fn of_crates(crates: &BTreeSet<String>) -> Result<String> {
     let output = metadata.output().context("cannot start cargo")?;
     ensure!(output.status.success(), "cargo metadata: {}", String::from_utf8_lossy(&output.stderr).trim());
     let Metadata { packages } = serde_json::from_slice(&output.stdout).context("cargo metadata wrote no such JSON")?;
-    let others = packages.into_iter().filter(|package| package.source.is_some() && crates.contains(&package.id));
-    concatenate(others.collect())
+    let listed: Vec<Package> = packages.into_iter().filter(|package| crates.contains(&package.id)).collect();
+    let known: BTreeSet<&str> = listed.iter().map(|package| package.id.as_str()).collect();
+    let unknown: Vec<&String> = crates.iter().filter(|identity| !known.contains(identity.as_str())).collect();
+    ensure!(unknown.is_empty(), "the bill of materials lists crates that cargo does not know: {unknown:?}");
+    concatenate(listed.into_iter().filter(|package| package.source.is_some()).collect())
 }
 
 fn concatenate(packages: Vec<Package>) -> Result<String> {

@@ -20,11 +20,12 @@ const OUTPUT: &str = "bill-of-materials-of-xtask";
 /// the native libraries in `lib`.
 pub(super) fn bills(programs: &[&str], trees: &[PathBuf], date: u64) -> Result<Vec<Value>> {
     let packages = packages()?;
+    // It writes a file for every crate of the workspace, also before an interruption.
+    let clean =
+        || packages.iter().for_each(|package| drop(fs::remove_file(package.directory.join(format!("{OUTPUT}.json")))));
+    clean();
     let listed = list_crates(&packages, programs, date);
-    // It writes a file for every crate of the workspace.
-    for package in &packages {
-        let _ = fs::remove_file(package.directory.join(format!("{OUTPUT}.json")));
-    }
+    clean();
     let mut bills = listed?;
     for ((bill, tree), program) in bills.iter_mut().zip(trees).zip(programs) {
         let native = libraries::of(program).map(|library| component(library, tree)).collect::<Result<Vec<_>>>()?;

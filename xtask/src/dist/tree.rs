@@ -34,6 +34,12 @@ pub(super) fn build() -> Result<PathBuf> {
     let cargo_home = cargo_home.or_else(|| Some(PathBuf::from(std::env::var_os("HOME")?).join(".cargo")));
     let cargo_home = cargo_home.context("neither CARGO_HOME nor HOME is set")?;
     let (root, cargo_home) = (root().display().to_string(), cargo_home.display().to_string());
+    for path in [&root, &cargo_home] {
+        ensure!(
+            !path.contains(char::is_whitespace),
+            "{path}: a C compiler would split this path: use one without spaces"
+        );
+    }
     let (ours, theirs) = (format!("{root}=/comic"), format!("{cargo_home}=/cargo"));
     let in_c = format!("-ffile-prefix-map={ours} -ffile-prefix-map={theirs}");
     let mut build = cargo();
@@ -74,7 +80,12 @@ fn names_no(file: &Path, path: &str) -> Result<()> {
 /// Makes the directory of a program anew in `parent` from the program that was built, without its documents.
 pub(super) fn make(program: &str, built: &Path, parent: &Path) -> Result<PathBuf> {
     let tree = parent.join(format!("{program}-{VERSION}"));
-    let _ = fs::remove_dir_all(&tree);
+    match fs::remove_dir_all(&tree) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            return Err(error).with_context(|| format!("cannot remove {} of an earlier try", tree.display()));
+        }
+        _ => {}
+    }
     for name in ["bin", "lib", "share"] {
         fs::create_dir_all(tree.join(name)).with_context(|| format!("cannot make {}", tree.display()))?;
     }
