@@ -9,7 +9,7 @@ pub mod heartbeat;
 mod heat_map;
 mod lines;
 pub mod metrics_file;
-mod page;
+pub(crate) mod page;
 pub mod probes;
 pub mod prometheus;
 mod tensorboard;

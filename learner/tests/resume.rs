@@ -386,6 +386,7 @@ fn after_too_many_skipped_steps_the_last_good_state_is_restored() {
         }
     });
     assert_eq!(ended.unwrap(), Ending::Budget);
+    assert!(page(run.path()).contains("\"state\":\"over\""));
     let initial = read(&run.path().join("checkpoints/initial")).unwrap();
     let last = last_checkpoint(run.path());
     for part in ["learner.safetensors", "policy.safetensors"] {
@@ -397,6 +398,10 @@ fn after_too_many_skipped_steps_the_last_good_state_is_restored() {
     assert!(prometheus.contains("comic_updates_skipped_total 4\n") && prometheus.contains("comic_restores_total 1\n"));
 }
 
+fn page(run: &Path) -> String {
+    std::fs::read_to_string(run.join("index.html")).unwrap()
+}
+
 #[test]
 fn if_the_last_good_state_does_not_help_training_ends_and_names_the_remedies() {
     let _alone = ONE_AT_A_TIME.lock();
@@ -405,6 +410,7 @@ fn if_the_last_good_state_does_not_help_training_ends_and_names_the_remedies() {
     let said = format!("{:#}", ended.unwrap_err());
     assert!(said.contains("optimiser.learning_rate") && said.contains("update 7"), "{said}");
     assert!(prometheus.contains("comic_restores_total 1\n"), "{prometheus}");
+    assert!(page(run.path()).contains("\"state\":\"failed\""), "the page of the run goes on");
 }
 
 #[test]

@@ -9,7 +9,7 @@ use crate::observe::heat_map::HeatMap;
 use crate::observe::thinned::{Entry, Thinned};
 
 /// Bytes of the longest name of a clip. Longer ones are not shown, because names come from the network.
-const LONGEST_NAME: usize = 200;
+pub(super) const LONGEST_NAME: usize = 200;
 /// Most clips of an evaluation that are shown in full.
 const MOST_CLIPS: usize = 256;
 /// Most evaluations that are marks of a curve.
@@ -79,6 +79,8 @@ pub(super) struct Summary<'a> {
     marks: Vec<&'a Mark>,
     newest: Option<&'a Shown>,
     best: Option<&'a Shown>,
+    /// The newest one is the best one. Another one of the same checkpoint may not be.
+    newest_is_best: bool,
     newest_film: Option<Film<'a>>,
     best_film: Option<Film<'a>>,
     /// The rows of the heat map, and the environment steps and levels of each column.
@@ -170,6 +172,7 @@ impl EvaluationHistory {
             marks: self.marks.iter().collect(),
             newest: self.newest.as_ref(),
             best: self.best.as_ref(),
+            newest_is_best: self.newest.is_some() && self.newest == self.best,
             newest_film: self.filmed.as_ref().and_then(|mark| Film::of(mark, films)),
             best_film: self.best.as_ref().and_then(|best| Film::of(&best.mark, films)),
             heat_map_clips: self.heat_map.clips(),

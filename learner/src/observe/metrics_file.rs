@@ -192,12 +192,18 @@ impl MetricsFile {
         if let Some(Err(error)) = written {
             tracing::error!("TensorBoard's file lacks the experiment: {}", comic_proto::chain(&error));
         }
-        self.page.write(State::Running, self.evaluations.summary());
     }
 
-    /// Ends the learner epoch: the page says whether the run is `over`, or was stopped and may be resumed.
-    pub fn end(&mut self, over: bool) {
-        let state = if over { State::Over } else { State::Stopped };
+    /// Writes the page of a run that goes on, if the last one is a minute old. A learner that waits for actors writes no lines, but
+    /// this.
+    pub(crate) fn write_page_when_due(&mut self) {
+        if self.page.is_due() {
+            self.page.write(State::Running, self.evaluations.summary());
+        }
+    }
+
+    /// Ends the learner epoch: the page shows this state from now on.
+    pub(crate) fn end(&mut self, state: State) {
         self.page.write(state, self.evaluations.summary());
     }
 
@@ -275,8 +281,8 @@ impl MetricsFile {
         }
     }
 
-    /// Writes the line, and once a minute the page, starts a new window, and returns the line for the status. If the disk
-    /// refuses, the error is logged, and training continues.
+    /// Writes the line, starts a new window, and returns the line for the status. If the disk refuses, the error is logged, and
+    /// training continues.
     pub fn write(
         &mut self,
         position: Position,
@@ -295,9 +301,6 @@ impl MetricsFile {
             tracing::error!("TensorBoard's file lacks a line: {error}");
         }
         self.page.add(&line);
-        if self.page.is_due() {
-            self.page.write(State::Running, self.evaluations.summary());
-        }
         let line = line.to_string();
         if let Err(error) = self.file.append(format!("{line}\n").as_bytes()) {
             tracing::error!("metrics.jsonl lacks a line: {error}");

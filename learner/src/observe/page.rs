@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::error::{Error, Result};
-use crate::observe::evaluation_history::Summary;
+use crate::observe::evaluation_history::{LONGEST_NAME, Summary};
 use crate::observe::lines;
 use crate::observe::thinned::{Entry, Thinned};
 use writer::PageWriter;
@@ -27,7 +27,7 @@ const JAVASCRIPT: &str = include_str!("page/page.js");
 const MOST_POINTS: usize = 512;
 /// Bytes of the experiment that are shown. The longest preset has 5,000.
 const LONGEST_EXPERIMENT: usize = 64 << 10;
-/// How old a page may be when a line of metrics is written.
+/// How old a page of a run that goes on may become, but for one long gradient step.
 const INTERVAL: Duration = Duration::from_secs(60);
 
 /// The page of a run.
@@ -40,16 +40,19 @@ pub(super) struct Page {
     experiment: String,
     progress: Progress,
     training: Thinned<Point>,
-    written: Instant,
+    /// When the last page was given to the writer.
+    written: Option<Instant>,
     writer: PageWriter,
 }
 
 /// Whether the run goes on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub(super) enum State {
+pub(crate) enum State {
     /// The learner trains, or waits for actors.
     Running,
+    /// The learner ended with an error. The run may be resumed when the reason is gone.
+    Failed,
     /// The learner was told to stop. The run may be resumed.
     Stopped,
     /// The budget is used up.
@@ -119,16 +122,18 @@ impl Page {
         let name =
             std::path::absolute(run).ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
         let mut page = Self {
-            run: cut(name.unwrap_or_default()),
-            name: cut(experiment.name.clone()),
-            experiment: cut(experiment.to_toml()?),
+            run: cut(name.unwrap_or_default(), LONGEST_NAME),
+            name: cut(experiment.name.clone(), LONGEST_NAME),
+            experiment: cut(experiment.to_toml()?, LONGEST_EXPERIMENT),
             progress: Progress::default(),
             training: Thinned::new(MOST_POINTS),
-            written: Instant::now(),
+            written: None,
             writer: PageWriter::start(run.join("index.html")),
         };
         let metrics = run.join("metrics.jsonl");
-        let read = lines::for_each(&metrics, |line| page.progress_to(serde_json::from_slice(line).ok()));
+        // A list would be read as the fields in their order.
+        let progress = |line: &[u8]| line.starts_with(b"{").then(|| serde_json::from_slice(line).ok()).flatten();
+        let read = lines::for_each(&metrics, |line| page.progress_to(progress(line)));
         read.unwrap_or_else(|error| tracing::error!("the page lacks earlier metrics: {}: {error}", metrics.display()));
         Ok(page)
     }
@@ -154,14 +159,18 @@ impl Page {
 
     /// Whether the page is old enough for another one.
     pub(super) fn is_due(&self) -> bool {
-        self.written.elapsed() >= INTERVAL
+        self.written.is_none_or(|written| written.elapsed() >= INTERVAL)
     }
 
-    /// Has the page written. A page that the disk refuses is logged, and is lost.
+    /// Has the page written. A page that the disk refuses is logged, and is lost. While an earlier page waits for the disk, this one
+    /// is left out and stays due; the last one is not.
     pub(super) fn write(&mut self, state: State, evaluations: Summary<'_>) {
-        self.written = Instant::now();
         match self.render(state, evaluations) {
-            Ok(page) if state == State::Running => self.writer.write(page),
+            Ok(page) if state == State::Running => {
+                if self.writer.write(page) {
+                    self.written = Some(Instant::now());
+                }
+            }
             Ok(page) => self.writer.write_last(page),
             Err(error) => tracing::error!("the page is not written: {}", comic_proto::chain(&error)),
         }
@@ -186,9 +195,9 @@ impl Page {
     }
 }
 
-/// The text up to its most bytes.
-fn cut(mut text: String) -> String {
-    text.truncate(text.floor_char_boundary(LONGEST_EXPERIMENT));
+/// The text up to so many bytes.
+fn cut(mut text: String, most: usize) -> String {
+    text.truncate(text.floor_char_boundary(most));
     text
 }
 
@@ -292,7 +301,8 @@ mod tests {
     fn the_page_stays_below_two_megabytes() {
         let run = tempfile::tempdir().unwrap();
         let (mut page, mut writer) = open(run.path());
-        page.experiment = cut("<".repeat(1 << 20));
+        page.experiment = cut("<".repeat(1 << 20), LONGEST_EXPERIMENT);
+        page.name = cut("<".repeat(1 << 20), LONGEST_NAME);
         for steps in 0..10_000 {
             page.add(&line(steps, 1.0 / 3.0 + steps as f64));
         }
@@ -319,7 +329,7 @@ mod tests {
         let lines = [line(100, 0.25), line(200, 0.5)];
         lines.iter().for_each(|line| page.add(line));
         let (_, mut before) = written(page, &writer, run.path());
-        let text = format!("{}\nbroken\n\n[3]\n{}\n{{\"environment_steps\":30", lines[0], lines[1]);
+        let text = format!("{}\nbroken\n\n{}\n[3]\n{{\"environment_steps\":30", lines[0], lines[1]);
         fs::write(run.path().join("metrics.jsonl"), text).unwrap();
         let (page, writer) = open(run.path());
         let (_, mut after) = written(page, &writer, run.path());
@@ -327,6 +337,28 @@ mod tests {
         assert!(before["written"].take().is_number() && after["written"].take().is_number());
         assert_eq!(before, after);
         assert_eq!(after["training"].as_array().unwrap().len(), 2);
+    }
+
+    #[test]
+    fn a_page_is_due_at_first_and_when_the_last_one_is_a_minute_old() {
+        let run = tempfile::tempdir().unwrap();
+        let (mut page, writer) = open(run.path());
+        assert!(page.is_due());
+        page.write(State::Running, writer.summary());
+        assert!(!page.is_due());
+        page.written = Instant::now().checked_sub(INTERVAL);
+        assert!(page.is_due());
+    }
+
+    #[test]
+    fn the_newest_evaluation_is_the_best_one_or_is_not_also_for_the_same_checkpoint() {
+        let run = tempfile::tempdir().unwrap();
+        for (reward, is_best) in [(0.5, true), (0.25, false), (0.75, true)] {
+            let (page, mut writer) = open(run.path());
+            writer.keep(&evaluation(1, &["walk"], reward), None);
+            let (_, contents) = written(page, &writer, run.path());
+            assert_eq!(contents["evaluations"]["newest_is_best"], is_best, "{reward}");
+        }
     }
 
     #[test]

@@ -14,9 +14,12 @@ use crate::algorithm::replay::ReplayReport;
 use crate::checkpoint::Evaluated;
 use crate::checkpoint::progress::Progress;
 use crate::error::Result;
+use crate::observe::evaluation::Evaluation;
 use crate::observe::metrics_file::{MetricsFile, Position, Waited};
+use crate::observe::page::State;
 use crate::observe::prometheus::Prometheus;
 use crate::service::TrainerHandle;
+use crate::train::parts::Ending;
 
 /// Counters, metric lines, and evaluations that came in.
 #[derive(Debug)]
@@ -61,9 +64,18 @@ impl Reports {
         self.metrics.begin(progress.epoch, progress.environment_steps, accounting);
     }
 
-    /// Ends the learner epoch; the run is `over`, or was stopped.
-    pub(super) fn end(&mut self, over: bool) {
-        self.metrics.end(over);
+    /// Ends the learner epoch.
+    pub(super) fn end(&mut self, ended: &Result<Ending>) {
+        self.metrics.end(match ended {
+            Ok(Ending::Budget) => State::Over,
+            Ok(Ending::Stopped) => State::Stopped,
+            Err(_) => State::Failed,
+        });
+    }
+
+    /// Writes the run's page if the last one is a minute old.
+    pub(super) fn write_page_when_due(&mut self) {
+        self.metrics.write_page_when_due();
     }
 
     /// Counts the rows and episodes of a batch that was used, and returns its environment steps.
@@ -150,9 +162,24 @@ impl Reports {
         self.metrics.elapsed() >= self.interval
     }
 
-    /// Writes the evaluations that actors reported since the last time, and returns what they say of checkpoints.
-    pub(super) fn take_evaluations(&mut self) -> Vec<Evaluated> {
-        let evaluations = self.service.take_evaluations();
+    /// Writes the evaluations that actors reported since the last time, and returns what they say of checkpoints. Those of a
+    /// place that the run has not reached are left out: they would hide the others.
+    pub(super) fn take_evaluations(&mut self, progress: &Progress) -> Vec<Evaluated> {
+        let mut evaluations = self.service.take_evaluations();
+        evaluations.retain(|evaluation| {
+            let possible = evaluation.is_before(progress);
+            if !possible {
+                let &Evaluation { epoch, updates, environment_steps, seconds, .. } = evaluation;
+                tracing::warn!(
+                    epoch,
+                    updates,
+                    environment_steps,
+                    seconds,
+                    "an evaluation is left out, because this run has no such checkpoint yet: report one of this run"
+                );
+            }
+            possible
+        });
         self.metrics.keep_evaluations(&evaluations);
         evaluations.iter().filter_map(|evaluation| evaluation.evaluated()).collect()
     }

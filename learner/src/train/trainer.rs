@@ -112,28 +112,34 @@ impl Trainer {
     /// # Errors
     /// When gradient steps are still skipped after the last good state was restored, or when the disk refuses.
     pub fn run(mut self) -> Result<Ending> {
-        let ending = match self.train().and_then(|ending| self.report_deferred().map(|_| ending)) {
-            Ok(ending) => ending,
-            Err(error) => {
-                // What the writer was given is still good.
-                let _ = self.checkpoints.finish();
-                return Err(error);
+        let trained = self.train_to_the_end();
+        let Self { checkpoints, saved_replay, state, mut reports, .. } = self;
+        // What the writer was given is good after an error, too.
+        let written = checkpoints.finish();
+        let ended = trained.and_then(|ending| {
+            written?;
+            match saved_replay {
+                Some(saved) => saved.remove_earlier(state.progress.updates).map(|()| ending),
+                None => Ok(ending),
             }
-        };
+        });
+        reports.end(&ended);
+        ended
+    }
+
+    fn train_to_the_end(&mut self) -> Result<Ending> {
+        let ending = self.train()?;
+        self.report_deferred()?;
         self.take_evaluations()?;
         self.state.progress.seconds = self.budget.seconds();
         self.show_replay();
         self.reports.write(&self.state.progress, self.batcher.accounting_by_task());
         self.write_last_checkpoint()?;
-        self.checkpoints.finish()?;
-        if let Some(saved) = &self.saved_replay {
-            saved.remove_earlier(self.state.progress.updates)?;
-        }
-        self.reports.end(ending == Ending::Budget);
         Ok(ending)
     }
 
     fn train(&mut self) -> Result<Ending> {
+        self.reports.write_page_when_due();
         match self.state.progress.version {
             0 => self.publish()?,
             _ => self.versions.announce(&self.state),
@@ -318,6 +324,7 @@ impl Trainer {
     }
 
     fn write_metrics_when_due(&mut self) -> Result<()> {
+        self.reports.write_page_when_due();
         if !self.reports.are_due() {
             return Ok(());
         }
@@ -341,7 +348,10 @@ impl Trainer {
     }
 
     fn take_evaluations(&mut self) -> Result<()> {
-        self.reports.take_evaluations().into_iter().try_for_each(|evaluated| self.checkpoints.judge(evaluated))
+        self.reports
+            .take_evaluations(&self.state.progress)
+            .into_iter()
+            .try_for_each(|evaluated| self.checkpoints.judge(evaluated))
     }
 
     fn write_checkpoint_if_sound(&mut self, name: Name) -> Result<()> {

@@ -4,8 +4,9 @@
 const contents = JSON.parse(document.getElementById("contents").textContent);
 const { progress, training, evaluations } = contents;
 const SVG = "http://www.w3.org/2000/svg";
-/** Seconds without a newer page after which the learner may have ended: it writes one every minute. */
-const SILENCE = 600;
+/** Seconds without a newer page after which the learner may have ended. It writes one every minute, but for a gradient step
+ * that may take 900 s (LONGEST_STEP in probes.rs). */
+const SILENCE = 1200;
 /** Seconds between two looks at a run that goes on. */
 const RELOAD = 60;
 /** The colours of the rewards 0, 0.25, 0.5, 0.75 and 1: viridis, as in heat_map.rs. */
@@ -68,7 +69,7 @@ function follow(target, move, leave = hideTip) {
 
 function drawHead() {
   const silent = contents.state === "running" && Date.now() / 1000 - contents.written > SILENCE;
-  const states = { running: "running", stopped: "stopped; may be resumed", over: "finished" };
+  const states = { running: "running", failed: "failed; the log says why", stopped: "stopped; may be resumed", over: "finished" };
   document.title = `${contents.run} · CoMic`;
   at("run").textContent = contents.run;
   at("name").textContent = `experiment ${contents.name}`;
@@ -263,12 +264,12 @@ function drawHeatMap() {
 // The tables.
 
 function drawEvaluations() {
-  const { newest, best } = evaluations;
+  const { newest, best, newest_is_best: newestIsBest } = evaluations;
   if (!newest) {
     at("evaluations").remove();
     return;
   }
-  const shown = best && best.updates !== newest.updates ? [newest, best] : [newest];
+  const shown = best && !newestIsBest ? [newest, best] : [newest];
   const titles = shown.length === 2 ? ["newest", "best"] : [best ? "newest and best" : "newest"];
   const of = (evaluation, index) => `${titles[index]}, ${compact(evaluation.environment_steps)} steps`;
   const heads = shown.map((evaluation, index) =>

@@ -28,11 +28,10 @@ impl PageWriter {
         }
     }
 
-    /// Has a page written. While another one waits, this one is left out: the next one has everything that it has.
-    pub(super) fn write(&self, page: Vec<u8>) {
-        if let Some(queue) = &self.queue {
-            let _ = queue.try_send(page);
-        }
+    /// Has a page written, and says whether it will be. While another one waits, this one is left out: the next one has everything
+    /// that it has.
+    pub(super) fn write(&self, page: Vec<u8>) -> bool {
+        self.queue.as_ref().is_some_and(|queue| queue.try_send(page).is_ok())
     }
 
     /// Has the last page written; waits while another one waits.
@@ -58,5 +57,23 @@ fn write_all(path: &Path, pages: &Receiver<Vec<u8>>) {
         if let Err(error) = replace_file(path, page) {
             tracing::error!("the page of the run is not written: {}", comic_proto::chain(&error));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn while_a_page_waits_others_are_left_out_but_the_last_one_is_not() {
+        let (queue, pages) = sync_channel(1);
+        let writer = PageWriter { queue: Some(queue), thread: None };
+        assert!(writer.write(b"first".into()));
+        assert!(!writer.write(b"second".into()));
+        // The writer ends there, and with it the queue.
+        let last = std::thread::spawn(move || writer.write_last(b"last".into()));
+        let written: Vec<Vec<u8>> = pages.iter().collect();
+        last.join().unwrap();
+        assert_eq!(written, [b"first".to_vec(), b"last".to_vec()]);
     }
 }
