@@ -103,7 +103,7 @@ impl ForwardPass for TorchPolicy {
     fn forward(&mut self, batch: &mut ActingBatch) -> Result<(), Error> {
         let environments = batch.environments() as i64;
         let matrix = |values: &[f32]| matrix(values, environments);
-        tch::no_grad(|| {
+        comic_networks::acting(|| {
             let image = (!batch.image.is_empty())
                 .then(|| Tensor::f_from_slice(&batch.image)?.f_view([environments, -1]))
                 .transpose()?;
@@ -164,7 +164,7 @@ impl ForwardPass for TorchPolicy {
 pub(crate) fn actuate(frozen: &FrozenLowLevel, batch: &mut ActingBatch) -> Result<(), Error> {
     let environments = batch.environments() as i64;
     let matrix = |values: &[f32]| matrix(values, environments);
-    tch::no_grad(|| {
+    comic_networks::acting(|| {
         let (action, proprioception) = (matrix(&batch.action)?, matrix(&batch[Field::Proprioception])?);
         let (command, state) = frozen.act(&action, &proprioception, &matrix(&batch.low_level_state)?);
         read(&command, &mut batch.command)?;

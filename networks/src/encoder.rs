@@ -4,7 +4,8 @@ use comic_experiment::{Network, TaskSpec};
 use tch::{Tensor, nn};
 
 use crate::gaussian::DiagonalGaussian;
-use crate::layers::{GaussianHeadConfig, Mlp, Torso, gaussian, linear};
+use crate::layers::{GaussianHeadConfig, Mlp, Torso, gaussian};
+use crate::linear::{Linear, Matrix};
 use crate::routing::{PerTask, Routing};
 
 /// q(z_t | x_t, s_t, z_{t−1}), one network per task: `[x, s, z_{t−1}]` → torso → mean and σ of z. An optional linear
@@ -43,7 +44,7 @@ impl Encoder {
             let input = (spec.proprioception + latent.size + task.observation) as i64 + image_features;
             let torso = Torso::new(&path, input, &config.encoder);
             if latent.size == 0 {
-                let head = linear(&(&path / "head"), torso.output(), config.primitives.count as i64, 1.0);
+                let head = Linear::new(&(&path / "head"), torso.output(), config.primitives.count as i64, 1.0);
                 return Mlp::new(torso, head, None);
             }
             let start = GaussianHeadConfig {
@@ -56,7 +57,8 @@ impl Encoder {
             // The linear path starts at 0: raw observations reach hundreds (contact forces) and would dominate the
             // initial latent.
             let size = [2 * latent.size as i64, input];
-            let linear_path = config.encoder_linear_path.then(|| path.var("linear_path", &size, nn::Init::Const(0.0)));
+            let linear_path =
+                config.encoder_linear_path.then(|| Matrix::new(path.var("linear_path", &size, nn::Init::Const(0.0))));
             Mlp::new(torso, head, linear_path)
         });
         let head = if latent.size > 0 { Head::Latent { min_std: latent.min_std } } else { Head::Weights };

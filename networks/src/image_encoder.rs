@@ -3,7 +3,7 @@
 use comic_experiment::IMAGE_SIZE;
 use tch::{Kind, Tensor, nn};
 
-use crate::layers::linear;
+use crate::linear::Linear;
 
 /// Two convolutions, each followed by ELU (8×8 with stride 4 to 16 channels, 4×4 with stride 2 to 32 channels), then
 /// Linear → LayerNorm → tanh.
@@ -14,7 +14,7 @@ use crate::layers::linear;
 pub(crate) struct ImageEncoder {
     first: nn::Conv2D,
     second: nn::Conv2D,
-    output: nn::Linear,
+    output: Linear,
     norm: nn::LayerNorm,
     features: i64,
 }
@@ -39,7 +39,7 @@ impl ImageEncoder {
         Self {
             first: convolution("first", 3, 16, 8, 4),
             second: convolution("second", 16, 32, 4, 2),
-            output: linear(&(path / "output"), SECOND, features, 1.0),
+            output: Linear::new(&(path / "output"), SECOND, features, 1.0),
             norm: nn::layer_norm(path / "norm", vec![features], nn::LayerNormConfig::default()),
             features,
         }

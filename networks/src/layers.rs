@@ -4,18 +4,7 @@ use comic_experiment::Network;
 use tch::{Tensor, nn};
 
 use crate::gaussian::DiagonalGaussian;
-
-/// A linear layer with weights uniform in ±`scale`/√fan_in and bias 0.
-pub(crate) fn linear(path: &nn::Path, input: i64, output: i64, scale: f64) -> nn::Linear {
-    let bound = scale / (input as f64).sqrt();
-    let weights = if bound > 0.0 { nn::Init::Uniform { lo: -bound, up: bound } } else { nn::Init::Const(0.0) };
-    nn::linear(
-        path,
-        input,
-        output,
-        nn::LinearConfig { ws_init: weights, bs_init: Some(nn::Init::Const(0.0)), bias: true },
-    )
-}
+use crate::linear::{Linear, Matrix};
 
 /// Reshapes `[.., D]` to rows `[N, D]`. The trace of an exported policy must not contain their number.
 pub(crate) fn rows(tensor: &Tensor) -> Tensor {
@@ -32,7 +21,7 @@ pub(crate) fn rows(tensor: &Tensor) -> Tensor {
 /// Hidden layers: Linear → LayerNorm → tanh first, then Linear → ELU.
 #[derive(Debug)]
 pub(crate) struct Torso {
-    layers: Vec<nn::Linear>,
+    layers: Vec<Linear>,
     norm: [Tensor; 2],
     output: i64,
 }
@@ -44,10 +33,10 @@ impl Torso {
         let mut width = first;
         let mut layers = Vec::new();
         for (index, size) in sizes.iter().enumerate().skip(1) {
-            layers.push(linear(&(path / "layers" / index), width, *size as i64, 1.0));
+            layers.push(Linear::new(&(path / "layers" / index), width, *size as i64, 1.0));
             width = *size as i64;
         }
-        layers.insert(0, linear(&(path / "layers" / 0), input, first, 1.0));
+        layers.insert(0, Linear::new(&(path / "layers" / 0), input, first, 1.0));
         let norm = path / "norm";
         let norm =
             [norm.var("weight", &[first], nn::Init::Const(1.0)), norm.var("bias", &[first], nn::Init::Const(0.0))];
@@ -84,26 +73,26 @@ const LAYER_NORM_EPSILON: f64 = 1e-5;
 #[derive(Debug)]
 pub(crate) struct Mlp {
     torso: Torso,
-    head: nn::Linear,
+    head: Linear,
     /// `[output, input]`.
-    linear_path: Option<Tensor>,
+    linear_path: Option<Matrix>,
 }
 
 impl Mlp {
-    pub(crate) fn new(torso: Torso, head: nn::Linear, linear_path: Option<Tensor>) -> Self {
+    pub(crate) fn new(torso: Torso, head: Linear, linear_path: Option<Matrix>) -> Self {
         Self { torso, head, linear_path }
     }
 
     /// Width of its input.
     pub(crate) fn input(&self) -> i64 {
-        self.torso.layers.first().map_or(0, |layer| layer.ws.size()[1])
+        self.torso.layers.first().map_or(0, |layer| layer.matrix.weights().size()[1])
     }
 
     /// From `[N, input]` to `[N, output]`.
     pub(crate) fn forward(&self, input: &Tensor) -> Tensor {
         let output = self.torso.forward(input).apply(&self.head);
         match &self.linear_path {
-            Some(weights) => output.addmm(input, &weights.tr()),
+            Some(path) => path.add_product(&output, input),
             None => output,
         }
     }
@@ -122,12 +111,9 @@ pub(crate) fn forward_chosen(networks: &[Mlp], chosen: &Tensor, input: &Tensor) 
     };
     // The weights of entries that a network does not read are 0.
     let widened = |weights: &Tensor, width: i64| weights.constant_pad_nd([width - weights.size()[1], 0]);
-    let linear = |input: &Tensor, of: &dyn Fn(&Mlp) -> &nn::Linear| {
-        let weights = choose(&|network| widened(&of(network).ws, input.size()[2]));
-        let biases = choose(&|network| match &of(network).bs {
-            Some(bias) => bias.shallow_clone(),
-            None => of(network).ws.select(1, 0).zeros_like(),
-        });
+    let linear = |input: &Tensor, of: &dyn Fn(&Mlp) -> &Linear| {
+        let weights = choose(&|network| widened(of(network).matrix.weights(), input.size()[2]));
+        let biases = choose(&|network| of(network).bias.shallow_clone());
         input.matmul(&weights.transpose(1, 2)) + biases.unsqueeze(1)
     };
     let hidden = linear(input, &|network| &network.torso.layers[0]);
@@ -142,7 +128,7 @@ pub(crate) fn forward_chosen(networks: &[Mlp], chosen: &Tensor, input: &Tensor) 
     let output = linear(&hidden, &|network| &network.head);
     match networks.iter().map(|network| network.linear_path.as_ref()).collect::<Option<Vec<_>>>() {
         Some(paths) => {
-            let weights: Vec<Tensor> = paths.iter().map(|weights| widened(weights, input.size()[2])).collect();
+            let weights: Vec<Tensor> = paths.iter().map(|path| widened(path.weights(), input.size()[2])).collect();
             output + input.matmul(&Tensor::stack(&weights, 0).index_select(0, chosen).transpose(1, 2))
         }
         None => output,
@@ -174,13 +160,11 @@ impl<'a> GaussianHeadConfig<'a> {
 
     /// The linear layer whose output is the mean, followed by the raw standard deviation. The initial bias of the raw
     /// half gives σ = initial_std.
-    pub(crate) fn linear(&self, path: &nn::Path, input: i64) -> nn::Linear {
-        let layer = linear(path, input, 2 * self.mean.len() as i64, self.scale);
+    pub(crate) fn linear(&self, path: &nn::Path, input: i64) -> Linear {
+        let layer = Linear::new(path, input, 2 * self.mean.len() as i64, self.scale);
         let raw = inverse_softplus(self.initial_std - self.min_std) as f32;
         let bias: Vec<f32> = self.mean.iter().copied().chain(std::iter::repeat_n(raw, self.mean.len())).collect();
-        if let Some(parameter) = &layer.bs {
-            tch::no_grad(|| parameter.shallow_clone().copy_(&Tensor::from_slice(&bias)));
-        }
+        tch::no_grad(|| layer.bias.shallow_clone().copy_(&Tensor::from_slice(&bias)));
         layer
     }
 }
@@ -195,7 +179,7 @@ pub(crate) fn gaussian(output: &Tensor, min_std: f64) -> DiagonalGaussian {
 /// A linear layer whose output is a Gaussian.
 #[derive(Debug)]
 pub(crate) struct GaussianHead {
-    head: nn::Linear,
+    head: Linear,
     min_std: f64,
 }
 

@@ -1,4 +1,4 @@
-//! The networks. Acting and learning use the same functions: acting inside `tch::no_grad`, learning with gradient.
+//! The networks. Acting and learning use the same functions: acting inside [`acting`], learning with gradient.
 //!
 //! # Layout
 //! - [`Policy`] is what acting needs of every policy; the learner publishes its parameters. [`new_policy`] makes that of an
@@ -17,9 +17,8 @@
 //!   policies and parts of them as files for other programs.
 //!
 //! Networks take float32 tensors of rows, `[N, ·]`. In the learner N is unrolls × steps. Recurrent layers take
-//! `[B, T, ·]`. The last bits of sums over N depend on N and on the number of threads. If both are equal, acting and
-//! learning give the same numbers bit for bit. An LSTM's numbers agree to 1e-5, because the learner computes the input
-//! products of all steps at once.
+//! `[B, T, ·]`. The last bits of libtorch's sums depend on N and on the number of threads. Acting has products of its own, so
+//! acting and learning give the same numbers up to rounding.
 //!
 //! By default initial weights are uniform in ±1/√fan_in (variance scaling with scale ⅓), and biases are 0. The random
 //! numbers are libtorch's: call `tch::manual_seed` first to make them reproducible.
@@ -34,9 +33,11 @@ mod gaussian;
 mod high_level;
 mod image_encoder;
 mod layers;
+mod linear;
 mod low_level;
 mod lstm;
 mod normaliser;
+mod packed;
 mod parameters;
 mod policy;
 mod prior;
@@ -52,6 +53,7 @@ pub use algorithms::new_policy;
 pub use error::Error;
 pub use frozen::FrozenLowLevel;
 pub use gaussian::DiagonalGaussian;
+pub use linear::acting;
 pub use low_level::{Layer, Sizes, low_level_layers};
 pub use lstm::RecurrentState;
 pub use normaliser::{NORMALISED_LIMIT, NORMALISER_MIN_STD, NormalisedObservation, NormaliserStatistics};

@@ -2,7 +2,7 @@
 
 use tch::{Tensor, nn};
 
-use crate::layers::linear;
+use crate::linear::{Linear, Matrix};
 
 /// Stacked LSTM layers. Their state is a row: hidden and cell state of the first layer, then of the next.
 #[derive(Debug)]
@@ -71,22 +71,20 @@ impl LstmStack {
 /// One layer, in PyTorch's order of gates: input, forget, cell, output.
 #[derive(Debug)]
 struct LstmLayer {
-    input: nn::Linear,
+    input: Linear,
     /// `[4·units, units]`.
-    recurrent: Tensor,
+    recurrent: Matrix,
     units: i64,
 }
 
 impl LstmLayer {
     fn new(path: &nn::Path, input: i64, units: i64) -> Self {
         let bound = 1.0 / (units as f64).sqrt();
-        let input = linear(&(path / "input"), input, 4 * units, 1.0);
-        if let Some(bias) = &input.bs {
-            // The forget gate is open initially, so gradients reach back through time from the beginning (D).
-            let _ = tch::no_grad(|| bias.narrow(0, units, units).fill_(1.0));
-        }
+        let input = Linear::new(&(path / "input"), input, 4 * units, 1.0);
+        // The forget gate is open initially, so gradients reach back through time from the beginning (D).
+        let _ = tch::no_grad(|| input.bias.narrow(0, units, units).fill_(1.0));
         let recurrent = path.var("recurrent", &[4 * units, units], nn::Init::Uniform { lo: -bound, up: bound });
-        Self { input, recurrent, units }
+        Self { input, recurrent: Matrix::new(recurrent), units }
     }
 
     /// From `input` `[T, B, I]` to `[T, B, units]`, with `h` and `c` `[B, units]` and `kept` `[T, B, 1]`. Also returns
@@ -95,7 +93,6 @@ impl LstmLayer {
     /// The product with the input is one product for all steps; each step then needs only one small product.
     fn forward(&self, input: &Tensor, mut h: Tensor, mut c: Tensor, kept: Option<&Tensor>) -> (Tensor, Tensor, Tensor) {
         let projected = input.apply(&self.input);
-        let recurrent = self.recurrent.tr();
         // One `unbind` splits all steps at once, so its gradient is assembled once. The gradient of a single selected
         // step would be as large as the whole tensor and nearly all zeros.
         let mut kept = kept.map(|kept| kept.unbind(0).into_iter());
@@ -104,7 +101,7 @@ impl LstmLayer {
             if let Some(kept) = kept.as_mut().and_then(Iterator::next) {
                 (h, c) = (h * &kept, c * kept);
             }
-            let gates = projected.addmm(&h, &recurrent).split(self.units, 1);
+            let gates = self.recurrent.add_product(&projected, &h).split(self.units, 1);
             let [input, forget, output] = [0, 1, 3].map(|gate| gates[gate].sigmoid());
             c = (forget * c).addcmul(&input, &gates[2].tanh());
             h = output * c.tanh();

@@ -3,7 +3,7 @@
 use comic_experiment::IMAGE_SIZE;
 use tch::{Kind, Tensor, nn};
 
-use crate::layers::linear;
+use crate::linear::Linear;
 
 /// Channels of the sections (N): those of IMPALA's deep network (Espeholt et al., 2018, figure 3).
 const CHANNELS: [i64; 3] = [16, 32, 32];
@@ -17,7 +17,7 @@ const LAST: i64 = SIZE / 8;
 #[derive(Debug)]
 pub(crate) struct ResNet {
     sections: Vec<Section>,
-    output: nn::Linear,
+    output: Linear,
     features: i64,
 }
 
@@ -51,7 +51,7 @@ impl ResNet {
         });
         let sections = sections.collect();
         let flat = CHANNELS[CHANNELS.len() - 1] * LAST * LAST;
-        Self { sections, output: linear(&(path / "output"), flat, features, 1.0), features }
+        Self { sections, output: Linear::new(&(path / "output"), flat, features, 1.0), features }
     }
 
     /// The number of weights of a network with so many features.

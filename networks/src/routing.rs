@@ -253,9 +253,9 @@ mod tests {
         let networks = [5_i64, 3].into_iter().enumerate().map(|(task, input)| {
             let path = store.root() / task;
             let torso = crate::layers::Torso::new(&path, input, &[8, 7]);
-            let head = crate::layers::linear(&(&path / "head"), torso.output(), 4, 1.0);
+            let head = crate::linear::Linear::new(&(&path / "head"), torso.output(), 4, 1.0);
             let linear_path = path.var("linear_path", &[4, input], tch::nn::Init::Randn { mean: 0.0, stdev: 1.0 });
-            Mlp::new(torso, head, Some(linear_path))
+            Mlp::new(torso, head, Some(crate::linear::Matrix::new(linear_path)))
         });
         PerTask::new(networks.collect())
     }

@@ -7,7 +7,8 @@ use tch::{Tensor, nn};
 use crate::action::ActionDistribution;
 use crate::error::Error;
 use crate::gaussian::DiagonalGaussian;
-use crate::layers::{GaussianHead, GaussianHeadConfig, Torso, linear, rows};
+use crate::layers::{GaussianHead, GaussianHeadConfig, Torso, rows};
+use crate::linear::Linear;
 use crate::lstm::{LstmStack, RecurrentState};
 use crate::normaliser::{NormalisedObservation, Normaliser, NormaliserStatistics};
 use crate::policy::{self, Acting, Policy, Weights};
@@ -203,14 +204,14 @@ impl LatentPolicy {
 #[derive(Debug)]
 pub struct ActionValue {
     torso: Torso,
-    head: nn::Linear,
+    head: Linear,
 }
 
 impl ActionValue {
     /// Creates its parameters in `path`.
     pub fn new(path: &nn::Path, spec: &TaskSpec, sizes: &Svg0) -> Self {
         let torso = Torso::new(path, (sizes.core + spec.action) as i64, &sizes.action_value);
-        let head = linear(&(path / "head"), torso.output(), 1, 1.0);
+        let head = Linear::new(&(path / "head"), torso.output(), 1, 1.0);
         Self { torso, head }
     }
 

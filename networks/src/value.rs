@@ -3,7 +3,8 @@
 use comic_experiment::{Network, TaskSpec};
 use tch::{Kind, Tensor, nn};
 
-use crate::layers::{Mlp, Torso, linear, rows};
+use crate::layers::{Mlp, Torso, rows};
+use crate::linear::Linear;
 use crate::lstm::{LstmStack, RecurrentState};
 use crate::normaliser::NormalisedObservation;
 use crate::routing::PerTask;
@@ -25,7 +26,7 @@ pub struct Value {
 #[derive(Debug)]
 enum Body {
     FeedForward(PerTask),
-    Recurrent { torso: Torso, lstm: LstmStack, head: nn::Linear },
+    Recurrent { torso: Torso, lstm: LstmStack, head: Linear },
 }
 
 impl Value {
@@ -46,11 +47,11 @@ impl Value {
             let torso = Torso::new(&path, input, &config.value);
             if !config.value_lstm.is_empty() {
                 let lstm = LstmStack::new(&path, torso.output(), &config.value_lstm);
-                let head = linear(&(&path / "head"), lstm.output(), terms, 1.0);
+                let head = Linear::new(&(&path / "head"), lstm.output(), terms, 1.0);
                 embedding();
                 return Self { embeddings, body: Body::Recurrent { torso, lstm, head } };
             }
-            let head = linear(&(&path / "head"), torso.output(), terms, 1.0);
+            let head = Linear::new(&(&path / "head"), torso.output(), terms, 1.0);
             embedding();
             networks.push(Mlp::new(torso, head, None));
         }

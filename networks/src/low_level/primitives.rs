@@ -5,7 +5,8 @@ use tch::{Tensor, nn};
 use super::interface::{Config, Input};
 use super::size::{Layer, Sizes};
 use crate::gaussian::DiagonalGaussian;
-use crate::layers::{Torso, inverse_softplus, linear};
+use crate::layers::{Torso, inverse_softplus};
+use crate::linear::Linear;
 
 /// Largest fixed bias of a primitive's mean (S).
 const LARGEST_BIAS: f64 = 0.66;
@@ -18,7 +19,7 @@ const LARGEST_BIAS: f64 = 0.66;
 pub(crate) struct Primitives {
     torso: Torso,
     /// The hidden layers of all primitives as one layer, `[K·hidden]`.
-    hidden: nn::Linear,
+    hidden: Linear,
     /// `[K, hidden, 2·A]`.
     heads: Tensor,
     /// `[K, 1, 2·A]`.
@@ -36,7 +37,7 @@ impl Primitives {
         let (count, units, actions) = (sizes.count as i64, sizes.hidden as i64, config.pose.len() as i64);
         let path = path / "primitives";
         let torso = Torso::new(&path, config.proprioception, &sizes.torso);
-        let hidden = linear(&(&path / "hidden"), torso.output(), count * units, 1.0);
+        let hidden = Linear::new(&(&path / "hidden"), torso.output(), count * units, 1.0);
         let bound = network.policy_head_scale / (units as f64).sqrt();
         let weights = if bound > 0.0 { nn::Init::Uniform { lo: -bound, up: bound } } else { nn::Init::Const(0.0) };
         let heads = path.var("heads", &[count, units, 2 * actions], weights);
@@ -94,7 +95,7 @@ fn evenly(count: usize) -> Vec<f32> {
 /// With a bottleneck: `[z, s]` → MLP (S: 2×400) → K. Without one, the encoder's output is these K numbers.
 #[derive(Debug)]
 pub(crate) struct Gate {
-    bottleneck: Option<(Torso, nn::Linear)>,
+    bottleneck: Option<(Torso, Linear)>,
 }
 
 impl Gate {
@@ -103,7 +104,7 @@ impl Gate {
         let bottleneck = (config.network.latent.size > 0).then(|| {
             let path = path / "gate";
             let torso = Torso::new(&path, config.latent + config.proprioception, &sizes.gate);
-            let head = linear(&(&path / "head"), torso.output(), sizes.count as i64, 1.0);
+            let head = Linear::new(&(&path / "head"), torso.output(), sizes.count as i64, 1.0);
             (torso, head)
         });
         Self { bottleneck }
