@@ -27,7 +27,7 @@ const ENVIRONMENTS: usize = 16;
 ///
 /// `ratio` is value / floor. `actor.env` and `actor.policy`: steps/s with resets, against the same controls through the
 /// physics alone. `actor.gradient`: steps/s with the simulator's derivative, against those without it; the quickstart's
-/// networks. `actor.contended`: steps/s of one thread alone, against those with one busy process for each core.
+/// networks. `actor.contended`: steps/s of one thread alone, against those beside busy processes, one for each core or `--beside`.
 /// `actor.threads`: steps/s of two threads, against one. `actor.reset`: ms. `actor.wire`: ms of one core
 /// for sending the unrolls of one update from a worker into a batch, against one second. `actor.vision`: ms of an image.
 /// `actor.memory`: resident MiB after 10,000 resets, against those after 1,000. `actor.memory.reset`: ms of one of the
@@ -43,6 +43,9 @@ pub struct Bench {
     /// The low level of the policy: mlp, lstm, mixture or product. All but mlp add their name to the figure's
     #[arg(long, default_value_t = LowLevelName::Mlp)]
     low_level: LowLevelName,
+    /// Busy processes of equal priority beside `actor.contended` [default: one for each core]
+    #[arg(long, value_name = "N")]
+    beside: Option<usize>,
     /// Figures to measure [default: all but vision and memory]
     #[arg(value_enum)]
     figures: Vec<Name>,
@@ -67,6 +70,8 @@ struct Subject {
     experiment: Experiment,
     task: Arc<dyn Task>,
     budget: Duration,
+    /// Busy neighbours.
+    beside: usize,
 }
 
 impl Subject {
@@ -87,7 +92,8 @@ impl Bench {
         let experiment = Experiment { task: self.task, ..paper };
         let catalogue = Catalogue::open(&experiment.clips)?;
         let task = comic_tasks::build(&experiment, &catalogue)?;
-        let subject = Subject { experiment, task, budget };
+        let beside = self.beside.map_or_else(crate::busy::cores, Ok)?;
+        let subject = Subject { experiment, task, budget, beside };
         // Images need OpenGL, which not every machine has. Memory takes minutes.
         let wanted = |name: &&Name| match self.figures.as_slice() {
             [] => !matches!(name, Name::Vision | Name::Memory),

@@ -4,19 +4,18 @@ use std::process::{Child, Command, Stdio};
 
 use anyhow::{Context as _, Result};
 
-/// One busy process for each core that this one may use, until this is dropped.
+/// Busy processes of equal priority, until this is dropped.
 #[derive(Debug)]
 pub(crate) struct Busy(Vec<Child>);
 
 impl Busy {
-    /// Starts them.
+    /// Starts so many.
     ///
     /// # Errors
     /// When there is no shell.
-    pub(crate) fn on_every_core() -> Result<Self> {
-        let cores = std::thread::available_parallelism().context("the number of cores is not known")?.get();
+    pub(crate) fn start(count: usize) -> Result<Self> {
         let mut busy = Self(Vec::new());
-        for _ in 0..cores {
+        for _ in 0..count {
             let mut shell = Command::new("sh");
             // They end with this process, however that ends.
             let child = shell
@@ -28,6 +27,14 @@ impl Busy {
         }
         Ok(busy)
     }
+}
+
+/// One for each core that this process may use.
+///
+/// # Errors
+/// When the system does not say.
+pub(crate) fn cores() -> Result<usize> {
+    Ok(std::thread::available_parallelism().context("the number of cores is not known")?.get())
 }
 
 impl Drop for Busy {

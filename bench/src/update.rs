@@ -33,8 +33,8 @@ use recorded::Recorded;
 ///
 /// `value` is milliseconds of the step with its batch on the device. `floor` is milliseconds of its matrix products,
 /// forward and backward, on the same threads, and of libtorch's own LSTM where the network has one. `copy` is milliseconds
-/// of bringing the batch to the device, `read_back` of bringing the parameters back. `learner.update.contended` is the step with
-/// one busy process of equal priority for each core, against the same alone; fair sharing is 2. All are medians of
+/// of bringing the batch to the device, `read_back` of bringing the parameters back. `learner.update.contended` is the step beside
+/// `--beside N` busy processes, against the same alone; with one for each core fair sharing is 2. All are medians of
 /// interleaved repeats.
 #[derive(Debug, Args)]
 pub struct Update {
@@ -53,9 +53,9 @@ pub struct Update {
     /// SVG(0) instead of V-MPO
     #[arg(long, conflicts_with_all = ["low_level", "joint"])]
     svg0: bool,
-    /// Measure it also beside busy processes
-    #[arg(long)]
-    contended: bool,
+    /// Measure it also beside so many busy processes of equal priority
+    #[arg(long, value_name = "N")]
+    beside: Option<usize>,
     /// Where the update runs: cpu, cuda, cuda:N, xla or xla:N
     #[arg(long, value_name = "DEVICE", default_value_t = DeviceName::default())]
     device: DeviceName,
@@ -86,8 +86,8 @@ impl Update {
             let read = milliseconds(|| networks.learner.policy_parameters())?;
             let one_task = one_task.as_mut().map(|networks| networks.update(&backend)).transpose()?;
             let floor = milliseconds(|| products.run(&backend))?;
-            if self.contended && repeat >= WARM_UP {
-                let _neighbours = Busy::on_every_core()?;
+            if let Some(neighbours) = self.beside.filter(|_| repeat >= WARM_UP) {
+                let _neighbours = Busy::start(neighbours)?;
                 contended.push(networks.update(&backend)?);
             }
             if repeat >= WARM_UP {

@@ -56,7 +56,7 @@ fn run(options: &Options) -> Result<ExitCode> {
         Some(command) => run_command(command, options)?,
         None if options.print => comic_learner::run::print(options)?,
         None => {
-            comic_learner::threads::wait_passively();
+            comic_learner::threads::prepare_libraries();
             if comic_learner::run::run(options)? == Ending::Stopped {
                 return Ok(ExitCode::from(STOPPED));
             }

@@ -1,21 +1,34 @@
-//! libtorch's threads beside other programs.
+//! libtorch's threads beside other programs, and its memory.
 
 use std::os::unix::process::CommandExt as _;
 use std::process::Command;
 
 use comic_experiment::Experiment;
 
-/// The variables by which libgomp is told how a thread waits for the others. It reads them when it is loaded.
+/// The variables by which libgomp is told how a thread waits for the others.
 const SPINS: &str = "GOMP_SPINCOUNT";
 const POLICY: &str = "OMP_WAIT_POLICY";
-/// How often a thread looks whether the others have finished before it sleeps. libgomp's default of 300,000 is milliseconds,
-/// in which a neighbour of equal priority could have computed. docs/benchmarks.md has the figures.
-const FEW_SPINS: &str = "30000";
 
-/// Starts this program anew, as the same process, so that libtorch's threads soon sleep while they wait for each other. Does
-/// nothing if the environment says how they wait, or if the program cannot be started again.
-pub fn wait_passively() {
-    if std::env::var_os(SPINS).is_some() || std::env::var_os(POLICY).is_some() {
+/// What the libraries of this program read when they are loaded, unless the user has set it. docs/benchmarks.md has the figures.
+const ENVIRONMENT: [(&str, &str); 4] = [
+    // How often a thread looks whether the others have finished before it sleeps. libgomp's default of 300,000 is milliseconds,
+    // in which a neighbour of equal priority could have computed.
+    (SPINS, "30000"),
+    // glibc gives tensors of megabytes back to the system when they are freed, and the system clears every page of the next
+    // tensor: a tenth of an update. Let it keep them: tensors of up to 1 GiB, and 64 GiB in all.
+    ("MALLOC_MMAP_THRESHOLD_", "1073741824"),
+    ("MALLOC_TRIM_THRESHOLD_", "68719476736"),
+    // Only glibc's first arena keeps large blocks, and the trainer's thread would have another. Rust's own memory is mimalloc's.
+    ("MALLOC_ARENA_MAX", "1"),
+];
+
+/// Starts this program anew, as the same process, so that libtorch's threads soon sleep while they wait for each other, and its
+/// memory is kept for the next update. Does nothing if the environment says all of it, or if the program cannot be started again.
+pub fn prepare_libraries() {
+    let is_set = |name: &str| std::env::var_os(name).is_some();
+    let missing: Vec<_> =
+        ENVIRONMENT.into_iter().filter(|(name, _)| !is_set(name) && (*name != SPINS || !is_set(POLICY))).collect();
+    if missing.is_empty() {
         return;
     }
     let mut arguments = std::env::args_os();
@@ -24,8 +37,8 @@ pub fn wait_passively() {
     if let Some(name) = arguments.next() {
         command.arg0(name);
     }
-    let error = command.args(arguments).env(SPINS, FEW_SPINS).exec();
-    tracing::warn!(%error, "libtorch's threads wait actively, because this program cannot be started anew");
+    let error = command.args(arguments).envs(missing).exec();
+    tracing::warn!(%error, "libtorch will be slower, because this program cannot be started anew");
 }
 
 /// As many threads as the experiment wants, and no more than the cores that this process may use, its cgroup's quota included:

@@ -161,13 +161,14 @@ fn written(arguments: &[String]) -> Option<Written> {
 /// Our update and the same update in Python PyTorch. They take turns, so that other programs slow down both.
 fn learner(threads: u16, arguments: &[String]) -> Result<()> {
     let written = written(arguments);
+    let cores = std::thread::available_parallelism().context("the number of cores is not known")?;
     let mut ours = Vec::new();
     let mut theirs = Vec::new();
     for _ in 0..ROUNDS {
         let mut bench = Command::new(workspace::program("comic-bench-learner")?);
         bench.args(["update", "--threads", &threads.to_string()]).args(arguments);
-        if written.is_some() {
-            bench.arg("--contended");
+        if written.is_some() && !arguments.iter().any(|argument| argument.starts_with("--beside")) {
+            bench.args(["--beside", &cores.to_string()]);
         }
         ours.push(figures(&mut bench)?);
         if let Some(Written { script, .. }) = written {

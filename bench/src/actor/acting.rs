@@ -44,7 +44,7 @@ pub(super) fn gradient(subject: &Subject) -> Result<Figure> {
         let overrides: Vec<String> = overrides.iter().map(|field| (*field).to_owned()).collect();
         let experiment = comic_experiment::resolve("quickstart", &overrides)?;
         let task = comic_tasks::build(&experiment, &Catalogue::open(&experiment.clips)?)?;
-        let subject = Subject { experiment, task, budget: subject.budget };
+        let subject = Subject { experiment, task, budget: subject.budget, beside: subject.beside };
         worker(&subject, environments(&subject, 1)?, 1)
     };
     let (mut with, mut without) = (quickstart(&[])?, quickstart(&["vmpo.action_gradient=0"])?);
@@ -55,16 +55,16 @@ pub(super) fn gradient(subject: &Subject) -> Result<Figure> {
     Ok(Figure::new("actor.gradient", "steps/s", medians, note))
 }
 
-/// Steps/s of one thread alone, against the same with one busy process for each core.
+/// Steps/s of one thread alone, against the same beside busy processes.
 pub(super) fn contended(subject: &Subject) -> Result<Figure> {
     let mut worker = worker(subject, environments(subject, 1)?, 1)?;
     let medians = interleave(subject.budget, || {
         let alone = unroll_rate(&mut worker)?;
-        let _neighbours = Busy::on_every_core()?;
+        let _neighbours = Busy::start(subject.beside)?;
         Ok::<_, anyhow::Error>((alone, unroll_rate(&mut worker)?))
     })?;
-    let note = "one thread, 16 environments, the paper's networks; floor: the same with one busy process of equal \
-                priority for each core";
+    let note = "one thread, 16 environments, the paper's networks; floor: the same beside busy processes of equal priority, \
+                one for each core or --beside";
     Ok(Figure::new("actor.contended", "steps/s", medians, note))
 }
 

@@ -35,9 +35,12 @@ fn main() -> anyhow::Result<()> {
     let Arguments { measurement } = Arguments::parse();
     comic_bench::start_logging();
     // As `comic-learner` does.
-    comic_learner::threads::wait_passively();
+    comic_learner::threads::prepare_libraries();
     match measurement {
-        Measurement::Update(update) => update.run(),
+        // The trainer of `comic-learner` has a thread of its own, too, and so other memory than the first thread.
+        Measurement::Update(update) => {
+            std::thread::spawn(move || update.run()).join().map_err(|_| anyhow::anyhow!("the measurement panicked"))?
+        }
         Measurement::Replay(replay) => replay.run(),
         Measurement::Ingest(ingest) => ingest.run(),
         Measurement::Publish(publish) => publish.run(),
