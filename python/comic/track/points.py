@@ -180,7 +180,7 @@ def experiment(run: Path) -> str:
         return experiment_without_directories(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise _native.Error(f"{path}: it cannot be read: {error}") from error
-    except ValueError as error:
+    except (ValueError, _native.Error) as error:
         raise _native.Error(f"{path}: {error}") from error
 
 
