@@ -15,8 +15,8 @@ const ENVIRONMENT: [(&str, &str); 4] = [
     // in which a neighbour of equal priority could have computed.
     (SPINS, "30000"),
     // glibc gives tensors of megabytes back to the system when they are freed, and the system clears every page of the next
-    // tensor: a tenth of an update. Let it keep them: tensors of up to 1 GiB, and 64 GiB in all.
-    ("MALLOC_MMAP_THRESHOLD_", "1073741824"),
+    // tensor: a tenth of an update. Let it keep them: tensors of up to 32 MiB, the most that every glibc takes, and 64 GiB in all.
+    ("MALLOC_MMAP_THRESHOLD_", "33554432"),
     ("MALLOC_TRIM_THRESHOLD_", "68719476736"),
     // Only glibc's first arena keeps large blocks, and the trainer's thread would have another. Rust's own memory is mimalloc's.
     ("MALLOC_ARENA_MAX", "1"),

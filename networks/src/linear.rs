@@ -15,8 +15,8 @@ thread_local! {
     static ACTING: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Runs `act` without gradients, and on a CPU with matrix products that are made for few rows: the parameters are used many
-/// times before they change. The results differ from libtorch's in the last bits.
+/// Runs `act` without gradients, and on a CPU with matrix products for few rows, whose weights are packed once for each version
+/// of the parameters. The results differ from libtorch's in the last bits. No gradient of a parameter can be had in here.
 ///
 /// A policy that is traced must not act in here: a trace has libtorch's operations only.
 pub fn acting<T>(act: impl FnOnce() -> T) -> T {
@@ -54,7 +54,7 @@ impl Matrix {
         if !self.acts_on(input) {
             return start.addmm(input, &self.weights.tr());
         }
-        // libtorch counts how often a tensor was changed.
+        // libtorch counts how often a tensor was changed in place. It does not count `set_data`, which nothing here uses.
         let version = self.weights.internal_version();
         let mut packed = self.packed.borrow_mut();
         let packed = match packed.take() {
@@ -119,7 +119,6 @@ impl Linear {
     pub(crate) fn new(path: &nn::Path, inputs: i64, outputs: i64, scale: f64) -> Self {
         let bound = scale / (inputs as f64).sqrt();
         let weights = if bound > 0.0 { nn::Init::Uniform { lo: -bound, up: bound } } else { nn::Init::Const(0.0) };
-        // libtorch's generator gives the weights after the bias, which draws nothing.
         let bias = path.var("bias", &[outputs], nn::Init::Const(0.0));
         Self { matrix: Matrix::new(path.var("weight", &[outputs, inputs], weights)), bias }
     }

@@ -22,7 +22,7 @@ pub(crate) struct Packed {
 }
 
 impl Packed {
-    /// Packs `weights`, `[outputs, inputs]`, row-major. No product has a matrix without inputs.
+    /// Packs `weights`, `[outputs, inputs]`, row-major. Without inputs there is nothing to pack.
     pub(crate) fn new(weights: &[f32], inputs: usize) -> Self {
         let outputs = weights.len() / inputs.max(1);
         let mut panels = vec![[0.0; OUTPUTS]; outputs.div_ceil(OUTPUTS) * inputs];

@@ -37,7 +37,7 @@ fn main() -> anyhow::Result<()> {
     // As `comic-learner` does.
     comic_learner::threads::prepare_libraries();
     match measurement {
-        // The trainer of `comic-learner` has a thread of its own, too, and so other memory than the first thread.
+        // As in `comic-learner`, the update runs on a thread of its own: without MALLOC_ARENA_MAX its memory would be another arena.
         Measurement::Update(update) => {
             std::thread::spawn(move || update.run()).join().map_err(|_| anyhow::anyhow!("the measurement panicked"))?
         }
