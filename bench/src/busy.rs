@@ -9,7 +9,7 @@ use anyhow::{Context as _, Result};
 pub(crate) struct Busy(Vec<Child>);
 
 impl Busy {
-    /// Starts so many.
+    /// Starts `count` of them.
     ///
     /// # Errors
     /// When there is no shell.

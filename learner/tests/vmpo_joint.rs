@@ -58,7 +58,7 @@ fn unrolls(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Unrolls
         let within = 1.0 - at(&unrolls.first, LENGTH + 1, t);
         (previous, recurrent_state) = (previous * &within, recurrent_state * within);
         latents.push(previous.copy());
-        let acting = tch::no_grad(|| {
+        let acting = comic_networks::acting(|| {
             let (proprioception, task) = (at(&unrolls.proprioception, LENGTH + 1, t), at(&unrolls.task, LENGTH + 1, t));
             let routing = Routing::grouped(&TASKS, 2);
             let observation = learner.policy().normalise(&proprioception, &task, None, &routing);

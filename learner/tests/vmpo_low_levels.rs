@@ -78,7 +78,7 @@ fn acted(learner: &VmpoLearner, experiment: &Experiment, seed: u64) -> Acted {
         previous = (1.0 - &begins) * previous;
         recurrent_state = (1.0 - begins) * recurrent_state;
         previous_latents.push(previous.copy());
-        let acting = tch::no_grad(|| {
+        let acting = comic_networks::acting(|| {
             let observation = learner.policy().normalise(
                 &rows(&unrolls.proprioception, LENGTH + 1, t),
                 &rows(&unrolls.task, LENGTH + 1, t),

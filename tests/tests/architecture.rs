@@ -280,7 +280,7 @@ fn every_crate_keeps_the_workspaces_lints() -> Result<()> {
     Ok(())
 }
 
-/// Foreign functions and processor instructions need unsafe code. Only these files call them.
+/// Foreign functions, processor instructions and the memory of a tensor need unsafe code. Only these files use them.
 #[test]
 fn unsafe_code_is_in_these_files_only() -> Result<()> {
     const FILES: [&str; 11] = [
