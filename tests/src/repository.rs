@@ -77,15 +77,28 @@ pub fn direct_dependencies(package: &str) -> Result<BTreeSet<String>> {
 }
 
 fn tree(package: &str, more: &[&str]) -> Result<BTreeSet<String>> {
-    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let arguments =
-        ["tree", "--offline", "--edges", "normal", "--prefix", "none", "--format", "{p}", "--package", package];
-    let output = Command::new(cargo).args(arguments).args(more).current_dir(root()).output();
-    let output = output.context("cannot start cargo")?;
-    if !output.status.success() {
-        bail!("cargo tree --package {package}: {}", String::from_utf8_lossy(&output.stderr));
-    }
-    let text = String::from_utf8_lossy(&output.stdout);
+    let arguments = ["--edges", "normal", "--prefix", "none", "--format", "{p}", "--package", package];
+    let text = cargo_tree(&[&arguments, more].concat())?;
     let names = text.lines().filter_map(|line| line.split_whitespace().next()).map(str::to_owned);
     Ok(names.filter(|name| name != package).collect())
+}
+
+/// Every crate that a build of these packages compiles, with its version and features.
+///
+/// # Errors
+/// When cargo fails.
+pub fn compiled(packages: &[&str]) -> Result<BTreeSet<String>> {
+    let arguments = ["--edges", "normal,build", "--prefix", "none", "--format", "{p} {f}"];
+    let text = cargo_tree(&[&arguments, packages].concat())?;
+    Ok(text.lines().map(|line| line.trim_end_matches(" (*)").to_owned()).collect())
+}
+
+fn cargo_tree(arguments: &[&str]) -> Result<String> {
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let output = Command::new(cargo).args(["tree", "--offline"]).args(arguments).current_dir(root()).output();
+    let output = output.context("cannot start cargo")?;
+    if !output.status.success() {
+        bail!("cargo tree {}: {}", arguments.join(" "), String::from_utf8_lossy(&output.stderr));
+    }
+    Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }

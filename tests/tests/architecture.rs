@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use anyhow::{Result, ensure};
 use comic_tests::modules::circles;
-use comic_tests::repository::{Source, dependencies, direct_dependencies, folders, root, sources};
+use comic_tests::repository::{Source, compiled, dependencies, direct_dependencies, folders, root, sources};
 
 const MUJOCO: [&str; 2] = ["mujoco-rs", "mujoco-sys"];
 const LIBTORCH: [&str; 2] = ["tch", "torch-sys"];
@@ -72,6 +72,19 @@ fn xtask_and_setup_link_nothing_that_they_fetch() -> Result<()> {
 #[test]
 fn shipped_programs_contain_no_benchmarks() -> Result<()> {
     ["comic-actor", "comic-learner"].iter().try_for_each(|package| does_not_depend_on(package, &[&["comic-bench"]]))
+}
+
+/// Cargo chooses the features of a crate for all packages of one build. If they differed, `cargo build` after `cargo xtask train`
+/// would compile most crates again. The packages are those of `xtask/src/workspace.rs`.
+#[test]
+fn programs_are_built_from_the_same_crates_alone_as_with_the_workspace() -> Result<()> {
+    let everything = compiled(&["--workspace", "--exclude", "comic-python"])?;
+    for packages in [["comic-learner", "comic-actor"], ["comic-bench", "comic-learner"]] {
+        let arguments: Vec<&str> = packages.iter().flat_map(|package| ["--package", package]).collect();
+        let other: Vec<String> = compiled(&arguments)?.difference(&everything).cloned().collect();
+        ensure!(other.is_empty(), "{packages:?} alone: {other:?}");
+    }
+    Ok(())
 }
 
 /// A folder is one module to its siblings; a module and the modules inside it may need each other. With `--no-capture` this lists every circle in full.
@@ -283,7 +296,8 @@ fn every_crate_keeps_the_workspaces_lints() -> Result<()> {
 /// Foreign functions, processor instructions and the memory of a tensor need unsafe code. Only these files use them.
 #[test]
 fn unsafe_code_is_in_these_files_only() -> Result<()> {
-    const FILES: [&str; 11] = [
+    const FILES: [&str; 12] = [
+        "learner/src/adam/fused.rs",
         "learner/src/device/cuda.rs",
         "networks/src/export/onnx/graph.rs",
         "networks/src/linear.rs",

@@ -64,7 +64,7 @@ fn other_low_levels() -> impl Iterator<Item = &'static str> {
 /// Builds and measures.
 pub(crate) fn run(options: &Options) -> Result<()> {
     setup::run(&setup::Options::default())?;
-    workspace::build()?;
+    workspace::build(&workspace::BENCHMARKS)?;
     let arguments = &options.arguments;
     match options.side {
         Side::Actor => {
@@ -130,7 +130,7 @@ fn printing(figure: &str, arguments: &[String]) -> Result<()> {
 }
 
 /// The options that choose another network than the MLP on one task.
-const NETWORKS: [&str; 3] = ["--low-level", "--joint", "--svg0"];
+const NETWORKS: [&str; 4] = ["--low-level", "--joint", "--svg0", "--preset"];
 
 /// Whether the arguments choose another network than the MLP on one task.
 fn chooses_network(arguments: &[String]) -> bool {

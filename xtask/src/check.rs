@@ -114,7 +114,7 @@ fn test_xla(arguments: &[String]) -> Result<()> {
 /// The long tests of the Python package.
 fn test_python(arguments: &[String]) -> Result<()> {
     setup::run(&setup::Options::default())?;
-    workspace::build()?;
+    workspace::build(&workspace::PROGRAMS)?;
     python::install(&wheel::build()?, python::FULL)?;
     let mut pytest = python::tool("pytest", python::FULL)?;
     // Beside python/comic, which has no native module.

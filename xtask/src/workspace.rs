@@ -62,10 +62,15 @@ pub(crate) fn describe(command: &Command) -> String {
 /// maturin its linker would look for a libpython, which not every Python has.
 pub(crate) const CRATES: [&str; 3] = ["--workspace", "--exclude", "comic-python"];
 
-/// Builds every program in the release profile. Building a part of them would compile crates again, since cargo chooses
-/// the features of shared dependencies for all crates of one build.
-pub(crate) fn build() -> Result<()> {
-    run(cargo().args(["build", "--release", "--bins"]).args(CRATES))
+/// The packages of the programs that train and evaluate.
+pub(crate) const PROGRAMS: [&str; 2] = ["comic-learner", "comic-actor"];
+/// The packages of the benchmarks, which start `comic-learner` for its certificates.
+pub(crate) const BENCHMARKS: [&str; 2] = ["comic-bench", "comic-learner"];
+
+/// Builds the programs of these packages in the release profile, and nothing else.
+pub(crate) fn build(packages: &[&str]) -> Result<()> {
+    let packages = packages.iter().flat_map(|package| ["--package", package]);
+    run(cargo().args(["build", "--release", "--bins"]).args(packages))
 }
 
 /// Builds every program and every test at once. The tests' dependencies add features to shared crates, so a build of the
@@ -74,8 +79,9 @@ pub(crate) fn build_with_tests() -> Result<()> {
     run(cargo().args(["build", "--release", "--bins", "--tests"]).args(CRATES))
 }
 
-/// The path of a program of this workspace. All of them lie beside this one.
+/// The path of a program in the release profile. This program's profile is another one, beside it.
 pub(crate) fn program(name: &str) -> Result<PathBuf> {
     let own = std::env::current_exe().context("cannot find the path of this program")?;
-    Ok(own.with_file_name(format!("{name}{}", std::env::consts::EXE_SUFFIX)))
+    let target = own.ancestors().nth(2).with_context(|| format!("{} lies in no target directory", own.display()))?;
+    Ok(target.join("release").join(format!("{name}{}", std::env::consts::EXE_SUFFIX)))
 }

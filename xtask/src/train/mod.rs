@@ -86,7 +86,7 @@ pub(crate) fn run(options: Options) -> Result<()> {
 /// Sets up and builds.
 pub(crate) fn prepare() -> Result<()> {
     setup::run(&setup::Options::default())?;
-    workspace::build()
+    workspace::build(&workspace::PROGRAMS)
 }
 
 impl Job {
