@@ -4,7 +4,8 @@ use comic_experiment::Network;
 use tch::{Tensor, nn};
 
 use crate::gaussian::DiagonalGaussian;
-use crate::linear::{Linear, Matrix};
+use crate::linear::{Activation, Linear, Matrix, forward_through};
+use crate::packed::LAYER_NORM_EPSILON;
 
 /// Reshapes `[.., D]` to rows `[N, D]`. The trace of an exported policy must not contain their number.
 pub(crate) fn rows(tensor: &Tensor) -> Tensor {
@@ -49,25 +50,15 @@ impl Torso {
     }
 
     /// From `[N, input]` to `[N, output]`.
-    ///
-    /// The activations work in place. That is correct because the gradients of layer norm and linear layers do not need
-    /// their outputs. It saves a new 16 MB tensor per layer, which costs more than the arithmetic.
     pub(crate) fn forward(&self, input: &Tensor) -> Tensor {
-        let mut hidden = self.normalise(&input.apply(&self.layers[0])).tanh_();
-        for layer in &self.layers[1..] {
-            hidden = hidden.apply(layer).elu_();
-        }
-        hidden
+        forward_through(&self.layers(), input)
     }
 
-    fn normalise(&self, hidden: &Tensor) -> Tensor {
-        let [weight, bias] = &self.norm;
-        hidden.layer_norm(weight.size(), Some(weight), Some(bias), LAYER_NORM_EPSILON, true)
+    fn layers(&self) -> Vec<(&Linear, Activation<'_>)> {
+        let activation = |index| if index == 0 { Activation::NormTanh(&self.norm) } else { Activation::Elu };
+        self.layers.iter().enumerate().map(|(index, layer)| (layer, activation(index))).collect()
     }
 }
-
-/// The default of PyTorch.
-const LAYER_NORM_EPSILON: f64 = 1e-5;
 
 /// Hidden layers and a linear output, with an optional linear path from input to output.
 #[derive(Debug)]
@@ -90,7 +81,9 @@ impl Mlp {
 
     /// From `[N, input]` to `[N, output]`.
     pub(crate) fn forward(&self, input: &Tensor) -> Tensor {
-        let output = self.torso.forward(input).apply(&self.head);
+        let mut layers = self.torso.layers();
+        layers.push((&self.head, Activation::Linear));
+        let output = forward_through(&layers, input);
         match &self.linear_path {
             Some(path) => path.add_product(&output, input),
             None => output,
@@ -174,6 +167,26 @@ pub(crate) fn gaussian(output: &Tensor, min_std: f64) -> DiagonalGaussian {
     let size = output.size()[1] / 2;
     let std = output.narrow(1, size, size).softplus() + min_std;
     DiagonalGaussian { mean: output.narrow(1, 0, size), std }
+}
+
+/// Hidden layers, and a linear layer whose output is a Gaussian.
+#[derive(Debug)]
+pub(crate) struct GaussianMlp {
+    mlp: Mlp,
+    min_std: f64,
+}
+
+impl GaussianMlp {
+    pub(crate) fn new(path: &nn::Path, input: i64, sizes: &[usize], config: &GaussianHeadConfig) -> Self {
+        let torso = Torso::new(path, input, sizes);
+        let head = config.linear(&(path / "head"), torso.output());
+        Self { mlp: Mlp::new(torso, head, None), min_std: config.min_std }
+    }
+
+    /// From `[N, input]` to Gaussians `[N, D]`.
+    pub(crate) fn forward(&self, input: &Tensor) -> DiagonalGaussian {
+        gaussian(&self.mlp.forward(input), self.min_std)
+    }
 }
 
 /// A linear layer whose output is a Gaussian.

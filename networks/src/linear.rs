@@ -2,12 +2,12 @@
 
 #![allow(unsafe_code, reason = "tch gives the memory of a tensor as a pointer only")]
 
-use std::cell::{Cell, RefCell};
+use std::cell::{Cell, Ref, RefCell};
 use std::ops::RangeInclusive;
 
 use tch::{Device, Kind, Tensor, nn};
 
-use crate::packed::Packed;
+use crate::packed::{self, LAYER_NORM_EPSILON, Layer, Packed, add_layers};
 
 /// The numbers of rows for which [`Packed`] is used. For a single row it would compute 16, where libtorch takes as long as the
 /// memory; for many rows libtorch's products are nearly as fast, and use all threads.
@@ -17,8 +17,8 @@ thread_local! {
     static ACTING: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Runs `act` without gradients, and on a CPU with matrix products for few rows, whose weights are packed once for each version
-/// of the parameters. The results differ from libtorch's in the last bits. No gradient of a parameter can be had in here.
+/// Runs `act` without gradients, and on a CPU with layers for few rows, whose weights are packed once for each version of the
+/// parameters. The results differ from libtorch's by rounding. No gradient of a parameter can be had in here.
 ///
 /// A policy that is traced must not act in here: a trace has libtorch's operations only.
 pub fn acting<T>(act: impl FnOnce() -> T) -> T {
@@ -36,13 +36,13 @@ pub fn acting<T>(act: impl FnOnce() -> T) -> T {
 #[derive(Debug)]
 pub(crate) struct Matrix {
     weights: Tensor,
-    /// The weights for acting, and the version of the parameters that they are of.
-    packed: RefCell<Option<(i64, Packed)>>,
+    /// The version of the parameters that is packed, and its weights for acting.
+    packed: RefCell<(Option<i64>, Packed)>,
 }
 
 impl Matrix {
     pub(crate) fn new(weights: Tensor) -> Self {
-        Self { weights, packed: RefCell::new(None) }
+        Self { weights, packed: RefCell::default() }
     }
 
     /// `[outputs, inputs]`.
@@ -53,30 +53,37 @@ impl Matrix {
     /// `start` + `input` · weightsᵀ, `[N, outputs]`, for `input` `[N, inputs]`. `start` is `[N, outputs]`, or a bias
     /// `[outputs]`.
     pub(crate) fn add_product(&self, start: &Tensor, input: &Tensor) -> Tensor {
-        if !self.acts_on(input) {
+        if !acts_on(input, self) {
             return start.addmm(input, &self.weights.tr());
         }
-        // libtorch counts how often a tensor was changed in place. It does not count `set_data`, which nothing here uses.
-        let version = self.weights.internal_version();
-        let mut packed = self.packed.borrow_mut();
-        let packed = match packed.take() {
-            Some((of, kept)) if of == version => packed.insert((version, kept)),
-            _ => packed
-                .insert((version, Packed::new(memory(&self.weights.contiguous()), self.weights.size()[1] as usize))),
-        };
         let mut sums = Tensor::empty([input.size()[0], self.weights.size()[0]], (Kind::Float, Device::Cpu));
         sums.copy_(start);
-        packed.1.add_product(memory(&input.contiguous()), memory_mut(&mut sums));
+        let layer = Layer { weights: &self.packed(), bias: &[], activation: packed::Function::Linear };
+        add_layers(&[layer], memory(&input.contiguous()), memory_mut(&mut sums));
         sums
     }
 
-    fn acts_on(&self, input: &Tensor) -> bool {
-        ACTING.get()
-            && !input.requires_grad()
-            && (input.device(), input.kind(), self.weights.kind()) == (Device::Cpu, Kind::Float, Kind::Float)
-            && input.dim() == 2
-            && FEW_ROWS.contains(&input.size()[0])
+    /// The weights for acting, of the parameters as they are now.
+    fn packed(&self) -> Ref<'_, Packed> {
+        // libtorch counts how often a tensor was changed in place. It does not count `set_data`, which nothing here uses.
+        let version = self.weights.internal_version();
+        if self.packed.borrow().0 != Some(version) {
+            let packed = Packed::new(memory(&self.weights.contiguous()), self.weights.size()[1] as usize);
+            *self.packed.borrow_mut() = (Some(version), packed);
+        }
+        Ref::map(self.packed.borrow(), |(_, packed)| packed)
     }
+}
+
+/// Whether [`Packed`] weights are used for these rows, `[N, inputs]`.
+fn acts_on(input: &Tensor, matrix: &Matrix) -> bool {
+    ACTING.get()
+        && !input.requires_grad()
+        && (input.device(), input.kind(), matrix.weights.kind()) == (Device::Cpu, Kind::Float, Kind::Float)
+        && input.dim() == 2
+        && input.size()[1] == matrix.weights.size()[1]
+        && matrix.weights.numel() > 0
+        && FEW_ROWS.contains(&input.size()[0])
 }
 
 /// The numbers of a contiguous float32 tensor on the CPU.
@@ -138,6 +145,62 @@ impl nn::Module for Linear {
         size.extend(self.bias.size());
         output.view(&size[..])
     }
+}
+
+/// What follows a linear layer.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Activation<'a> {
+    /// Nothing.
+    Linear,
+    /// tanh of the layer norm with these parameters: scale and shift, `[outputs]` each.
+    NormTanh(&'a [Tensor; 2]),
+    /// ELU.
+    Elu,
+}
+
+impl Activation<'_> {
+    /// The activations work in place. That is correct because the gradients of layer norm and linear layers do not need
+    /// their outputs. It saves a new 16 MB tensor per layer, which costs more than the arithmetic.
+    fn apply(self, mut output: Tensor) -> Tensor {
+        match self {
+            Self::Linear => output,
+            Self::NormTanh([scale, shift]) => {
+                output.layer_norm(scale.size(), Some(scale), Some(shift), LAYER_NORM_EPSILON, true).tanh_()
+            }
+            Self::Elu => output.elu_(),
+        }
+    }
+
+    fn packed(&self) -> packed::Function<'_> {
+        match self {
+            Self::Linear => packed::Function::Linear,
+            Self::NormTanh([scale, shift]) => packed::Function::NormTanh { scale: memory(scale), shift: memory(shift) },
+            Self::Elu => packed::Function::Elu,
+        }
+    }
+}
+
+/// Linear layers with their activations, one after another: from `[N, inputs]` to `[N, outputs]`.
+pub(crate) fn forward_through(layers: &[(&Linear, Activation<'_>)], input: &Tensor) -> Tensor {
+    if !layers.iter().all(|(layer, _)| acts_on(input, &layer.matrix)) {
+        let forward =
+            |hidden: Tensor, (layer, activation): &(&Linear, Activation<'_>)| activation.apply(hidden.apply(*layer));
+        return layers.iter().fold(input.shallow_clone(), forward);
+    }
+    let weights: Vec<_> = layers.iter().map(|(layer, _)| layer.matrix.packed()).collect();
+    let packed: Vec<_> = layers
+        .iter()
+        .zip(&weights)
+        .map(|((layer, activation), weights)| Layer {
+            weights,
+            bias: memory(&layer.bias),
+            activation: activation.packed(),
+        })
+        .collect();
+    let outputs = layers.last().map_or(0, |(layer, _)| layer.bias.size()[0]);
+    let mut output = Tensor::zeros([input.size()[0], outputs], (Kind::Float, Device::Cpu));
+    add_layers(&packed, memory(&input.contiguous()), memory_mut(&mut output));
+    output
 }
 
 #[cfg(test)]

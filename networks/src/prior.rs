@@ -4,7 +4,7 @@ use comic_experiment::Network;
 use tch::{Tensor, nn};
 
 use crate::gaussian::DiagonalGaussian;
-use crate::layers::{GaussianHead, GaussianHeadConfig, Torso};
+use crate::layers::{GaussianHeadConfig, GaussianMlp};
 
 /// Least standard deviation of an entry of the latent (D).
 const MIN_STD: f64 = 1e-2;
@@ -12,24 +12,19 @@ const MIN_STD: f64 = 1e-2;
 /// p(z | s), learned with an encoder or fitted to its latents: normalised proprioception → torso → mean and σ of the latent. It
 /// begins near N(0, I).
 #[derive(Debug)]
-pub struct StatePrior {
-    torso: Torso,
-    head: GaussianHead,
-}
+pub struct StatePrior(GaussianMlp);
 
 impl StatePrior {
     /// A prior for the latents of `network`, with its parameters in `path`. `proprioception` is P; `hidden` has at least one
     /// layer.
     pub fn new(path: &nn::Path, proprioception: usize, network: &Network, hidden: &[usize]) -> Self {
-        let torso = Torso::new(path, proprioception as i64, hidden);
         let mean = vec![0.0; network.latent.size];
         let start = GaussianHeadConfig { mean: &mean, initial_std: 1.0, min_std: MIN_STD, scale: 0.1 };
-        let head = GaussianHead::new(path, torso.output(), &start);
-        Self { torso, head }
+        Self(GaussianMlp::new(path, proprioception as i64, hidden, &start))
     }
 
     /// The distribution of latents for normalised proprioception `[N, P]`.
     pub fn forward(&self, proprioception: &Tensor) -> DiagonalGaussian {
-        self.head.forward(&self.torso.forward(proprioception))
+        self.0.forward(proprioception)
     }
 }

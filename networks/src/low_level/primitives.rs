@@ -5,7 +5,7 @@ use tch::{Tensor, nn};
 use super::interface::{Config, Input};
 use super::size::{Layer, Sizes};
 use crate::gaussian::DiagonalGaussian;
-use crate::layers::{Torso, inverse_softplus};
+use crate::layers::{Mlp, Torso, inverse_softplus};
 use crate::linear::Linear;
 
 /// Largest fixed bias of a primitive's mean (S).
@@ -95,7 +95,7 @@ fn evenly(count: usize) -> Vec<f32> {
 /// With a bottleneck: `[z, s]` → MLP (S: 2×400) → K. Without one, the encoder's output is these K numbers.
 #[derive(Debug)]
 pub(crate) struct Gate {
-    bottleneck: Option<(Torso, Linear)>,
+    bottleneck: Option<Mlp>,
 }
 
 impl Gate {
@@ -105,7 +105,7 @@ impl Gate {
             let path = path / "gate";
             let torso = Torso::new(&path, config.latent + config.proprioception, &sizes.gate);
             let head = Linear::new(&(&path / "head"), torso.output(), sizes.count as i64, 1.0);
-            (torso, head)
+            Mlp::new(torso, head, None)
         });
         Self { bottleneck }
     }
@@ -113,10 +113,7 @@ impl Gate {
     /// K numbers per row, `[N, K]`.
     pub(crate) fn forward(&self, input: &Input<'_>) -> Tensor {
         match &self.bottleneck {
-            Some((torso, head)) => {
-                let joined = Tensor::cat(&[input.intent, input.proprioception], 1);
-                torso.forward(&joined).apply(head)
-            }
+            Some(mlp) => mlp.forward(&Tensor::cat(&[input.intent, input.proprioception], 1)),
             None => input.intent.shallow_clone(),
         }
     }
