@@ -1,4 +1,4 @@
-//! The run path, as for every crate, and the C++ files for devices: CUDA where libtorch has it, XLA with `--features xla`.
+//! The run path, as for every crate, and the C++ files: for Adam, for CUDA where libtorch has it, and for XLA with `--features xla`.
 //! XLA also needs the directories of Python and of its packages.
 
 #[path = "../setup/cpp.rs"]
@@ -11,9 +11,18 @@ use std::path::PathBuf;
 
 fn main() {
     rpath::write_run_path();
+    adam();
     cuda();
     #[cfg(feature = "xla")]
     xla();
+}
+
+/// Compiles the C++ that calls libtorch's fused Adam.
+fn adam() {
+    let Some(libtorch) = std::env::var_os("LIBTORCH").map(PathBuf::from) else {
+        panic!("LIBTORCH is not set: `cargo xtask setup` fetches libtorch");
+    };
+    cpp::with_libtorch(&libtorch, "src/adam/fused.cpp").compile("comic_adam");
 }
 
 /// Links CUDA where libtorch has it, and compiles the C++ that copies to a card.

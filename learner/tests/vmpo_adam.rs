@@ -37,7 +37,7 @@ proptest! {
         let group = adam.add_group("all", vec![("x".into(), learnt.shallow_clone())], learning_rate);
         let (mut x, mut m, mut v) = (f64::from(start), 0.0, 0.0);
         for (index, gradient) in gradients.iter().enumerate() {
-            adam.step(group, &[Tensor::from_slice(&[*gradient])], &counts(true));
+            adam.step(group, &[Tensor::from_slice(&[*gradient])], &counts(true)).unwrap();
             let gradient = f64::from(*gradient);
             m = config.beta1 * m + (1.0 - config.beta1) * gradient;
             v = config.beta2 * v + (1.0 - config.beta2) * gradient * gradient;
@@ -69,7 +69,7 @@ fn each_group_has_its_own_learning_rate() {
     let slow_group = adam.add_group("slow", vec![("a".into(), slow.shallow_clone())], 1e-3);
     let fast_group = adam.add_group("fast", vec![("b".into(), fast.shallow_clone())], 1e-1);
     for group in [slow_group, fast_group] {
-        adam.step(group, &[Tensor::from_slice(&[1f32])], &counts(true));
+        adam.step(group, &[Tensor::from_slice(&[1f32])], &counts(true)).unwrap();
     }
     assert!((values(&slow)[0] + 1e-3).abs() < 1e-6 && (values(&fast)[0] + 1e-1).abs() < 1e-5);
     adam.set_learning_rate(slow_group, 0.5);
@@ -87,12 +87,12 @@ fn a_restored_adam_continues_bit_for_bit() {
     let gradient = |step: i64| Tensor::arange(5, (Kind::Float, Device::Cpu)) * 0.3 - step as f64 * 0.2;
     let start = Tensor::zeros([5], (Kind::Float, Device::Cpu));
     let (mut adam, learnt) = make(&start);
-    (0..4).for_each(|step| adam.step(0, &[gradient(step)], &counts(true)));
+    (0..4).for_each(|step| adam.step(0, &[gradient(step)], &counts(true)).unwrap());
     let (mut restored, restored_parameter) = make(&learnt);
     restored.load_state(&adam.state()).unwrap();
     (4..8).for_each(|step| {
-        adam.step(0, &[gradient(step)], &counts(true));
-        restored.step(0, &[gradient(step)], &counts(true));
+        adam.step(0, &[gradient(step)], &counts(true)).unwrap();
+        restored.step(0, &[gradient(step)], &counts(true)).unwrap();
     });
     assert_eq!(values(&learnt), values(&restored_parameter));
 }
@@ -119,7 +119,7 @@ impl OnTheHost {
 }
 
 #[test]
-fn a_step_that_counts_equals_the_same_step_computed_on_the_host() {
+fn a_step_that_counts_equals_the_same_step_composed_of_operations() {
     let start = Tensor::linspace(-1.0, 1.0, 37, (Kind::Float, Device::Cpu));
     let mut adam = Adam::new(&Optimiser::default());
     let learnt = start.copy().set_requires_grad(true);
@@ -128,9 +128,10 @@ fn a_step_that_counts_equals_the_same_step_computed_on_the_host() {
     let mut expected = OnTheHost { parameter: start.copy(), first: zeros(), second: zeros(), steps: 0 };
     for step in 0..500 {
         let gradient = (&start * f64::from(step)).sin() * f64::from(10f32.powi(step % 9 - 6));
-        adam.step(group, &[gradient.copy()], &counts(true));
+        adam.step(group, &[gradient.copy()], &counts(true)).unwrap();
         expected.step(&gradient, 3e-3);
-        assert_eq!(bits(&learnt), bits(&expected.parameter), "step {step}");
+        let difference = (&learnt.detach() - &expected.parameter).abs().max().double_value(&[]);
+        assert!(difference < 1e-6, "step {step}: {difference}");
     }
 }
 
@@ -144,9 +145,9 @@ fn a_step_that_does_not_count_changes_not_one_bit() {
         let state =
             |adam: &Adam| adam.state().iter().map(|(_, tensor)| bits(&tensor.to_kind(Kind::Float))).collect::<Vec<_>>();
         let (parameter_before, state_before) = (bits(&learnt), state(&adam));
-        adam.step(group, &[poison.copy()], &counts(false));
+        adam.step(group, &[poison.copy()], &counts(false)).unwrap();
         assert_eq!((bits(&learnt), state(&adam)), (parameter_before, state_before), "before step {step}");
         // A moment that is −0 at the end.
-        adam.step(group, &[Tensor::from_slice(&[1.0, -1e-30, -1e-45, step as f32])], &counts(true));
+        adam.step(group, &[Tensor::from_slice(&[1.0, -1e-30, -1e-45, step as f32])], &counts(true)).unwrap();
     }
 }

@@ -3,6 +3,7 @@
 use tch::Tensor;
 
 use crate::adam::{self, Adam};
+use crate::algorithm::error::Error;
 
 /// The gradients of one group of Adam's parameters.
 pub(crate) struct Gradients {
@@ -41,12 +42,15 @@ impl Gradients {
 
 /// Steps every group, or none of them if `total` or a gradient is not finite. Returns whether the step was taken, a boolean
 /// scalar on the device.
-pub(crate) fn descend(adam: &mut Adam, total: &Tensor, groups: &[Gradients]) -> Tensor {
+///
+/// # Errors
+/// When libtorch refuses.
+pub(crate) fn descend(adam: &mut Adam, total: &Tensor, groups: &[Gradients]) -> Result<Tensor, Error> {
     // Of the squares, because Adam keeps squares: if their sum is finite, each of them is.
     let sum = groups.iter().fold(total.detach(), |sum, gradients| sum + gradients.norm.square());
     let finite = sum.isfinite().all();
     for Gradients { group, gradients, .. } in groups {
-        adam.step(*group, gradients, &finite);
+        adam.step(*group, gradients, &finite)?;
     }
-    finite
+    Ok(finite)
 }

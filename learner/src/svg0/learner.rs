@@ -84,7 +84,7 @@ impl Algorithm for Svg0Learner {
         let norms = [critic.norm(), policy.norm()];
         let limit = optimiser.max_gradient_norm;
         let period = svg0.target_period as i64;
-        let finite = descend(&mut self.adam, &total, &[critic.clipped(limit), policy.clipped(limit)]);
+        let finite = descend(&mut self.adam, &total, &[critic.clipped(limit), policy.clipped(limit)])?;
         self.steps += 1;
         // On the device, so that nothing waits for it: the steps that were taken decide.
         let due = self.adam.steps(self.critic).remainder(period).eq(0).logical_and(&finite);

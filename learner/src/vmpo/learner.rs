@@ -188,14 +188,14 @@ impl VmpoLearner {
     }
 
     /// Clips the networks' gradients if the experiment says so, and steps networks and multipliers if every number is finite.
-    fn descend(&mut self, total: &Tensor, networks: Vec<Tensor>, multipliers: Vec<Tensor>) -> Descent {
+    fn descend(&mut self, total: &Tensor, networks: Vec<Tensor>, multipliers: Vec<Tensor>) -> Result<Descent, Error> {
         let networks = Gradients::new(&self.adam, self.networks_group, networks);
         let norm = networks.norm();
         let networks = networks.clipped(self.experiment.optimiser.max_gradient_norm);
         let multipliers = Gradients::new(&self.adam, self.multipliers_group, multipliers);
-        let finite = descend(&mut self.adam, total, &[networks, multipliers]);
+        let finite = descend(&mut self.adam, total, &[networks, multipliers])?;
         self.multipliers.project();
-        Descent { norm, finite }
+        Ok(Descent { norm, finite })
     }
 }
 
@@ -239,7 +239,7 @@ impl Algorithm for VmpoLearner {
         let inputs: Vec<&Tensor> = networks.iter().chain([self.multipliers.parameter()]).collect();
         let mut gradients = Tensor::f_run_backward(&[&total], &inputs, false, false)?;
         let multipliers = gradients.split_off(networks.len());
-        let descent = self.descend(&total, gradients, multipliers);
+        let descent = self.descend(&total, gradients, multipliers)?;
         Ok(report(&pass, &descent, &total, &improvement, &self.multipliers))
     }
 
