@@ -54,7 +54,7 @@ fn close(left: &[f32], right: &[f32]) -> bool {
 }
 
 fn unroll() -> impl Strategy<Value = Unroll> {
-    (2usize..20).prop_flat_map(|steps| {
+    (2usize..40).prop_flat_map(|steps| {
         let numbers = |count| prop::collection::vec(-2f32..2.0, count);
         let flags = |chance| prop::collection::vec(prop::bool::weighted(chance).prop_map(f32::from), steps);
         (numbers(steps), flags(0.8), flags(0.8), numbers(steps + 1))

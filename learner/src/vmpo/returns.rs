@@ -9,6 +9,9 @@ use tch::Tensor;
 /// episode's last observation. A truncated episode is bootstrapped there; a terminated one has d = 0 before it. So no
 /// reward of one episode enters the target of another.
 ///
+/// Every row is G_t = a_t + b_t G_{t+1}, and two such rows in succession are again one, over two steps: after ⌈log₂(T + 1)⌉
+/// doublings each row reaches row T. For 32 rows that is a fifth of the operations of a loop over them.
+///
 /// - `reward`: `[B, T, R]`.
 /// - `discount`: `[B, T]`, 0 where the episode terminated.
 /// - `valid`: `[B, T]`, 1 where the row is a transition.
@@ -22,15 +25,20 @@ pub fn returns(reward: &Tensor, discount: &Tensor, valid: &Tensor, values: &Tens
         if lambda < 1.0 {
             base = &discount * values.narrow(1, 1, steps) * (1.0 - lambda) + base;
         }
-        let passed_on = discount * lambda;
-        let mut target = values.select(1, steps);
-        let mut targets = Vec::with_capacity(steps as usize);
-        for t in (0..steps).rev() {
-            let continued = base.select(1, t) + passed_on.select(1, t) * target;
-            target = continued.where_self(&transition.select(1, t), &values.select(1, t));
-            targets.push(target.shallow_clone());
+        // a and b. No row follows row T.
+        let base = base.where_self(&transition, &values.narrow(1, 0, steps));
+        let mut sum = Tensor::cat(&[base, values.narrow(1, steps, 1)], 1);
+        let mut weight = (discount * lambda).where_scalarother(&transition, 0.0).constant_pad_nd([0, 0, 0, 1]);
+        let mut span = 1;
+        while span <= steps {
+            let rows = steps + 1 - span;
+            let [(first, rest), (weights, _)] =
+                [&sum, &weight].map(|all| (all.narrow(1, 0, rows), all.narrow(1, rows, span)));
+            let reached = first.addcmul(&weights, &sum.narrow(1, span, rows));
+            let weights = weights * weight.narrow(1, span, rows);
+            (sum, weight) = (Tensor::cat(&[reached, rest], 1), weights.constant_pad_nd([0, 0, 0, span]));
+            span *= 2;
         }
-        targets.reverse();
-        Tensor::stack(&targets, 1)
+        sum.narrow(1, 0, steps)
     })
 }
