@@ -12,8 +12,8 @@ const POLICY: &str = "OMP_WAIT_POLICY";
 /// What the libraries of this program read when they are loaded, unless the user has set it. docs/benchmarks.md has the figures.
 const ENVIRONMENT: [(&str, &str); 4] = [
     // How often a thread looks whether the others have finished before it sleeps. libgomp's default of 300,000 is milliseconds,
-    // in which a neighbour of equal priority could have computed.
-    (SPINS, "30000"),
+    // in which another program could have computed, for instance an actor.
+    (SPINS, "3000"),
     // glibc gives tensors of megabytes back to the system when they are freed, and the system clears every page of the next
     // tensor: a tenth of an update. Let it keep them: tensors of up to 32 MiB, the most that every glibc takes, and 64 GiB in all.
     ("MALLOC_MMAP_THRESHOLD_", "33554432"),
