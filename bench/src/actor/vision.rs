@@ -25,7 +25,7 @@ pub(super) fn vision(subject: &Subject) -> Result<Figure> {
     // The settings do not take turns: a thread keeps one context, and making another costs more than many images.
     let mut full = environments(subject, Vision::Full)?;
     let medians = interleave(subject.budget.div_f64(2.0), || Ok::<_, anyhow::Error>((draw(&mut full, FULL)?, 0.0)))?;
-    let note = "a 64 x 64 image without shadows and multisampling; floor: with dm_control's settings";
+    let note = "a 64 x 64 image without shadows and multisampling, with fewer faces; floor: with dm_control's settings";
     Ok(Figure::new("actor.vision", "ms", Medians { value, floor: medians.value }, note))
 }
 

@@ -55,9 +55,9 @@ impl GradientOfSpeed {
 pub enum Vision {
     /// No images.
     Off,
-    /// Without shadows and without multisampling (D).
+    /// Without shadows and without multisampling, and round bodies have fewer faces (D).
     Fast,
-    /// As dm_control draws them: a 4096² shadow map, four samples a pixel (C). In software this takes about twenty times
-    /// as long.
+    /// As dm_control draws them: a 4096² shadow map, four samples a pixel (C). In software this takes more than
+    /// twenty times as long.
     Full,
 }
