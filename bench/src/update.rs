@@ -53,6 +53,9 @@ pub struct Update {
     /// SVG(0) instead of V-MPO
     #[arg(long, conflicts_with_all = ["low_level", "joint"])]
     svg0: bool,
+    /// A preset's own networks and minibatch. Its name is added to the figure's
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["low_level", "joint", "svg0"])]
+    preset: Option<String>,
     /// Measure it also beside so many busy processes of equal priority
     #[arg(long, value_name = "N")]
     beside: Option<usize>,
@@ -123,6 +126,9 @@ impl Update {
 
     /// The experiment that is measured, and the figure's name.
     fn subject(&self) -> Result<(Experiment, String)> {
+        if let Some(preset) = &self.preset {
+            return Ok((comic_experiment::resolve(preset, &[])?, format!("learner.update.{preset}")));
+        }
         if self.svg0 {
             return Ok((transfer::experiment(TaskName::GoToTarget), "learner.svg0".into()));
         }

@@ -8,7 +8,7 @@ use super::floor::{Floor, Gradients};
 
 /// Unrolls of a gradient step.
 pub(super) fn unrolls(experiment: &Experiment) -> usize {
-    experiment.unroll.batch
+    experiment.vmpo.minibatch_unrolls
 }
 
 /// Policy and value networks.
