@@ -7,39 +7,32 @@ mod cpp;
 #[path = "../setup/rpath.rs"]
 mod rpath;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 fn main() {
     rpath::write_run_path();
-    adam();
-    cuda();
-    #[cfg(feature = "xla")]
-    xla();
-}
-
-/// Compiles the C++ that calls libtorch's fused Adam.
-fn adam() {
     let Some(libtorch) = std::env::var_os("LIBTORCH").map(PathBuf::from) else {
         panic!("LIBTORCH is not set: `cargo xtask setup` fetches libtorch");
     };
     cpp::with_libtorch(&libtorch, "src/adam/fused.cpp").compile("comic_adam");
+    cuda(&libtorch);
+    #[cfg(feature = "xla")]
+    xla(&libtorch);
 }
 
 /// Links CUDA where libtorch has it, and compiles the C++ that copies to a card.
-fn cuda() {
+fn cuda(libtorch: &Path) {
     println!("cargo:rustc-check-cfg=cfg(cuda)");
-    let Some(libtorch) = std::env::var_os("LIBTORCH").map(PathBuf::from) else { return };
     if rpath::link_cuda() {
         println!("cargo:rustc-cfg=cuda");
-        cpp::with_libtorch(&libtorch, "src/device/cuda.cpp").compile("comic_cuda");
+        cpp::with_libtorch(libtorch, "src/device/cuda.cpp").compile("comic_cuda");
     }
 }
 
 #[cfg(feature = "xla")]
-fn xla() {
-    let libtorch = PathBuf::from(std::env::var_os("LIBTORCH").expect("LIBTORCH is not set: `cargo xtask setup --xla`"));
+fn xla(libtorch: &Path) {
     // The object file registers itself and no symbol refers to it, so all of it is linked.
-    cpp::with_libtorch(&libtorch, "src/device/xla.cpp").cargo_metadata(false).compile("comic_xla");
+    cpp::with_libtorch(libtorch, "src/device/xla.cpp").cargo_metadata(false).compile("comic_xla");
     println!("cargo:rustc-link-search=native={}", std::env::var("OUT_DIR").expect("cargo sets OUT_DIR"));
     println!("cargo:rustc-link-lib=static:+whole-archive,-bundle=comic_xla");
     println!("cargo:rustc-link-lib=stdc++");
