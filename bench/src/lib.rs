@@ -5,6 +5,7 @@
 //! - [`update`] measures the gradient step against its matrix products.
 //! - [`replay`] measures the replay's table against bare copies.
 //! - [`service`] measures the learner's service under thousands of simulated actors.
+//! - [`simulate`] predicts sizes that cannot be measured here.
 //! - `median` is the one statistic that all of them print, and `figure` the line of most; `busy` are neighbours that compute;
 //!   `transfer` is the experiment of off-policy learning that is measured.
 //!
@@ -21,6 +22,7 @@ mod figure;
 mod median;
 pub mod replay;
 pub mod service;
+pub mod simulate;
 mod transfer;
 pub mod update;
 

@@ -3,6 +3,7 @@
 use clap::{Parser, Subcommand};
 use comic_bench::replay::Replay;
 use comic_bench::service::{Crowd, Host, Ingest, Publish, Stalled, Swarm};
+use comic_bench::simulate::Simulate;
 use comic_bench::update::Update;
 
 /// The allocator of `comic-learner`.
@@ -25,6 +26,7 @@ enum Measurement {
     Publish(Publish),
     Stalled(Stalled),
     Swarm(Swarm),
+    Simulate(Box<Simulate>),
     #[command(hide = true)]
     Host(Host),
     #[command(hide = true)]
@@ -46,6 +48,7 @@ fn main() -> anyhow::Result<()> {
         Measurement::Publish(publish) => publish.run(),
         Measurement::Stalled(stalled) => stalled.run(),
         Measurement::Swarm(swarm) => swarm.run(),
+        Measurement::Simulate(simulate) => simulate.run(),
         Measurement::Host(host) => host.run(),
         Measurement::Crowd(crowd) => crowd.run(),
     }
