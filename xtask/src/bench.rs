@@ -1,5 +1,7 @@
 //! `cargo xtask bench`: the figures of docs/benchmarks.md, one JSON line each.
 
+mod preemption;
+
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, Result, bail};
@@ -15,7 +17,7 @@ pub(crate) struct Options {
     /// libtorch's threads in the learner's update and in PyTorch's
     #[arg(long, default_value_t = 2)]
     threads: u16,
-    /// Arguments for comic-bench-actor or comic-bench-learner
+    /// Arguments for comic-bench-actor, comic-bench-learner or the run that is preempted; `-- --help` lists them
     #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
     arguments: Vec<String>,
 }
@@ -26,6 +28,8 @@ enum Side {
     Actor,
     /// The update, against its matrix products and against PyTorch
     Learner,
+    /// The update of several learners together, against the same without exchange
+    Ranks,
     /// The replay's table, against bare copies
     Replay,
     /// Images of the humanoid's camera
@@ -38,6 +42,8 @@ enum Side {
     Swarm,
     /// Environments stepped from Python, and dm_control's own loop, against `actor.env`
     Python,
+    /// A run whose processes are killed and replaced for 20 minutes: its accounting, and its curve
+    Preemption,
 }
 
 /// One figure; ratio = value / floor.
@@ -63,8 +69,11 @@ fn other_low_levels() -> impl Iterator<Item = &'static str> {
 
 /// Builds and measures.
 pub(crate) fn run(options: &Options) -> Result<()> {
-    setup::run(&setup::Options::default())?;
-    workspace::build(&workspace::BENCHMARKS)?;
+    // A run that is preempted needs the shipped programs, and builds them.
+    if options.side != Side::Preemption {
+        setup::run(&setup::Options::default())?;
+        workspace::build(&workspace::BENCHMARKS)?;
+    }
     let arguments = &options.arguments;
     match options.side {
         Side::Actor => {
@@ -82,11 +91,13 @@ pub(crate) fn run(options: &Options) -> Result<()> {
             let mut networks = others.chain(["--joint", "--svg0"].map(|option| vec![option.to_owned()]));
             networks.try_for_each(|network| learner(options.threads, &[network, arguments.clone()].concat()))
         }
+        Side::Ranks => printing("ranks", arguments),
         Side::Replay => printing("replay", arguments),
         Side::Ingest => printing("ingest", arguments),
         Side::Publish => printing("publish", arguments),
         Side::Swarm => printing("swarm", arguments),
         Side::Python => python_environments(arguments),
+        Side::Preemption => preemption::run(arguments),
     }
 }
 

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use serde::Deserialize;
+use comic_experiment::Budget;
+use serde::{Deserialize, Serialize};
 
 /// The members of a line that curves and displays need. A mean over no episodes is absent.
 #[derive(Clone, Debug, Default, Deserialize)]
@@ -38,6 +39,15 @@ pub(crate) struct Line {
 }
 
 impl Line {
+    /// The used fraction of the budget, 0 to 1, by the limit that is nearest.
+    pub(crate) fn used(&self, budget: &Budget) -> f64 {
+        let of = |used: f64, limit: f64| if limit > 0.0 { used / limit } else { 0.0 };
+        of(self.seconds, budget.minutes * 60.0)
+            .max(of(self.environment_steps as f64, budget.environment_steps as f64))
+            .max(of(self.updates as f64, budget.updates as f64))
+            .clamp(0.0, 1.0)
+    }
+
     /// KL divergence of the latent from its prior in the newest update, nats per step.
     pub(crate) fn latent_kl(&self) -> Option<f64> {
         self.losses.get("latent_kl")?.as_f64()
@@ -56,13 +66,21 @@ pub(crate) fn read(path: &Path) -> Result<Vec<Line>> {
 }
 
 /// produced = trained + dropped + in flight.
-#[derive(Clone, Debug, Default, Deserialize)]
+#[derive(Clone, Debug, Default, Deserialize, Serialize)]
 #[serde(default)]
 pub(crate) struct Accounting {
     pub(crate) produced: u64,
     pub(crate) trained: u64,
     pub(crate) dropped: BTreeMap<String, u64>,
     pub(crate) in_flight: u64,
+}
+
+impl Accounting {
+    /// Whether the sum holds.
+    pub(crate) fn balances(&self) -> bool {
+        let parts = self.dropped.values().chain([&self.trained, &self.in_flight]);
+        parts.copied().try_fold(0, u64::checked_add) == Some(self.produced)
+    }
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 
 mod bootstrap;
 mod curve;
+mod difference;
 mod heat_map;
 mod panel;
 mod pool;
@@ -18,6 +19,7 @@ use panel::{Kind, Series, panel};
 use pool::pool;
 
 pub(crate) use curve::Axis;
+pub(crate) use difference::difference;
 pub(crate) use heat_map::draw as draw_clips;
 
 /// Both axes of a picture.

@@ -13,13 +13,7 @@ pub(super) fn pool(mut series: Series, curves: &[Vec<Point>], axis: Axis) -> Ser
     if let [only] = curves {
         return series.with_line(only.iter().map(|point| (point.on(axis), point.value)));
     }
-    let from = curves.iter().filter_map(|curve| curve.first()).map(|point| point.on(axis)).fold(0.0, f64::max);
-    let to = curves.iter().filter_map(|curve| curve.last()).map(|point| point.on(axis)).fold(f64::INFINITY, f64::min);
-    if from > to || to.is_infinite() {
-        return series;
-    }
-    for sample in 0..=SAMPLES {
-        let place = from + (to - from) * sample as f64 / SAMPLES as f64;
+    for place in places(curves, axis) {
         let values: Vec<f64> = curves.iter().filter_map(|curve| at(curve, axis, place)).collect();
         let (low, high) = interval(&values);
         series.line.push((place, values.iter().sum::<f64>() / values.len() as f64));
@@ -28,8 +22,18 @@ pub(super) fn pool(mut series: Series, curves: &[Vec<Point>], axis: Axis) -> Ser
     series
 }
 
+/// Places from the begin to the end of the part of the axis that all curves have; none if there is no such part.
+pub(super) fn places(curves: &[Vec<Point>], axis: Axis) -> Vec<f64> {
+    let from = curves.iter().filter_map(|curve| curve.first()).map(|point| point.on(axis)).fold(0.0, f64::max);
+    let to = curves.iter().filter_map(|curve| curve.last()).map(|point| point.on(axis)).fold(f64::INFINITY, f64::min);
+    if from > to || to.is_infinite() {
+        return Vec::new();
+    }
+    (0..=SAMPLES).map(|sample| from + (to - from) * sample as f64 / SAMPLES as f64).collect()
+}
+
 /// The interpolated value of a curve at this place; its first or last value outside its range.
-fn at(curve: &[Point], axis: Axis, place: f64) -> Option<f64> {
+pub(super) fn at(curve: &[Point], axis: Axis, place: f64) -> Option<f64> {
     let next = curve.partition_point(|point| point.on(axis) < place);
     match (next.checked_sub(1).and_then(|before| curve.get(before)), curve.get(next)) {
         (Some(before), Some(after)) => {

@@ -103,7 +103,7 @@ impl Display {
             self.event("unreadable metrics", &[("line", text.to_owned())]);
             return;
         };
-        let ticks = (self.used_budget(&line) * TICKS) as u64;
+        let ticks = (line.used(&self.budget) * TICKS) as u64;
         match &self.output {
             Output::Panel(panel) => {
                 self.progress = panel_text(&line);
@@ -140,15 +140,6 @@ impl Display {
             Output::Row(_) => {}
             Output::Text | Output::Lines => self.line("evaluation", evaluation_facts(&line, best)),
         }
-    }
-
-    /// The used fraction of the budget, 0 to 1, by the limit that is nearest.
-    fn used_budget(&self, line: &Line) -> f64 {
-        let of = |used: f64, limit: f64| if limit > 0.0 { used / limit } else { 0.0 };
-        of(line.seconds, self.budget.minutes * 60.0)
-            .max(of(line.environment_steps as f64, self.budget.environment_steps as f64))
-            .max(of(line.updates as f64, self.budget.updates as f64))
-            .clamp(0.0, 1.0)
     }
 
     fn line(&self, event: &str, mut facts: Map<String, Value>) {

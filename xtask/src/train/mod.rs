@@ -3,6 +3,7 @@
 pub(crate) mod child;
 pub(crate) mod display;
 pub(crate) mod evaluation;
+pub(crate) mod preemption;
 mod process;
 mod run_directory;
 mod supervisor;
@@ -18,6 +19,7 @@ use comic_setup::Interrupt;
 use crate::evaluations::Evaluation;
 use crate::{plot, setup, workspace};
 use display::Display;
+use preemption::Preemption;
 use run_directory::RunDirectory;
 use supervisor::Supervisor;
 
@@ -64,6 +66,8 @@ pub(crate) struct Job {
     episodes: Option<u32>,
     /// Whether a process evaluates checkpoints during training.
     evaluator: bool,
+    /// Whether the logs have each unroll, and the accounting at the end.
+    logs_unrolls: bool,
     port: Option<u16>,
     directory: RunDirectory,
 }
@@ -112,9 +116,15 @@ impl Job {
             actors: options.actors,
             episodes: options.episodes,
             evaluator: !options.no_evaluator,
+            logs_unrolls: false,
             port: options.port,
             directory,
         })
+    }
+
+    /// The same, with lines in the actors' logs for each unroll that is made and acknowledged, and the accounting in the learner's.
+    pub(crate) fn with_unrolls_in_logs(self) -> Self {
+        Self { logs_unrolls: true, ..self }
     }
 
     /// The experiment.
@@ -132,13 +142,38 @@ impl Job {
         self.directory.metrics()
     }
 
+    /// The newest checkpoint, if there is one.
+    pub(crate) fn newest_checkpoint(&self) -> Option<PathBuf> {
+        self.directory.newest_checkpoint()
+    }
+
+    /// The learner's log.
+    pub(crate) fn learner_log(&self) -> PathBuf {
+        self.directory.log("learner")
+    }
+
+    /// The logs of the actors.
+    pub(crate) fn actor_logs(&self) -> Vec<PathBuf> {
+        (0..usize::from(self.actors)).map(|number| self.directory.log(&supervisor::actor_name(number))).collect()
+    }
+
     /// Trains until the budget is used up or a stop is requested, and draws the run.
     pub(crate) fn train(&self, display: &mut Display, interrupt: &Interrupt) -> Result<()> {
+        self.train_preempted(&mut Preemption::none(), display, interrupt)
+    }
+
+    /// As [`train`](Self::train), while processes are killed and replaced.
+    pub(crate) fn train_preempted(
+        &self,
+        preemption: &mut Preemption,
+        display: &mut Display,
+        interrupt: &Interrupt,
+    ) -> Result<()> {
         self.directory.make()?;
         // The port is chosen after the build, which takes minutes: another program may take a port in that time.
         let port = self.port.map_or_else(free_port, Ok)?;
         display.event("starting", &[("directory", self.path().display().to_string()), ("port", port.to_string())]);
-        let outcome = Supervisor::start(self, port, display, interrupt).and_then(|mut supervisor| {
+        let outcome = Supervisor::start(self, port, preemption, display, interrupt).and_then(|mut supervisor| {
             let outcome = supervisor.watch(display, interrupt);
             supervisor.stop(display);
             outcome

@@ -72,6 +72,13 @@ impl Process {
         }
     }
 
+    /// Kills the process at once (SIGKILL), as a machine that is taken away does.
+    pub(super) fn kill(&mut self) {
+        // An error means that it has ended already.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+
     /// Waits until the process has ended, and kills it after `limit`. Returns whether it ended by itself.
     pub(super) fn wait(&mut self, limit: Duration) -> bool {
         let deadline = Instant::now() + limit;
@@ -81,8 +88,7 @@ impl Process {
             }
             std::thread::sleep(Duration::from_millis(50));
         }
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        self.kill();
         false
     }
 }

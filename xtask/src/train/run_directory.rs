@@ -61,15 +61,22 @@ impl RunDirectory {
         self.0.join(format!("{name}.log"))
     }
 
+    fn checkpoints(&self) -> PathBuf {
+        self.0.join("checkpoints")
+    }
+
+    /// The newest checkpoint, without the initial one.
+    pub(super) fn newest_checkpoint(&self) -> Option<PathBuf> {
+        let paths = fs::read_dir(self.checkpoints()).into_iter().flatten().flatten().map(|entry| entry.path());
+        paths
+            .filter(|path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("checkpoint-")))
+            .max()
+    }
+
     /// The policies that exist, each with its name.
     pub(super) fn policies(&self) -> Vec<(&'static str, PathBuf)> {
-        let checkpoints = self.0.join("checkpoints");
-        let mut policies = vec![("untrained", checkpoints.join("initial"))];
-        let newest = fs::read_dir(&checkpoints).into_iter().flatten().flatten().map(|entry| entry.path());
-        let newest = newest
-            .filter(|path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("checkpoint-")))
-            .max();
-        policies.extend(newest.map(|path| ("trained", path)));
+        let mut policies = vec![("untrained", self.checkpoints().join("initial"))];
+        policies.extend(self.newest_checkpoint().map(|path| ("trained", path)));
         policies.retain(|(_, path)| path.is_dir());
         policies
     }

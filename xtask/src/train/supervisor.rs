@@ -1,14 +1,19 @@
 //! Starts, watches, restarts and stops the processes of a run.
 
+use std::fs;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use comic_experiment::Experiment;
 use comic_setup::Interrupt;
+use serde::Deserialize;
 
 use super::display::Display;
+use super::preemption::{LearnerKilled, Preemption};
 use super::process::{Process, Tail};
 use super::{Job, child};
+use crate::metrics::Line;
 use crate::{evaluations, workspace};
 
 /// The exit code of a learner that was told to stop, and wrote its checkpoint.
@@ -23,16 +28,27 @@ const ACTOR_END_LIMIT: Duration = Duration::from_secs(10);
 const STABLE: Duration = Duration::from_secs(30);
 /// Failures in a row after which an actor is not started again.
 const MAX_FAILURES: u32 = 5;
+/// The time after which a process that was killed on purpose is replaced. A Job takes some seconds, too.
+const REPLACED_AFTER: Duration = Duration::from_secs(5);
+/// The log level of an actor that logs each unroll.
+const EVERY_UNROLL: &str = "info,comic_actor::session::outbox=debug";
 
 /// One learner and its actors.
 pub(super) struct Supervisor<'a> {
     job: &'a Job,
     port: u16,
     learner: Process,
+    /// When to start the learner again, after it was killed on purpose.
+    learner_restart_at: Option<Instant>,
     actors: Vec<Actor>,
+    /// When the actors were started.
+    started: Instant,
+    preemption: &'a mut Preemption,
     /// Evaluates checkpoints. It is not started again: training does not need it.
     evaluator: Option<Process>,
     metrics: Tail,
+    /// The newest line of metrics.
+    newest: Line,
     evaluations: Tail,
     log: Tail,
 }
@@ -42,25 +58,39 @@ struct Actor {
     number: usize,
     process: Option<Process>,
     failures: u32,
-    /// When to start the next process, after a failure.
+    /// When to start the next process, after a failure or a kill.
     restart_at: Option<Instant>,
 }
 
 impl<'a> Supervisor<'a> {
     /// Starts the learner, waits until it serves, and starts the actors and the evaluator.
-    pub(super) fn start(job: &'a Job, port: u16, display: &mut Display, interrupt: &Interrupt) -> Result<Self> {
+    pub(super) fn start(
+        job: &'a Job,
+        port: u16,
+        preemption: &'a mut Preemption,
+        display: &mut Display,
+        interrupt: &Interrupt,
+    ) -> Result<Self> {
         let metrics = Tail::new(job.directory.metrics());
         let evaluations = Tail::new(job.directory.evaluations());
         let log = Tail::new(job.directory.log("learner"));
-        let mut command = child::command(&workspace::program("comic-learner")?);
-        command.args(&job.document).args(["--address", "127.0.0.1", "--port", &port.to_string()]);
-        command.arg("--run").arg(job.directory.path());
-        let mut learner = Process::start("comic-learner", &mut command, job.directory.log("learner"))?;
-        await_serving(&mut learner, interrupt)?;
+        let learner = start_learner(job, port, interrupt)?;
         let page = job.directory.page().display().to_string();
         display.event("learner serves", &[("address", format!("127.0.0.1:{port}")), ("page", page)]);
-        let (actors, evaluator) = (Vec::new(), None);
-        let mut supervisor = Self { job, port, learner, actors, evaluator, metrics, evaluations, log };
+        let mut supervisor = Self {
+            job,
+            port,
+            learner,
+            learner_restart_at: None,
+            actors: Vec::new(),
+            started: Instant::now(),
+            preemption,
+            evaluator: None,
+            metrics,
+            newest: Line::default(),
+            evaluations,
+            log,
+        };
         for number in 0..usize::from(job.actors) {
             let process = Some(supervisor.start_actor(number)?);
             supervisor.actors.push(Actor { number, process, failures: 0, restart_at: None });
@@ -93,13 +123,16 @@ impl<'a> Supervisor<'a> {
     fn start_actor(&self, number: usize) -> Result<Process> {
         let mut command = child::command(&workspace::program("comic-actor")?);
         command.args(["--learner", &self.address()]);
+        if self.job.logs_unrolls {
+            command.env("RUST_LOG", EVERY_UNROLL);
+        }
         let Experiment { unroll, actor, .. } = &self.job.experiment;
         if unroll.lockstep {
             // A batch waits for every environment, so the actors together must have all of them.
             let environments = unroll.batch.div_ceil(usize::from(self.job.actors) * actor.threads);
             command.args(["--environments", &environments.to_string()]);
         }
-        let name = format!("actor-{number}");
+        let name = actor_name(number);
         let log = self.job.directory.log(&name);
         Process::start(name, &mut command, log)
     }
@@ -112,7 +145,11 @@ impl<'a> Supervisor<'a> {
                 display.event("stopping", &[("reason", "requested".into())]);
                 return Ok(());
             }
-            if let Some(status) = self.learner.ended()? {
+            if let Some(moment) = self.learner_restart_at {
+                if Instant::now() >= moment {
+                    self.restart_learner(display, interrupt)?;
+                }
+            } else if let Some(status) = self.learner.ended()? {
                 if status.success() {
                     display.event("budget used up", &[]);
                     return Ok(());
@@ -125,6 +162,7 @@ impl<'a> Supervisor<'a> {
             }
             self.restart_failed_actors(display)?;
             self.report_failed_evaluator(display)?;
+            self.preempt(display)?;
             std::thread::sleep(Duration::from_millis(200));
         }
     }
@@ -156,6 +194,37 @@ impl<'a> Supervisor<'a> {
                 self.actors[index].restart_at = None;
             }
         }
+        Ok(())
+    }
+
+    /// Kills what is due.
+    fn preempt(&mut self, display: &mut Display) -> Result<()> {
+        for number in self.preemption.actors_due(self.started.elapsed(), self.actors.len()) {
+            let actor = &mut self.actors[number];
+            // One that was killed a moment ago has no machine yet that could be taken away.
+            let Some(mut process) = actor.process.take() else { continue };
+            process.kill();
+            actor.restart_at = Some(Instant::now() + REPLACED_AFTER);
+            self.preemption.actors_killed += 1;
+            display.event("actor killed", &[("name", process.name.clone())]);
+        }
+        if self.preemption.learner_due(self.newest.used(&self.job.experiment.budget), Instant::now())
+            && self.learner.ended()?.is_none()
+        {
+            self.learner.kill();
+            self.learner_restart_at = Some(Instant::now() + REPLACED_AFTER);
+            display.event("learner killed", &[]);
+        }
+        Ok(())
+    }
+
+    /// Starts the learner again after its kill, with the same run.
+    fn restart_learner(&mut self, display: &mut Display, interrupt: &Interrupt) -> Result<()> {
+        let resumed = self.job.directory.newest_checkpoint().map_or(Ok(0), |path| environment_steps(&path))?;
+        self.preemption.learner_killed = Some(LearnerKilled { reached: self.newest.environment_steps, resumed });
+        self.learner = start_learner(self.job, self.port, interrupt)?;
+        self.learner_restart_at = None;
+        display.event("learner restarted", &[("environment steps", resumed.to_string())]);
         Ok(())
     }
 
@@ -204,14 +273,36 @@ impl<'a> Supervisor<'a> {
                 display.learner(&line);
             }
         }
-        for line in self.metrics.lines() {
-            display.metrics(&line);
+        for text in self.metrics.lines() {
+            display.metrics(&text);
+            if let Ok(line) = serde_json::from_str(&text) {
+                self.newest = line;
+            }
         }
         for line in self.evaluations.lines() {
             // The whole file is read for the best, which may be older than a resumed run's new lines.
             display.evaluation(&line, evaluations::best(&self.job.directory.evaluations()));
         }
     }
+}
+
+/// The name of an actor's log and of its processes.
+pub(super) fn actor_name(number: usize) -> String {
+    format!("actor-{number}")
+}
+
+/// Starts the learner and waits until it serves.
+fn start_learner(job: &Job, port: u16, interrupt: &Interrupt) -> Result<Process> {
+    let mut command = child::command(&workspace::program("comic-learner")?);
+    command.args(&job.document).args(["--address", "127.0.0.1", "--port", &port.to_string()]);
+    command.arg("--run").arg(job.directory.path());
+    if job.logs_unrolls {
+        // Whatever the user's level is: the last line has the accounting.
+        command.env("RUST_LOG", "info");
+    }
+    let mut learner = Process::start("comic-learner", &mut command, job.directory.log("learner"))?;
+    await_serving(&mut learner, interrupt)?;
+    Ok(learner)
 }
 
 /// Waits for the line `{"listening": …}`, which the learner prints when it serves.
@@ -233,4 +324,16 @@ fn await_serving(learner: &mut Process, interrupt: &Interrupt) -> Result<()> {
 
 fn is_listening_line(line: &str) -> bool {
     serde_json::from_str::<serde_json::Value>(line).is_ok_and(|line| line.get("listening").is_some())
+}
+
+/// The environment steps that were trained on before this checkpoint.
+fn environment_steps(checkpoint: &Path) -> Result<u64> {
+    #[derive(Deserialize)]
+    struct Progress {
+        environment_steps: u64,
+    }
+    let path = checkpoint.join("progress.json");
+    let text = fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+    let progress: Progress = serde_json::from_slice(&text).with_context(|| path.display().to_string())?;
+    Ok(progress.environment_steps)
 }
