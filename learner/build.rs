@@ -1,4 +1,4 @@
-//! The run path, as for every crate, and the C++ files: for Adam, for CUDA where libtorch has it, and for XLA with `--features xla`.
+//! The run path, as for every crate, and the C++ files: for Adam, for several learners, for CUDA where libtorch has it, and for XLA with `--features xla`.
 //! XLA also needs the directories of Python and of its packages.
 
 #[path = "../setup/cpp.rs"]
@@ -15,6 +15,10 @@ fn main() {
         panic!("LIBTORCH is not set: `cargo xtask setup` fetches libtorch");
     };
     cpp::with_libtorch(&libtorch, "src/adam/fused.cpp").compile("comic_adam");
+    // The directory has what c10d's header includes of gloo.
+    println!("cargo:rerun-if-changed=src/world/gloo");
+    let mut world = cpp::with_libtorch(&libtorch, "src/world/c10d.cpp");
+    world.define("USE_C10D_GLOO", None).include("src/world").compile("comic_world");
     cuda(&libtorch);
     #[cfg(feature = "xla")]
     xla(&libtorch);

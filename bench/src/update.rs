@@ -1,10 +1,12 @@
 //! The gradient step against its bare matrix products.
 //!
 //! # Layout
+//! - [`ranks`] is the step of several learners together.
 //! - [`mod@floor`] is the least that an update can cost, [`vmpo`] and [`svg0`] have its layers; [`recorded`] is the batch that is
 //!   learned from.
 
 mod floor;
+mod ranks;
 mod recorded;
 mod svg0;
 mod vmpo;
@@ -18,6 +20,7 @@ use comic_learner::algorithm::minibatch::MinibatchTensors;
 use comic_learner::algorithm::{Algorithm, Parts};
 use comic_learner::algorithms;
 use comic_learner::device::Backend;
+use comic_learner::world::World;
 use serde_json::json;
 use tch::Device;
 
@@ -26,6 +29,8 @@ use crate::median::median;
 use crate::transfer;
 use floor::Floor;
 use recorded::Recorded;
+
+pub use ranks::Ranks;
 
 /// Measure a gradient step of paper size against the matrix products of the same shapes
 ///
@@ -77,9 +82,9 @@ impl Update {
         tch::manual_seed(1);
         let (experiment, figure) = self.subject()?;
         let backend = Backend::open(&Learner { device: self.device, ..experiment.learner.clone() })?;
-        let mut networks = Networks::new(&experiment, &backend)?;
+        let mut networks = Networks::new(&experiment, &backend, &World::alone())?;
         let alone = Experiment { joint: Vec::new(), ..experiment.clone() };
-        let mut one_task = self.joint.then(|| Networks::new(&alone, &backend)).transpose()?;
+        let mut one_task = self.joint.then(|| Networks::new(&alone, &backend, &World::alone())).transpose()?;
         let products = floor(&networks.spec, &experiment, backend.device());
         let (mut updates, mut one_tasks, mut floors) = (Vec::new(), Vec::new(), Vec::new());
         let (mut copies, mut reads, mut contended) = (Vec::new(), Vec::new(), Vec::new());
@@ -166,10 +171,10 @@ struct Networks {
 }
 
 impl Networks {
-    fn new(experiment: &Experiment, backend: &Backend) -> Result<Self> {
+    fn new(experiment: &Experiment, backend: &Backend, world: &World) -> Result<Self> {
         let spec = TaskSpec::new(experiment, vec!["clip".into()]).map_err(|name| anyhow!("no observation `{name}`"))?;
         let (pose, device) = (vec![0.0; spec.action], backend.device());
-        let learner = algorithms::learner(Parts { experiment, spec: &spec, pose: &pose, device })?;
+        let learner = algorithms::learner(Parts { experiment, spec: &spec, pose: &pose, device, world })?;
         let recorded = Recorded::new(&spec, experiment, unrolls(experiment))?;
         let minibatch = recorded.to_tensors(backend.device())?;
         Ok(Self { spec, learner, recorded, minibatch })

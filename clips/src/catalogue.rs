@@ -1,6 +1,7 @@
 //! The clips of an experiment: their list, and how to read each of them.
 
 use std::{
+    collections::BTreeSet,
     fmt,
     path::{Path, PathBuf},
 };
@@ -10,6 +11,7 @@ use sha2::{Digest, Sha256};
 
 use crate::builtin;
 use crate::clip::Clip;
+use crate::cut::cut;
 use crate::entry::Entry;
 use crate::error::Error;
 use crate::file::{ClipFile, Header};
@@ -116,20 +118,36 @@ impl Catalogue {
         }
     }
 
-    /// The files of the clips with their hashes, each file once. Built-in clips have no file.
+    /// The files of the clips with their hashes, each file once. Built-in clips have no file. If at most half of the clips of a file
+    /// are in use and there is a directory for `cuts`, a file with these clips alone is made there and takes its place.
     ///
     /// # Errors
-    /// [`Error::Unreadable`].
-    pub fn assets(&self) -> Result<Vec<Asset>, Error> {
+    /// [`Error::Unreadable`]; with `cuts` also [`Error::Unwritable`].
+    pub fn assets(&self, cuts: Option<&Path>) -> Result<Vec<Asset>, Error> {
         let mut assets: Vec<Asset> = Vec::new();
         for source in &self.sources {
-            if let Source::File { source, file } = source
-                && assets.iter().all(|asset| asset.source != *source)
-            {
-                assets.push(asset(source, file.path())?);
+            let Source::File { source, file } = source else { continue };
+            if assets.iter().any(|asset| asset.source == *source) {
+                continue;
             }
+            let whole = asset(source, file.path())?;
+            let used = self.used(source);
+            assets.push(match cuts {
+                Some(directory) if 2 * used.len() <= file.names().len() => {
+                    asset(source, &cut(file, &whole.sha256, &used, directory)?)?
+                }
+                _ => whole,
+            });
         }
         Ok(assets)
+    }
+
+    /// The names of the clips of a source that are in use, sorted. An experiment may name a source several times.
+    fn used(&self, source: &str) -> Vec<String> {
+        let is_of = |index: &usize| matches!(self.sources.get(*index), Some(Source::File { source: found, .. }) if found == source);
+        let of_source = self.entries.iter().zip(&self.source_of).filter(|(_, index)| is_of(index));
+        let names: BTreeSet<&String> = of_source.map(|(entry, _)| &entry.name).collect();
+        names.into_iter().cloned().collect()
     }
 
     /// The servo action that aims at the mean pose of the clips, in `ctrl` order, each entry in [−1, 1]. It is the mean

@@ -22,6 +22,7 @@ mod builtin;
 mod catalogue;
 pub mod check;
 mod clip;
+mod cut;
 mod entry;
 mod error;
 mod features;

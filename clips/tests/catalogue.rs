@@ -114,7 +114,7 @@ fn a_catalogue_finds_files_through_the_callers_function() {
     let sources = [with_ids("motion.h5", &["TINY_001_01"]), ClipSource::whole("builtin:stand")];
     let catalogue = Catalogue::open_with(&sources, |source| (source == "motion.h5").then(|| tiny().into())).unwrap();
     assert_eq!(names(&catalogue), ["TINY_001_01", "stand"]);
-    assert_eq!(catalogue.assets().unwrap()[0].source, "motion.h5");
+    assert_eq!(catalogue.assets(None).unwrap()[0].source, "motion.h5");
     let message = Catalogue::open_with(&sources, |_| None).unwrap_err().to_string();
     assert_eq!(message, "no clip file `motion.h5`; there is no local copy of it");
 }
@@ -123,12 +123,12 @@ fn a_catalogue_finds_files_through_the_callers_function() {
 fn assets_are_the_files_each_hashed_once() {
     let sources =
         [with_ids(tiny(), &["TINY_001_01"]), ClipSource::whole("builtin:walk"), with_ids(tiny(), &["TINY_001_02"])];
-    let assets = Catalogue::open(&sources).unwrap().assets().unwrap();
+    let assets = Catalogue::open(&sources).unwrap().assets(None).unwrap();
     let bytes = std::fs::read(tiny()).unwrap();
     assert_eq!(assets.len(), 1);
     assert_eq!((assets[0].source.clone(), assets[0].size), (tiny(), bytes.len() as u64));
     assert_eq!(assets[0].sha256[..], *<sha2::Sha256 as sha2::Digest>::digest(bytes));
-    assert!(Catalogue::open(&[ClipSource::whole("builtin:walk")]).unwrap().assets().unwrap().is_empty());
+    assert!(Catalogue::open(&[ClipSource::whole("builtin:walk")]).unwrap().assets(None).unwrap().is_empty());
 }
 
 #[test]

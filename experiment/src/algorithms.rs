@@ -100,6 +100,12 @@ pub(crate) trait AlgorithmParameters {
     /// unrolls of every age are learned from.
     fn versions_in(&self, updates: u64) -> Option<u64>;
 
+    /// Reduces the section to the share of one of so many learners.
+    ///
+    /// # Errors
+    /// The field that they cannot share, or that several learners do not support.
+    fn share(&mut self, ranks: usize) -> Result<(), Fault>;
+
     /// Whether it learns from the simulator's derivative of the rewards with respect to the actions.
     fn reads_action_gradient(&self) -> bool {
         false

@@ -80,6 +80,17 @@ impl MatmulPrecision {
     }
 }
 
+/// The numbers in which the learner publishes parameters. It computes with float32, and so do actors.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PublishedNumber {
+    /// As the learner has them.
+    #[default]
+    Float32,
+    /// Rounded to 8 bits of precision, for half of the bytes. The normaliser stays float32.
+    Bfloat16,
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -5,6 +5,8 @@ use serde::{Deserialize, Serialize};
 use crate::algorithms::{AlgorithmName, AlgorithmParameters, Rest, Svg0, Vmpo};
 use crate::body::ACTION_SIZE;
 use crate::clips::ClipSource;
+use crate::error::Error;
+use crate::fault::{Fault, ensure};
 use crate::network::Network;
 use crate::replay::Replay;
 use crate::settings::{Actor, Budget, Learner, Optimiser, Unroll};
@@ -100,6 +102,12 @@ macro_rules! parameters {
                     $(AlgorithmName::$algorithm => &self.$section,)*
                 }
             }
+
+            fn algorithm_parameters_mut(&mut self) -> &mut dyn AlgorithmParameters {
+                match self.algorithm {
+                    $(AlgorithmName::$algorithm => &mut self.$section,)*
+                }
+            }
         }
     };
 }
@@ -117,6 +125,32 @@ pub struct Complement {
 }
 
 impl Experiment {
+    /// The share of each of so many learners that train this experiment together: a part of every batch and minibatch.
+    ///
+    /// # Errors
+    /// [`Error::Value`] with the field that they cannot share.
+    pub fn share(&self, ranks: usize) -> Result<Self, Error> {
+        let mut share = self.clone();
+        share.divide(ranks).map_err(|Fault { field, value, remedy }| {
+            let origin = format!("{ranks} learners together");
+            Error::Value { origin, field, value, remedy }
+        })?;
+        Ok(share)
+    }
+
+    fn divide(&mut self, ranks: usize) -> Result<(), Fault> {
+        if ranks == 1 {
+            return Ok(());
+        }
+        let batch = self.unroll.batch;
+        let holds = ranks > 0 && batch.is_multiple_of(ranks);
+        ensure("unroll.batch", batch, holds, format!("must be a multiple of {ranks}"))?;
+        let lockstep = self.unroll.lockstep;
+        ensure("unroll.lockstep", lockstep, !lockstep, "must be false: arrival decides which unrolls share a batch")?;
+        self.unroll.batch /= ranks;
+        self.algorithm_parameters_mut().share(ranks)
+    }
+
     /// Every task and the probability of an episode of it, `task` first.
     pub fn tasks(&self) -> Vec<(TaskName, f64)> {
         let others = self.joint.iter().map(|complement| (complement.task, complement.probability));

@@ -41,7 +41,7 @@ mod vocabulary;
 pub use algorithms::{AlgorithmName, Svg0, Vmpo};
 pub use body::{ACTION_SIZE, CONTROL_TIMESTEP, IMAGE_SIZE, PROPRIOCEPTION, PROPRIOCEPTION_SIZE};
 pub use clips::{ClipSource, SUBSETS};
-pub use device::{DeviceName, MatmulPrecision};
+pub use device::{DeviceName, MatmulPrecision, PublishedNumber};
 pub use document::{Complement, Experiment};
 pub use error::Error;
 pub use fields::{Difference, find_field};

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::device::{DeviceName, MatmulPrecision};
+use crate::device::{DeviceName, MatmulPrecision, PublishedNumber};
 
 /// The longest unroll.
 pub const LONGEST_UNROLL: usize = 4096;
@@ -98,6 +98,8 @@ pub struct Learner {
     pub matmul_precision: MatmulPrecision,
     /// Threads of libtorch in the update.
     pub threads: usize,
+    /// The numbers of published parameters: bfloat16 halves what the network carries to the actors (D).
+    pub published_number: PublishedNumber,
     /// Seconds between checkpoints.
     pub checkpoint_seconds: f64,
     /// Checkpoints kept.
@@ -115,6 +117,7 @@ impl Default for Learner {
             device: DeviceName::Cpu,
             matmul_precision: MatmulPrecision::Highest,
             threads: 1,
+            published_number: PublishedNumber::Float32,
             checkpoint_seconds: 60.0,
             checkpoints_kept: 3,
             metrics_seconds: 5.0,

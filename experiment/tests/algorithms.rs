@@ -99,3 +99,25 @@ fn an_unroll_may_be_late_by_the_updates_of_max_staleness_in_whole_versions_and_i
     assert_eq!(set("transfer-paper", &lockstep[..1]).unwrap().max_versions_late(), u64::MAX);
     assert_eq!(set("transfer-paper", &lockstep).unwrap().max_versions_late(), 0);
 }
+
+#[test]
+fn several_learners_share_batches_and_minibatches_and_refuse_what_they_cannot_share() {
+    let share = |preset: &str, set: &[&str], ranks: usize| {
+        self::set(preset, set).unwrap().share(ranks).map_err(|error| error.to_string())
+    };
+    let half = share("quickstart", &[], 2).unwrap();
+    let whole = resolve("quickstart", &[]).unwrap();
+    assert_eq!(half.unroll.batch * 2, whole.unroll.batch);
+    assert_eq!(half.vmpo.minibatch_unrolls * 2, whole.vmpo.minibatch_unrolls);
+    assert_eq!(share("quickstart", &[], 1).unwrap(), whole);
+    for (preset, set, ranks, part) in [
+        ("quickstart", &["unroll.batch=9", "vmpo.minibatch_unrolls=9"][..], 2, "unroll.batch = 9"),
+        ("quickstart", &["unroll.batch=12", "vmpo.minibatch_unrolls=3"], 2, "vmpo.minibatch_unrolls = 3"),
+        ("quickstart", &["unroll.lockstep=true", "unroll.ahead=0", "budget.minutes=0"], 2, "unroll.lockstep"),
+        ("quickstart", &[], 0, "unroll.batch"),
+        ("transfer-go-to-target", &["algorithm=svg0"], 2, "algorithm"),
+    ] {
+        let refused = share(preset, set, ranks).unwrap_err();
+        assert!(refused.contains(part) && refused.contains("learners together"), "no `{part}` in {refused}");
+    }
+}

@@ -40,6 +40,7 @@ use crate::algorithm::error::Error;
 use crate::algorithm::experience::Experience;
 use crate::algorithm::loss_report::Losses;
 use crate::algorithm::minibatch::MinibatchTensors;
+use crate::world::World;
 
 /// Networks and their optimiser, changed one gradient step at a time.
 pub trait Algorithm: Debug {
@@ -100,6 +101,8 @@ pub struct Parts<'a> {
     pub pose: &'a [f32],
     /// Where it computes.
     pub device: Device,
+    /// The ranks that train together. The experiment is that of this rank's share.
+    pub world: &'a World,
 }
 
 /// What an algorithm brings: its networks with their optimiser, and where its experience comes from.

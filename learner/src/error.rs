@@ -31,6 +31,9 @@ pub enum Error {
     /// libtorch refused an operation.
     #[error("libtorch failed")]
     Torch(#[from] tch::TchError),
+    /// The ranks of a run cannot go on together.
+    #[error(transparent)]
+    World(#[from] crate::world::Error),
     /// A device failed, or another process has it.
     #[error("{0}")]
     Device(String),

@@ -1,9 +1,18 @@
 //! The exit code of `comic-learner` after an error.
 
 use crate::error::Error;
+use crate::world;
+
+/// The exit code of a learner that was told to stop before the run was over, and wrote its checkpoint. A Kubernetes Job counts 0
+/// as done.
+pub const STOPPED: u8 = 4;
+
+/// The exit code of a learner that lost another one of its run, or did not find it: another process failed, not this one.
+const LOST: u8 = 5;
 
 impl Error {
-    /// The program's exit code: 2 when starting again cannot help, because the configuration is wrong, and 1 otherwise.
+    /// The program's exit code: 2 when starting again cannot help, because the configuration is wrong, 5 when another rank is lost,
+    /// and 1 otherwise.
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Configuration(_)
@@ -12,7 +21,9 @@ impl Error {
             | Self::Access(_)
             | Self::Networks(comic_networks::Error::Experiment(_)) => 2,
             Self::Within { source, .. } => source.exit_code(),
-            Self::Networks(_)
+            Self::World(world::Error::Lost { .. } | world::Error::Meeting { .. }) => LOST,
+            Self::World(_)
+            | Self::Networks(_)
             | Self::Accounting(_)
             | Self::Update(_)
             | Self::Torch(_)

@@ -7,6 +7,7 @@
 //!   computes: CPU, CUDA or XLA.
 //! - [`algorithm`] is what the trainer needs of a learning algorithm. [`vmpo`] is V-MPO, and [`svg0`] SVG(0): experience, losses
 //!   and gradient step. [`algorithms`] makes the one that the experiment names. [`adam`] is their optimiser, and [`tensors`] reads and writes its state.
+//! - [`world`] is the learners that train one run together, and [`meeting`] how they find each other.
 //! - [`checkpoint`] is the run's checkpoint directory. No other module touches it.
 //! - [`observe`] is what people and Prometheus see of a run: metrics, evaluations and probes.
 //! - `memory_limit` is how much memory the process may use. [`threads`] says how libtorch's threads share the machine.
@@ -26,6 +27,7 @@ pub mod document;
 pub mod error;
 mod exit_code;
 mod log_limiter;
+pub mod meeting;
 mod memory_limit;
 pub mod observe;
 pub mod options;
@@ -40,3 +42,6 @@ pub mod tensors;
 pub mod threads;
 pub mod train;
 pub mod vmpo;
+pub mod world;
+
+pub use exit_code::STOPPED;

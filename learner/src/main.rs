@@ -4,6 +4,7 @@ use std::io::{IsTerminal as _, Write as _};
 use std::process::ExitCode;
 
 use clap::{CommandFactory as _, Parser as _};
+use comic_learner::STOPPED;
 use comic_learner::commands;
 use comic_learner::error::{Error, Result};
 use comic_learner::options::{Command, LogFormat, Options};
@@ -15,10 +16,6 @@ use tracing_subscriber::fmt::format::FmtSpan;
 /// 27 MB a minute, without end. With this allocator it stays at its size. docs/benchmarks.md has the figures.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
-
-/// The exit code of a learner that was told to stop before the run was over, and wrote its checkpoint. A Kubernetes Job counts 0
-/// as done.
-const STOPPED: u8 = 4;
 
 fn main() -> ExitCode {
     let options = Options::parse();

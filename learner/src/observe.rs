@@ -15,3 +15,4 @@ pub mod prometheus;
 mod tensorboard;
 mod thinned;
 mod whole;
+pub mod window;

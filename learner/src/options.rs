@@ -12,6 +12,7 @@ use crate::commands::low_level::LowLevel;
 use crate::commands::prior::Prior;
 use crate::commands::status::Status;
 use crate::document::DocumentArguments;
+use crate::meeting::WorldArguments;
 use crate::security::{ConnectionLimits, SecurityArguments};
 use crate::service::quarantine::QuarantineArguments;
 
@@ -43,6 +44,9 @@ pub struct Options {
     /// What to do with invalid unrolls.
     #[command(flatten)]
     pub quarantine: QuarantineArguments,
+    /// Several learners.
+    #[command(flatten)]
+    pub world: WorldArguments,
     /// The run's directory: checkpoints, metrics.jsonl, tensorboard, the resolved experiment. If it holds checkpoints, the run
     /// is resumed.
     #[arg(long, value_name = "DIR", default_value = "runs/default")]
@@ -94,8 +98,8 @@ pub enum Command {
 
 /// `docs/running.md` says more, and has the actor's.
 const EXIT_CODES: &str = "\
-Exit codes: 0 when the run is over; 4 when the learner was told to stop before that and wrote its checkpoint; 2 when the
-configuration is wrong, so that starting again cannot help; 1 otherwise.
+Exit codes: 0 when the run is over; 4 when the learner was told to stop before that and wrote its checkpoint; 5 when another
+learner of the run was lost; 2 when the configuration is wrong, so that starting again cannot help; 1 otherwise.
 Logs go to standard error; RUST_LOG sets their level (default: info).";
 
 /// Format of the log.

@@ -1,6 +1,7 @@
 //! One learner epoch: resume a run or begin it, serve and train, end.
 
 mod low_level;
+mod opening;
 mod prepare;
 
 use std::io::Write as _;
@@ -10,13 +11,17 @@ use std::time::{Duration, Instant};
 
 use comic_experiment::Experiment;
 use comic_replay::Batcher;
+use tempfile::TempDir;
 use tokio::net::TcpListener;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
 
 use crate::checkpoint::Store;
 use crate::device::Backend;
+
 use crate::error::{Error, Result};
+use crate::exit_code::STOPPED;
+use crate::meeting::Meeting;
 use crate::observe::probes;
 use crate::options::Options;
 use crate::publish::Publisher;
@@ -56,6 +61,7 @@ pub fn print(options: &Options) -> Result<()> {
 /// A wrong experiment, unusable clips, a run directory of another experiment, an address in use, a disk that fails.
 pub fn run(options: &Options) -> Result<Ending> {
     let experiment = options.document.resolve()?;
+    options.world.check(&experiment)?;
     tch::set_num_threads(threads::of(&experiment) as i32);
     runtime()?.block_on(serve_and_train(options, experiment))
 }
@@ -66,10 +72,17 @@ async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<En
     let security = Security::new(&options.security, options.address)?;
     allow_descriptors(options.limits.max_connections() as u64 + OTHER_FILES);
     let listeners = Listeners::bind(options).await?;
-    let _lock = Store::open(&options.run, experiment.learner.checkpoints_kept)?.lock()?;
+    let open = || Store::open(&options.run, experiment.learner.checkpoints_kept);
+    let store = (options.world.rank == 0).then(open).transpose()?;
+    let _lock = store.as_ref().map(Store::lock).transpose()?;
+    // Another rank keeps what its actors fetch only as long as it runs.
+    let scratch = || tempfile::tempdir().map_err(Error::system("there is no temporary directory: set TMPDIR"));
+    let scratch = store.is_none().then(scratch).transpose()?;
+    let files = scratch.as_ref().map_or(options.run.as_path(), TempDir::path);
+    let meeting = meet(options, local_address(&listeners.actors)?, &mut signals).await?;
     // After the lock, so that only the learner that has the run takes the device. It may block: nothing else runs yet.
     let backend = Backend::open(&experiment.learner)?;
-    let (parts, service) = prepare::prepare(options, experiment, backend, security)?;
+    let (parts, service) = prepare::prepare(options, experiment, backend, security, store, files, meeting)?;
     let (batcher, publisher, epoch) = (parts.batcher.clone(), parts.publisher.clone(), parts.epoch);
     let trained_before = batcher.accounting().trained;
     let mut training = start_trainer(parts)?;
@@ -100,6 +113,23 @@ async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<En
         Ending::Stopped => "stopped; start again with the same --run to continue",
     });
     Ok(ending)
+}
+
+/// Meets the other ranks. A signal ends the process meanwhile: nothing has begun.
+async fn meet(options: &Options, serving: SocketAddr, signals: &mut Signals) -> Result<Meeting> {
+    let arguments = options.world.clone();
+    if arguments.world_size == 1 {
+        return Meeting::hold(&arguments, serving);
+    }
+    tokio::select! {
+        meeting = tokio::task::spawn_blocking(move || Meeting::hold(&arguments, serving)) => {
+            meeting.map_err(|_| Error::Panicked("the thread that meets the other ranks"))?
+        }
+        () = signals.first() => {
+            tracing::info!("told to stop before all ranks were here: nothing has changed");
+            signal_hook::low_level::exit(STOPPED.into())
+        }
+    }
 }
 
 /// Tells the actors that the run is over, and gives them this time to hear it, and more if one is away.
@@ -199,14 +229,17 @@ impl Listeners {
     /// Prints the JSON line that says where the learner listens.
     fn announce(&self, options: &Options, epoch: u64) -> Result<()> {
         let address = local_address(&self.actors)?;
-        let mut line =
-            serde_json::json!({ "listening": address.to_string(), "learner_epoch": epoch, "run": options.run });
+        let mut line = serde_json::json!({ "listening": address.to_string(), "learner_epoch": epoch });
+        match options.world.rank {
+            0 => line["run"] = serde_json::json!(options.run),
+            rank => line["rank"] = rank.into(),
+        }
         if let Some(metrics) = &self.metrics {
             line["metrics"] = local_address(metrics)?.to_string().into();
         }
         // An error is not important: stdout may be closed.
         let _ = writeln!(std::io::stdout(), "{line}");
-        tracing::info!(%address, epoch, run = %options.run.display(), "serving");
+        tracing::info!(%address, epoch, rank = options.world.rank, run = %options.run.display(), "serving");
         Ok(())
     }
 }

@@ -10,6 +10,7 @@
 //!   evaluators fetch, `evaluations` keeps reports for the trainer, and `status` shows the learner's state.
 //! - `framing` is the two calls that carry bytes past tonic's codec; `intake` validates unrolls and puts them into batches,
 //!   `room` bounds the messages that were read, and [`quarantine`] keeps invalid unrolls on disk.
+//! - [`placement`] sends actors to the rank that they belong to, if several learners train one run.
 //! - `roster` knows which actors are present, `assignments` which environments they simulate in lockstep.
 //! - [`memory`] computes how much memory all buffers can take.
 //!
@@ -30,6 +31,7 @@ mod join;
 pub mod memory;
 pub mod offer;
 mod peer;
+pub mod placement;
 pub mod process;
 pub mod quarantine;
 mod room;

@@ -37,7 +37,8 @@ pub(crate) struct Builder;
 
 impl algorithm::Builder for Builder {
     fn learner(&self, parts: Parts<'_>) -> Result<Box<dyn Algorithm>, Error> {
-        Ok(Box::new(VmpoLearner::new(parts.spec, parts.experiment, parts.pose, parts.device)?))
+        let learner = VmpoLearner::new(parts.spec, parts.experiment, parts.pose, parts.device)?;
+        Ok(Box::new(learner.in_world(parts.world)))
     }
 
     fn experience(&self, parts: Parts<'_>, _: &Arc<UnrollLayout>) -> crate::error::Result<Box<dyn Experience>> {

@@ -13,6 +13,7 @@ use comic_learner::publish::{Published, Publisher};
 use comic_learner::tensors;
 use comic_learner::train::parts::{Ending, TrainerParts};
 use comic_learner::train::trainer::Trainer;
+use comic_learner::world::World;
 use comic_networks::{Policy as _, RecurrentState, Routing, VmpoPolicy, from_safetensors};
 use comic_proto::v1::{ParametersChunk, UnrollHeader};
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
@@ -144,6 +145,7 @@ fn train(
         pose: vec![0.0; spec.action],
         low_level: None,
         backend: Backend::cpu(),
+        world: World::alone(),
         run: run.to_path_buf(),
         epoch,
         resume: None,

@@ -14,6 +14,7 @@ use comic_learner::observe::probes::Probed as _;
 use comic_learner::publish::{Published, Publisher};
 use comic_learner::train::parts::{Ending, TrainerParts};
 use comic_learner::train::trainer::Trainer;
+use comic_learner::world::World;
 use comic_proto::v1::{EvaluationReport, UnrollHeader};
 use comic_proto::{Field, UnrollBuffer, UnrollLayout, UnrollShape};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Outcome, Phase};
@@ -175,6 +176,7 @@ fn live_evaluated(
         pose,
         low_level: None,
         backend: Backend::cpu(),
+        world: World::alone(),
         run,
         epoch,
         resume,

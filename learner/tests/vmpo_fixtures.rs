@@ -8,7 +8,9 @@
 
 mod fixture;
 
+use comic_learner::algorithm::masked_mean::ValidSteps;
 use comic_learner::vmpo::{Evidence, KlLimits, Multipliers, policy_improvement, returns};
+use comic_learner::world::World;
 use comic_networks::{ActionDistribution, DiagonalGaussian};
 use fixture::{Fixture, Folder, agree};
 use tch::{Device, Kind, Tensor};
@@ -54,10 +56,11 @@ fn losses_and_gradients_equal_rlax() {
             kl_std,
             kl_weights: None,
             kl: None,
-            valid: &valid,
+            valid: &ValidSteps::alone(&valid),
             groups: &groups,
+            world: &World::alone(),
         };
-        let improvement = policy_improvement(&evidence, &multipliers, &limits);
+        let improvement = policy_improvement(&evidence, &multipliers, &limits).unwrap();
         fixture.compare("policy_loss", &improvement.policy);
         // η ln(mean of exp(A / η)), and its derivative, which is the difference of this and of the mean of A / η.
         let largest = advantage.abs().max().double_value(&[]);

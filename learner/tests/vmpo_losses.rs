@@ -2,8 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
 
-use comic_learner::algorithm::masked_mean::masked_mean;
+use comic_learner::algorithm::masked_mean::{ValidSteps, masked_mean};
 use comic_learner::vmpo::{Evidence, Improvement, KlLimits, Multipliers, policy_improvement};
+use comic_learner::world::World;
 use comic_networks::DiagonalGaussian;
 use proptest::prelude::*;
 use tch::{Device, Kind, Tensor};
@@ -59,10 +60,11 @@ impl Case {
             kl_std: &self.kl_std,
             kl_weights: None,
             kl,
-            valid: &self.valid,
+            valid: &ValidSteps::alone(&self.valid),
             groups: &[self.valid.ones_like().to_kind(Kind::Bool)],
+            world: &World::alone(),
         };
-        policy_improvement(&evidence, &self.multipliers, limits)
+        policy_improvement(&evidence, &self.multipliers, limits).unwrap()
     }
 
     fn gradient(&self, loss: &Tensor, input: &Tensor) -> Vec<f32> {
@@ -220,11 +222,12 @@ fn each_group_has_its_own_e_step_and_its_losses_are_weighted_by_its_steps() {
             kl_std: &case.kl_std,
             kl_weights: None,
             kl: None,
-            valid,
+            valid: &ValidSteps::alone(valid),
             groups,
+            world: &World::alone(),
         };
         let multipliers = Multipliers::new(temperatures, &[2.0, 3.0], Device::Cpu);
-        let losses = policy_improvement(&evidence, &multipliers, &LIMITS);
+        let losses = policy_improvement(&evidence, &multipliers, &LIMITS).unwrap();
         let eta = Tensor::run_backward(&[&losses.temperature], &[multipliers.parameter()], true, false).remove(0);
         (number(&losses.policy), number(&losses.temperature), values(&eta))
     };

@@ -57,7 +57,7 @@ pub use linear::acting;
 pub use low_level::{Layer, Sizes, low_level_layers};
 pub use lstm::RecurrentState;
 pub use normaliser::{NORMALISED_LIMIT, NORMALISER_MIN_STD, NormalisedObservation, NormaliserStatistics};
-pub use parameters::{from_safetensors, to_safetensors};
+pub use parameters::{from_safetensors, to_bfloat16, to_safetensors};
 pub use policy::{Acting, Policy};
 pub use prior::StatePrior;
 pub use routing::Routing;

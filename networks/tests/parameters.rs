@@ -5,10 +5,10 @@
 use std::collections::HashMap;
 
 use comic_experiment::{Mlp, Network, TaskPart, TaskSpec};
-use comic_networks::{Error, VmpoPolicy, from_safetensors, to_safetensors};
+use comic_networks::{Error, VmpoPolicy, from_safetensors, to_bfloat16, to_safetensors};
 use proptest::prelude::*;
 use safetensors::tensor::{Dtype, TensorView};
-use tch::{Device, nn};
+use tch::{Device, Kind, Tensor, nn};
 
 fn store() -> nn::VarStore {
     let spec = TaskSpec {
@@ -69,6 +69,23 @@ fn parameters_are_read_as_they_were_written() {
 }
 
 #[test]
+fn bfloat16_parameters_are_those_that_pytorch_rounds_to_and_the_normaliser_stays() {
+    let (from, mut to) = (store(), store());
+    let document = to_safetensors(&from).unwrap();
+    let narrowed = to_bfloat16(&document).unwrap();
+    assert!(narrowed.len() < document.len());
+    from_safetensors(&mut to, &narrowed).unwrap();
+    let read = to.variables();
+    for (name, tensor) in from.variables() {
+        let expected = match name.starts_with("normaliser.") {
+            true => tensor,
+            false => tensor.to_kind(Kind::BFloat16).to_kind(Kind::Float),
+        };
+        assert_eq!(read[&name], expected, "{name}");
+    }
+}
+
+#[test]
 fn the_error_names_a_missing_parameter() {
     let bytes = altered(|entries| drop(entries.remove("low_level.head.bias")));
     assert!(matches!(refused(&bytes), Error::Missing { name } if name == "low_level.head.bias"));
@@ -114,6 +131,26 @@ fn a_normaliser_with_a_standard_deviation_of_zero_is_refused() {
 }
 
 proptest! {
+    /// Every bit pattern of a finite number, so also subnormal ones and those between two.
+    #[test]
+    fn rounding_to_bfloat16_is_pytorchs(bits in any::<u32>()) {
+        let value = f32::from_bits(bits);
+        prop_assume!(value.is_finite());
+        let expected = f32::try_from(Tensor::from(value).to_kind(Kind::BFloat16).to_kind(Kind::Float)).unwrap();
+        let bytes = altered(|entries| {
+            entries.get_mut("low_level.head.bias").unwrap().bytes[..4].copy_from_slice(&value.to_le_bytes());
+        });
+        let mut to = store();
+        match from_safetensors(&mut to, &to_bfloat16(&bytes).unwrap()) {
+            Ok(()) => {
+                let found = to.variables()["low_level.head.bias"].double_value(&[0]) as f32;
+                prop_assert_eq!(found.to_bits(), expected.to_bits());
+            }
+            Err(Error::Number { .. }) => prop_assert!(expected.is_infinite()),
+            Err(error) => prop_assert!(false, "{}", error),
+        }
+    }
+
     #[test]
     fn random_bytes_are_refused_without_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         prop_assert!(from_safetensors(&mut store(), &bytes).is_err());

@@ -122,6 +122,12 @@ impl Access {
     }
 }
 
+/// The URL of another learner of a run, at `address` (host and port), which is reached as the one at `url` is.
+pub fn url_of_sibling(url: &str, address: &str) -> String {
+    let scheme = url.split_once("://").map_or("http", |(scheme, _)| scheme);
+    format!("{scheme}://{address}")
+}
+
 fn read(path: &Path) -> Result<Vec<u8>, AccessError> {
     std::fs::read(path).map_err(|source| AccessError::File { path: path.into(), source })
 }

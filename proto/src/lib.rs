@@ -39,7 +39,7 @@ pub mod v1 {
     tonic::include_proto!("comic.v1");
 }
 
-pub use access::{Access, Authorised, Bearer, Client, FRAME_BYTES, chain, distrusted, no_connection};
+pub use access::{Access, Authorised, Bearer, Client, FRAME_BYTES, chain, distrusted, no_connection, url_of_sibling};
 pub use access_error::AccessError;
 pub use buffer::UnrollBuffer;
 pub use field::Field;
@@ -55,4 +55,4 @@ pub use validate::{Expected, Invalid, MAX_SEQUENCE, validate};
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
 /// Version of the protocol. `Join` compares it. It changes if an older peer would misunderstand a newer one.
-pub const PROTOCOL_VERSION: u32 = 4;
+pub const PROTOCOL_VERSION: u32 = 5;

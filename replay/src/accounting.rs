@@ -1,6 +1,7 @@
 //! The sums over all unrolls, and over the unrolls of each task.
 
 use std::collections::BTreeMap;
+use std::ops::AddAssign;
 
 use serde::{Deserialize, Serialize};
 
@@ -29,6 +30,23 @@ impl Accounting {
     }
 }
 
+impl AddAssign for Accounting {
+    fn add_assign(&mut self, other: Self) {
+        let Self { produced, trained, dropped, in_flight, duplicates, unattributed } = other;
+        add(&mut self.produced, produced);
+        add(&mut self.trained, trained);
+        self.dropped += dropped;
+        add(&mut self.in_flight, in_flight);
+        add(&mut self.duplicates, duplicates);
+        add(&mut self.unattributed, unattributed);
+    }
+}
+
+/// Adds numbers of another rank, which come over the network.
+fn add(sum: &mut u64, other: u64) {
+    *sum = sum.saturating_add(other);
+}
+
 /// Dropped unrolls by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -41,6 +59,16 @@ pub struct Dropped {
     pub superseded: u64,
     /// Received by or sent to an earlier learner epoch that ended before it trained on them.
     pub lost_at_restart: u64,
+}
+
+impl AddAssign for Dropped {
+    fn add_assign(&mut self, other: Self) {
+        let Self { stale, invalid, superseded, lost_at_restart } = other;
+        add(&mut self.stale, stale);
+        add(&mut self.invalid, invalid);
+        add(&mut self.superseded, superseded);
+        add(&mut self.lost_at_restart, lost_at_restart);
+    }
 }
 
 impl Dropped {
@@ -96,6 +124,16 @@ pub struct TaskAccounting {
     pub in_flight: u64,
 }
 
+impl AddAssign for TaskAccounting {
+    fn add_assign(&mut self, other: Self) {
+        let Self { produced, trained, dropped, in_flight } = other;
+        add(&mut self.produced, produced);
+        add(&mut self.trained, trained);
+        self.dropped += dropped;
+        add(&mut self.in_flight, in_flight);
+    }
+}
+
 impl TaskAccounting {
     /// Whether `produced = trained + dropped + in flight`.
     pub fn balance(&self) -> bool {
@@ -104,10 +142,19 @@ impl TaskAccounting {
 }
 
 /// The total accounting and that of each task, at the same moment.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AccountingByTask {
     /// The total, with unrolls without a known task.
     pub all: Accounting,
     /// The accounting of each task, by its name.
     pub tasks: BTreeMap<String, TaskAccounting>,
+}
+
+impl AddAssign for AccountingByTask {
+    fn add_assign(&mut self, other: Self) {
+        self.all += other.all;
+        for (task, accounting) in other.tasks {
+            *self.tasks.entry(task).or_default() += accounting;
+        }
+    }
 }

@@ -223,6 +223,12 @@ impl Batcher {
         state.ledger.accounting(state.waiting())
     }
 
+    /// Unrolls that the batches have room for: those of the open batch, of full ones, and of the trainer's.
+    pub fn capacity(&self) -> usize {
+        let Config { unrolls, ahead, .. } = self.inner.config;
+        (ahead + 1) * unrolls
+    }
+
     /// How long unrolls have waited for a slot since the beginning, all together.
     pub fn waited(&self) -> Duration {
         self.lock().waited

@@ -38,6 +38,12 @@ pub enum JoinError {
     },
 }
 
+/// The rank that an actor belongs to, of this number of ranks, from its index alone: so every rank can tell, also after a restart with
+/// another number of ranks.
+pub fn home(actor: u64, ranks: usize) -> usize {
+    (actor % ranks.max(1) as u64) as usize
+}
+
 /// The account of one incarnation.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Entry {
@@ -66,6 +72,10 @@ pub struct Ledger {
     pub(crate) entries: HashMap<u64, Entry>,
     pub(crate) actors: HashMap<u64, u64>,
     pub(crate) next_actor: u64,
+    /// Distance between the indices of two new actors.
+    stride: u64,
+    /// See [`LedgerSnapshot`](crate::LedgerSnapshot).
+    pub(crate) sparse: bool,
     pub(crate) clock: u64,
     capacity: usize,
     /// Here, `in_flight` has only the unrolls at the trainer. The batcher counts the waiting unrolls in its buffers.
@@ -96,6 +106,8 @@ impl Ledger {
             entries: HashMap::new(),
             actors: HashMap::new(),
             next_actor: 0,
+            stride: 1,
+            sparse: false,
             clock: 0,
             capacity: capacity.max(1),
             sums: Accounting::default(),
@@ -115,6 +127,26 @@ impl Ledger {
         self
     }
 
+    /// The part of this ledger that one of several ranks keeps: the accounts of the actors that [`home`] gives it, and new indices of
+    /// its own. Rank 0 keeps the sums so far, so the sums of all ranks together are those of the run.
+    #[must_use]
+    pub fn part_of(mut self, rank: usize, ranks: usize) -> Self {
+        let is_own = |actor: u64| home(actor, ranks) == rank;
+        self.entries.retain(|actor, _| is_own(*actor));
+        self.actors.retain(|_, actor| is_own(*actor));
+        self.stride = ranks.max(1) as u64;
+        self.sparse |= ranks > 1;
+        while !is_own(self.next_actor) {
+            self.next_actor += 1;
+        }
+        if rank > 0 {
+            self.sums = Accounting::default();
+            self.tasks = Tasks::default();
+            self.others.clear();
+        }
+        self
+    }
+
     /// Opens an account, or finds the account of this incarnation. `claimed` is the index that the actor had before.
     ///
     /// # Errors
@@ -127,17 +159,19 @@ impl Ledger {
             entry.heard = self.clock;
             return Ok(Joined { actor: *actor, next_sequence: entry.next_sequence });
         }
-        // Every index below `next_actor` was assigned in this run. An index without an entry was closed. An index of
+        // Every index below `next_actor` was assigned in this run, unless several ranks counted apart. An index without an
+        // entry was closed. An index of
         // another incarnation was assigned again after a restart from a checkpoint without this actor; then the actor
         // gets a new account. An actor with an index that is not assigned yet gets a new account, too.
-        if let Some(actor) = claimed.filter(|actor| *actor < self.next_actor && !self.entries.contains_key(actor)) {
+        let closed = |actor: &u64| !self.sparse && *actor < self.next_actor && !self.entries.contains_key(actor);
+        if let Some(actor) = claimed.filter(closed) {
             return Err(JoinError::Closed { actor, incarnation });
         }
         if self.entries.len() >= self.capacity {
             self.close_least_recent();
         }
         let actor = self.next_actor;
-        self.next_actor += 1;
+        self.next_actor += self.stride;
         self.entries.insert(actor, Entry { incarnation, next_sequence: 0, heard: self.clock });
         self.actors.insert(incarnation, actor);
         Ok(Joined { actor, next_sequence: 0 })

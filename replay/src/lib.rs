@@ -81,7 +81,7 @@ pub use accounting::{Accounting, AccountingByTask, Dropped, Reason, TaskAccounti
 pub use batch::Batch;
 pub use batcher::{Batcher, Next, Outcome};
 pub use config::{BatchOrder, Config};
-pub use ledger::{JoinError, Joined, Ledger, MOST_LOST};
+pub use ledger::{JoinError, Joined, Ledger, MOST_LOST, home};
 pub use phase::Phase;
 pub use rate_limiter::{RateError, RateLimiter};
 pub use snapshot::{Account, Error, LedgerSnapshot};

@@ -1,6 +1,6 @@
 //! The ledger in a checkpoint.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 use comic_proto::MAX_SEQUENCE;
 use serde::{Deserialize, Serialize};
@@ -32,8 +32,41 @@ pub struct LedgerSnapshot {
     pub tasks: BTreeMap<String, TaskAccounting>,
     /// The index of the next new actor.
     pub next_actor: u64,
-    /// Open accounts, sorted by their last activity, the oldest first.
+    /// Open accounts, sorted by their last activity, the oldest first; with several ranks those of each rank in turn.
     pub accounts: Vec<Account>,
+    /// Whether some lower indices than `next_actor` were never assigned, because several ranks counted apart.
+    #[serde(default)]
+    pub sparse: bool,
+}
+
+impl LedgerSnapshot {
+    /// The ledger of all ranks together, from that of each; `None` without a rank. A process whose answer to its first `Join` was lost
+    /// may have an account at two ranks. It uses the newer one, so that has at least as many unrolls, and the other one is closed.
+    pub fn of_ranks(ranks: impl IntoIterator<Item = Self>) -> Option<Self> {
+        let mut all = Self::sum(ranks)?;
+        let mut newest: HashMap<u64, Account> = HashMap::new();
+        for account in &all.accounts {
+            let known = newest.entry(account.incarnation).or_insert(*account);
+            if (account.next_sequence, account.actor) > (known.next_sequence, known.actor) {
+                *known = *account;
+            }
+        }
+        all.accounts.retain(|account| newest.get(&account.incarnation) == Some(account));
+        Some(all)
+    }
+
+    fn sum(ranks: impl IntoIterator<Item = Self>) -> Option<Self> {
+        ranks.into_iter().reduce(|mut all, rank| {
+            all.sparse = true;
+            all.accounting += rank.accounting;
+            for (task, accounting) in rank.tasks {
+                *all.tasks.entry(task).or_default() += accounting;
+            }
+            all.next_actor = all.next_actor.max(rank.next_actor);
+            all.accounts.extend(rank.accounts);
+            all
+        })
+    }
 }
 
 /// The reason why a snapshot cannot be restored.
@@ -77,7 +110,7 @@ impl Ledger {
             .collect();
         let AccountingByTask { all: accounting, mut tasks } = self.accounting(waiting);
         tasks.extend(self.others.iter().map(|(task, accounting)| (task.clone(), *accounting)));
-        LedgerSnapshot { accounting, tasks, next_actor: self.next_actor, accounts }
+        LedgerSnapshot { accounting, tasks, next_actor: self.next_actor, accounts, sparse: self.sparse }
     }
 
     /// The ledger of a new learner epoch. The unrolls that were in flight are lost at restart.
@@ -126,6 +159,7 @@ impl Ledger {
             ledger.others.insert(task.clone(), accounting);
         }
         ledger.next_actor = snapshot.next_actor;
+        ledger.sparse = snapshot.sparse;
         ledger.sums = sums;
         Ok(ledger)
     }

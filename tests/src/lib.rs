@@ -8,6 +8,7 @@
 //! - [`lockstep`] starts runs in which the seed decides every parameter.
 //! - [`modules`] finds circles among the modules of a crate.
 //! - [`process`] is a running program.
+//! - [`ranks`] are several learners that train one run.
 //! - [`relay`] is a slow line to the learner.
 //! - [`repository`] reads the workspace's own files and dependencies.
 //! - [`steps`] are the steps that several tests take with a learner and its actors.
@@ -21,6 +22,7 @@ pub mod kubernetes;
 pub mod lockstep;
 pub mod modules;
 pub mod process;
+pub mod ranks;
 pub mod relay;
 pub mod repository;
 pub mod steps;

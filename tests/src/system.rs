@@ -109,7 +109,7 @@ pub struct System {
     port: u16,
     /// Reserves the port for this system.
     _kept: UdpSocket,
-    arguments: Vec<String>,
+    pub(crate) arguments: Vec<String>,
     /// How actors and tests reach the learner. With an authority they use https.
     pub access: Access,
     /// The learner's `RUST_LOG`, if it is not the default.
@@ -328,7 +328,7 @@ impl System {
         asking.output().context("cannot start comic-learner")
     }
 
-    fn spawn(&mut self, kind: &str, mut command: Command) -> Result<Process> {
+    pub(crate) fn spawn(&mut self, kind: &str, mut command: Command) -> Result<Process> {
         self.started += 1;
         let log = self.directory.path().join(format!("{}-{kind}.log", self.started));
         let output = OpenOptions::new().create(true).append(true).open(&log).context("cannot write a log")?;
@@ -427,7 +427,7 @@ pub fn metric(status: &Status, name: &str) -> f64 {
 
 /// A free port below the ephemeral range, so that no client gets it while the learner is down. The UDP socket reserves it
 /// among the tests of this process. UDP ports are separate from TCP ports, so the learner can still listen.
-fn free_port() -> Result<(u16, UdpSocket)> {
+pub(crate) fn free_port() -> Result<(u16, UdpSocket)> {
     let offset = u16::try_from(std::process::id() % 10_000)?;
     let mut candidates = (0..10_000).map(|step| 20_000 + (offset + step) % 10_000);
     let free = candidates.find_map(|port| {

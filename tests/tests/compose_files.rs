@@ -28,12 +28,14 @@ fn command(file: &str, service: &str) -> Result<Vec<String>> {
 
 #[test]
 fn every_container_is_limited_and_writes_where_it_is_told() -> Result<()> {
-    let (plain, tls) = (compose("compose.yaml")?, compose("compose.tls.yaml")?);
+    let plain = compose("compose.yaml")?;
+    let overlays = [compose("compose.tls.yaml")?, compose("compose.data-parallel.yaml")?];
     let services =
         |document: &Value| Ok::<_, anyhow::Error>(document["services"].as_mapping().context("no services")?.clone());
     let plain = services(&plain)?;
-    // The second file is laid over the first: only services that the first does not have are complete in it.
-    let own = services(&tls)?.into_iter().filter(|(name, _)| !plain.contains_key(name));
+    // The other files are laid over the first: only services that the first does not have are complete in them.
+    let own = overlays.iter().map(services).collect::<Result<Vec<_>>>()?;
+    let own = own.into_iter().flatten().filter(|(name, _)| !plain.contains_key(name));
     for (name, service) in plain.iter().map(|(name, service)| (name.clone(), service.clone())).chain(own) {
         ensure!(service["read_only"] == true && service["cap_drop"][0] == "ALL", "{name:?}: {service:?}");
         ensure!(service["security_opt"][0] == "no-new-privileges:true", "{name:?}: {service:?}");
@@ -72,6 +74,25 @@ fn with_tls_the_learner_has_the_same_options_except_for_access() -> Result<()> {
     let certificates =
         ["--cert", "/access/server.pem", "--key", "/access/server-key.pem", "--client-ca", "/access/ca.pem"];
     ensure!(options == certificates, "{options:?}");
+    Ok(())
+}
+
+#[test]
+fn two_learners_have_the_options_of_one_and_are_two_ranks_of_one_run() -> Result<()> {
+    let plain = command("compose.yaml", "learner")?;
+    let rank = |service: &str| -> Result<(Vec<String>, Vec<String>)> {
+        let mut words = command("compose.data-parallel.yaml", service)?;
+        let at = words.iter().position(|word| word == "--world-size").context("no --world-size")?;
+        let world = words.split_off(at);
+        Ok((words, world))
+    };
+    let (first, world) = rank("learner")?;
+    ensure!(first == plain, "{first:?} and {plain:?}");
+    ensure!(world == ["--world-size", "2", "--rank", "0", "--rendezvous", "learner:7071"], "{world:?}");
+    let (second, world) = rank("learner-1")?;
+    let run = plain.iter().position(|word| word == "--run").context("no --run")?;
+    ensure!(second == [&plain[..run], &plain[run + 2..]].concat(), "{second:?} and {plain:?}");
+    ensure!(world == ["--world-size", "2", "--rank", "1", "--rendezvous", "learner:7071"], "{world:?}");
     Ok(())
 }
 

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use comic_proto::v1::learner_client::LearnerClient;
 use comic_proto::v1::{JoinReply, JoinRequest};
-use comic_proto::{Access, AccessError, Client, PROTOCOL_VERSION, chain, distrusted, no_connection};
+use comic_proto::{Access, AccessError, Client, PROTOCOL_VERSION, chain, distrusted, no_connection, url_of_sibling};
 use tonic::{Code, Request, Status};
 
 use super::{JoinSettings, Terms};
@@ -12,6 +12,8 @@ use crate::Error;
 
 /// Deadline of a unary call.
 pub(super) const CALL: Duration = Duration::from_secs(10);
+/// How often one learner may send an actor to another, until one takes it.
+const MOST_HOPS: usize = 2;
 /// Room for the experiment with the names of some thousand clips. Pieces of parameters and assets are far smaller.
 const MESSAGE_LIMIT: usize = 16 << 20;
 
@@ -97,6 +99,8 @@ pub(super) struct Link {
 #[derive(Debug)]
 pub(super) struct Connector {
     address: String,
+    /// The learner that takes this actor, if the one at `address` sent it there.
+    home: Option<String>,
     access: Access,
     name: String,
     threads: Option<u32>,
@@ -114,6 +118,7 @@ impl Connector {
         let number = |given: Option<usize>| given.map(|number| u32::try_from(number).unwrap_or(u32::MAX));
         let connector = Self {
             address: options.learner.clone(),
+            home: None,
             access: options.access.clone(),
             name: options.name.clone().unwrap_or_default(),
             threads: number(options.threads),
@@ -135,9 +140,33 @@ impl Connector {
         self.incarnation
     }
 
-    /// Connects and joins. `acknowledged` is the sequence number below which every unroll is acknowledged.
+    /// Connects and joins, at the learner that takes this actor. If that one is lost, the next attempt begins at the first one again.
+    /// `acknowledged` is the sequence number below which every unroll is acknowledged.
     pub(super) async fn connect(&mut self, acknowledged: u64) -> Result<Link, Failure> {
-        let mut client = self.client().await?;
+        for _ in 0..=MOST_HOPS {
+            let address = self.home.take().unwrap_or_else(|| self.address.clone());
+            let link = self.join(&address, acknowledged).await.map_err(|failure| self.at(&address, failure))?;
+            if link.reply.learner.is_empty() {
+                self.home = Some(address);
+                return Ok(self.joined(link));
+            }
+            self.home = Some(url_of_sibling(&self.address, &link.reply.learner));
+        }
+        self.home = None;
+        Err(Failure::Postponed("the learners send this actor from one to the other".into()))
+    }
+
+    /// Names the learner that failed, if it is not the first one.
+    fn at(&self, address: &str, failure: Failure) -> Failure {
+        match failure {
+            Failure::Lost(reason) if address != self.address => Failure::Lost(format!("{address}: {reason}")),
+            Failure::Postponed(reason) if address != self.address => Failure::Postponed(format!("{address}: {reason}")),
+            other => other,
+        }
+    }
+
+    async fn join(&self, address: &str, acknowledged: u64) -> Result<Link, Failure> {
+        let mut client = self.client(address).await?;
         let mut request = Request::new(JoinRequest {
             incarnation: self.incarnation,
             actor: self.actor,
@@ -151,8 +180,14 @@ impl Connector {
         request.set_timeout(CALL);
         let reply = match client.join(request).await {
             Ok(reply) => reply.into_inner(),
-            Err(status) => return Err(self.judge(status)),
+            Err(status) => return Err(self.judge(address, status)),
         };
+        Ok(Link { client, reply })
+    }
+
+    /// Keeps what the learner said, for the next time.
+    fn joined(&mut self, link: Link) -> Link {
+        let reply = &link.reply;
         if self.learner_epoch.replace(reply.learner_epoch) != Some(reply.learner_epoch) {
             tracing::info!(actor = reply.actor, learner_epoch = reply.learner_epoch, "joined the learner");
         } else {
@@ -161,11 +196,11 @@ impl Connector {
         self.actor = Some(reply.actor);
         // 0 means that the run has no number.
         self.run = Some(reply.run).filter(|run| *run != 0);
-        Ok(Link { client, reply })
+        link
     }
 
-    async fn client(&self) -> Result<Client, Failure> {
-        let connected = connect(&self.address, &self.access).await;
+    async fn client(&self, address: &str) -> Result<Client, Failure> {
+        let connected = connect(address, &self.access).await;
         connected.map_err(|failure| if self.actor.is_some() { failure.transient() } else { failure })
     }
 
@@ -180,22 +215,22 @@ impl Connector {
         if Terms::of(&link.reply) == *terms { Ok(link) } else { Err(Failure::Fatal(Error::Changed)) }
     }
 
-    fn judge(&self, status: Status) -> Failure {
+    fn judge(&self, address: &str, status: Status) -> Failure {
         let message = describe(&status);
         // An actor that has joined before has a correct configuration. It may be accepted again, for instance with a
         // renewed token.
         match (status.code(), self.actor) {
-            (Code::Unauthenticated, None) => unwelcome(&self.address, status.message().to_string()),
+            (Code::Unauthenticated, None) => unwelcome(address, status.message().to_string()),
             (Code::Unauthenticated, Some(_)) => Failure::Postponed(message),
             (
                 Code::InvalidArgument | Code::FailedPrecondition | Code::Unimplemented | Code::PermissionDenied,
                 actor,
             ) => Failure::Fatal(match actor {
                 Some(actor) => Error::Dismissed { actor, message },
-                None => Error::Refused { url: self.address.clone(), message },
+                None => Error::Refused { url: address.to_owned(), message },
             }),
             (Code::Aborted, _) => Failure::Fatal(Error::Superseded { message }),
-            _ if self.is_barred(&status) => unwelcome(&self.address, chain(&status)),
+            _ if self.is_barred(&status) => unwelcome(address, chain(&status)),
             _ => status.into(),
         }
     }

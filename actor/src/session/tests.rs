@@ -95,6 +95,53 @@ async fn an_actor_sends_its_name_and_superseding_it_is_no_configuration_error() 
     assert_eq!(learner.seen().joins[0].name, "pod-0");
 }
 
+/// A learner that sends every actor to another one.
+async fn sends_to(other: &FakeLearner) -> FakeLearner {
+    let elsewhere = other.address().strip_prefix("http://").map(str::to_owned);
+    FakeLearner::start(Script { elsewhere, ..Script::default() }).await
+}
+
+#[tokio::test]
+async fn an_actor_joins_the_learner_that_it_is_sent_to_and_comes_back_to_that_one() {
+    let home = FakeLearner::start(Script { breaks: vec![(1, 1)], ..Script::default() }).await;
+    let first = sends_to(&home).await;
+    let running = start(&first).await;
+    for number in 0..3 {
+        running.unrolls.send(unroll(number)).await.unwrap();
+    }
+    drop(running.unrolls);
+    assert_eq!(running.session.await.unwrap().unwrap().taken, 3);
+    let (asked, joined) = (first.seen().joins, home.seen().joins);
+    assert_eq!((asked.len(), joined.len()), (1, 2));
+    assert_eq!(joined[1].actor, Some(learner::ACTOR));
+}
+
+#[tokio::test]
+async fn an_actor_that_loses_the_learner_that_it_was_sent_to_begins_at_the_first_again() {
+    let machine = tokio::runtime::Runtime::new().unwrap();
+    let home = machine.spawn(FakeLearner::start(Script::default())).await.unwrap();
+    let first = sends_to(&home).await;
+    let running = start(&first).await;
+    machine.shutdown_background();
+    first.until(|seen| seen.joins.len() > 1).await;
+    assert_eq!(first.seen().joins[1].actor, Some(learner::ACTOR), "it says who it was");
+    running.stop.send_replace(true);
+    running.session.abort();
+}
+
+#[tokio::test]
+async fn learners_that_send_an_actor_around_are_asked_again_later() {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let elsewhere = Some(listener.local_addr().unwrap().to_string());
+    let learner = FakeLearner::serve(listener, Script { elsewhere, ..Script::default() });
+    let options = options_for(learner.address());
+    let (stop, stopped) = watch::channel(false);
+    let joining = tokio::spawn(async move { join(&options, stopped).await });
+    learner.until(|seen| seen.joins.len() > 6).await;
+    stop.send_replace(true);
+    assert!(matches!(joining.await.unwrap(), Err(Error::Stopped)));
+}
+
 /// No server listens at port 1.
 const NOBODY: &str = "http://127.0.0.1:1";
 

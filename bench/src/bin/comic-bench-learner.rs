@@ -4,7 +4,7 @@ use clap::{Parser, Subcommand};
 use comic_bench::replay::Replay;
 use comic_bench::service::{Crowd, Host, Ingest, Publish, Stalled, Swarm};
 use comic_bench::simulate::Simulate;
-use comic_bench::update::Update;
+use comic_bench::update::{Ranks, Update};
 
 /// The allocator of `comic-learner`.
 #[global_allocator]
@@ -21,6 +21,7 @@ struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Measurement {
     Update(Update),
+    Ranks(Ranks),
     Replay(Replay),
     Ingest(Ingest),
     Publish(Publish),
@@ -42,6 +43,9 @@ fn main() -> anyhow::Result<()> {
         // As in `comic-learner`, the update runs on a thread of its own: without MALLOC_ARENA_MAX its memory would be another arena.
         Measurement::Update(update) => {
             std::thread::spawn(move || update.run()).join().map_err(|_| anyhow::anyhow!("the measurement panicked"))?
+        }
+        Measurement::Ranks(ranks) => {
+            std::thread::spawn(move || ranks.run()).join().map_err(|_| anyhow::anyhow!("the measurement panicked"))?
         }
         Measurement::Replay(replay) => replay.run(),
         Measurement::Ingest(ingest) => ingest.run(),

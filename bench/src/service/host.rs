@@ -142,6 +142,7 @@ impl StandIn {
             batcher: batcher.clone(),
             publisher: publisher.clone(),
             quarantine: QuarantineArguments::default(),
+            placement: None,
         })?;
         Ok(Self { service, batcher, publisher, payload: Bytes::from(vec![1; options.parameters]) })
     }

@@ -115,6 +115,10 @@ impl AlgorithmParameters for Svg0 {
         rest.replay.check(rest.unroll.length, sequences)
     }
 
+    fn share(&mut self, _: usize) -> Result<(), Fault> {
+        ensure("algorithm", "svg0", false, "must be vmpo: the replays of several learners are not shared")
+    }
+
     fn unread(&self, rest: &Rest<'_>) -> Vec<&'static str> {
         let of_low_levels = if rest.transfers { &[][..] } else { &OF_LOW_LEVELS[..] };
         [&UNREAD[..], of_low_levels].concat()

@@ -134,6 +134,14 @@ impl AlgorithmParameters for Vmpo {
         ensure("vmpo.control_variate", self.control_variate, holds, remedy)
     }
 
+    fn share(&mut self, ranks: usize) -> Result<(), Fault> {
+        let minibatch = self.minibatch_unrolls;
+        let holds = minibatch.is_multiple_of(ranks);
+        ensure("vmpo.minibatch_unrolls", minibatch, holds, format!("must be a multiple of {ranks}"))?;
+        self.minibatch_unrolls /= ranks;
+        Ok(())
+    }
+
     fn unread(&self, _: &Rest<'_>) -> Vec<&'static str> {
         vec!["replay"]
     }

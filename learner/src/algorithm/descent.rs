@@ -13,15 +13,24 @@ pub(crate) struct Gradients {
     norm: Tensor,
 }
 
-impl Gradients {
-    /// As libtorch gave them, in the order of the group's parameters. A parameter that the loss does not depend on has no
-    /// gradient tensor; here its gradient is 0.
-    pub(crate) fn new(adam: &Adam, group: usize, mut gradients: Vec<Tensor>) -> Self {
-        for (gradient, parameter) in gradients.iter_mut().zip(adam.parameters(group)) {
-            if !gradient.defined() {
-                *gradient = parameter.detach().zeros_like();
-            }
+/// The gradient of `total` for each input. An input that the loss does not depend on has no gradient tensor; here its gradient is
+/// 0.
+///
+/// # Errors
+/// When libtorch refuses.
+pub(crate) fn gradients_of(total: &Tensor, inputs: &[&Tensor]) -> Result<Vec<Tensor>, Error> {
+    let mut gradients = Tensor::f_run_backward(&[total], inputs, false, false)?;
+    for (gradient, input) in gradients.iter_mut().zip(inputs) {
+        if !gradient.defined() {
+            *gradient = input.detach().zeros_like();
         }
+    }
+    Ok(gradients)
+}
+
+impl Gradients {
+    /// In the order of the group's parameters.
+    pub(crate) fn new(group: usize, gradients: Vec<Tensor>) -> Self {
         let norm = adam::global_norm(&gradients);
         Self { group, gradients, norm }
     }

@@ -2,6 +2,7 @@
 
 use crate::adam::StateError;
 use crate::algorithm::shape::MinibatchShape;
+use crate::world;
 
 /// Errors of an algorithm.
 #[derive(Debug, thiserror::Error)]
@@ -43,6 +44,9 @@ pub enum Error {
     /// The state does not fit.
     #[error(transparent)]
     State(#[from] StateError),
+    /// The other ranks are lost.
+    #[error(transparent)]
+    World(#[from] world::Error),
     /// libtorch refused an operation.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),
@@ -53,6 +57,7 @@ impl From<Error> for crate::error::Error {
         match error {
             Error::Torch(error) | Error::State(StateError::Torch(error)) => Self::Torch(error),
             Error::Networks(error) => Self::Networks(error),
+            Error::World(error) => Self::World(error),
             error => Self::Update(Box::new(error)),
         }
     }

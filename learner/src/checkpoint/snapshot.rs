@@ -13,6 +13,8 @@ use crate::error::{Error, Result};
 pub(super) const MANIFEST: &str = "MANIFEST.json";
 /// The part that says how far the run had come.
 pub(crate) const PROGRESS: &str = "progress.json";
+/// The part that has everything learned.
+pub(crate) const LEARNED: &str = "learner.safetensors";
 /// In transfer: the part that is the file of the frozen low level.
 pub(crate) const LOW_LEVEL: &str = "low_level.safetensors";
 /// What the path of a checkpoint has to name.

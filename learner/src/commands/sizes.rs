@@ -9,6 +9,7 @@ use crate::algorithm::Parts;
 use crate::algorithms;
 use crate::document::DocumentArguments;
 use crate::error::{Error, Result};
+use crate::world::World;
 
 /// The paper's presets.
 const PRESETS: [&str; 6] =
@@ -22,7 +23,13 @@ pub fn count(experiment: &Experiment) -> Result<BTreeMap<&'static str, usize>> {
     let spec = TaskSpec::new(experiment, vec!["clip".into()])
         .map_err(|name| Error::Defect(format!("no observation `{name}`")))?;
     let pose = vec![0.0; spec.action];
-    let learner = algorithms::learner(Parts { experiment, spec: &spec, pose: &pose, device: Device::Cpu })?;
+    let learner = algorithms::learner(Parts {
+        experiment,
+        spec: &spec,
+        pose: &pose,
+        device: Device::Cpu,
+        world: &World::alone(),
+    })?;
     let mut counts = BTreeMap::new();
     for (name, count) in learner.parameter_counts() {
         let part = match name.split('.').collect::<Vec<_>>()[..] {

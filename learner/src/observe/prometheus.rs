@@ -17,7 +17,8 @@ use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use crate::algorithm::replay::ReplayReport;
 use crate::error::{Error, Result};
 use crate::observe::catalogue::{Catalogue, Description, Labelled, TASKS};
-use crate::observe::metrics_file::{Rows, Waited};
+use crate::observe::metrics_file::Waited;
+use crate::observe::window::Rows;
 
 /// How many versions old the unrolls of the newest update were.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -217,8 +218,8 @@ impl Default for Prometheus {
             joins: all.labelled(
                 "counter",
                 ("comic_joins", "result"),
-                &["joined", "full", "draining", "limited", "refused"],
-                "Attempts to join, reconnections included: accepted, refused because --max-actors are present, because the \
+                &["joined", "elsewhere", "full", "draining", "limited", "refused"],
+                "Attempts to join, reconnections included: accepted, sent to another learner of the run, refused because --max-actors are present, because the \
                  learner is going down or because the name joins too often, refused for good",
             ),
             connections: all.gauge("comic_connections", "Connections that are open"),

@@ -1,38 +1,47 @@
 //! What a learner epoch begins with: the experiment, the checkpoint to resume from, and the parts made of them.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use comic_clips::Catalogue;
+use comic_clips::{Asset, Catalogue};
 use comic_experiment::{Difference, Experiment, InitialPose, TaskSpec, Unroll};
 use comic_proto::{UnrollLayout, UnrollShape};
 use comic_replay::{BatchOrder, Batcher, Config, Ledger, Phase};
 
 use super::low_level::LowLevel;
+use super::opening::{self, Epoch};
 use crate::checkpoint::{Snapshot, Store, incompatible};
 use crate::device::Backend;
 use crate::error::{Error, Result};
+use crate::meeting::Meeting;
 use crate::options::Options;
 use crate::publish::Publisher;
 use crate::security::Security;
+use crate::service::placement::Placement;
 use crate::service::{self, Service};
 use crate::train::parts::TrainerParts;
 
-/// The trainer's parts and the service. Begins the learner epoch.
+/// The trainer's parts and the service. Begins the learner epoch. Rank 0 has the `store` of the run, and tells the others what is in
+/// it. What actors fetch is in the directory `files`.
 pub(super) fn prepare(
     options: &Options,
     mut experiment: Experiment,
     backend: Backend,
     security: Security,
+    store: Option<Store>,
+    files: &Path,
+    meeting: Meeting,
 ) -> Result<(TrainerParts, Service)> {
-    let store = Store::open(&options.run, experiment.learner.checkpoints_kept)?;
-    let newest = store.newest()?;
+    let Meeting { world, addresses } = meeting;
+    let newest = store.as_ref().map(Store::newest).transpose()?.flatten();
     if let Some((_, snapshot)) = &newest {
         snapshot.check_format().map_err(|error| incompatible(&options.run, error))?;
     }
+    let newest = opening::share_checkpoint(&world, newest)?;
     let low_level = LowLevel::find(&mut experiment, newest.as_ref().map(|(_, snapshot)| snapshot))?;
     let catalogue = Catalogue::open(&experiment.clips)?;
     catalogue.check_joint(&experiment)?;
+    opening::check_equality(&world, &experiment, &catalogue)?;
     let names = catalogue.entries().iter().map(|entry| entry.name.clone()).collect();
     let spec = TaskSpec::new(&experiment, names).map_err(|name| {
         Error::configuration(format!("tracking.observations: the tracking task has no observation `{name}`"))
@@ -42,29 +51,25 @@ pub(super) fn prepare(
         InitialPose::ReferenceMean => catalogue.mean_action()?.iter().map(|action| *action as f32).collect(),
     };
     let resume = resumed(newest, options, &experiment, &spec)?;
-    let epoch = store.begin_epoch()?;
-    let document = options.run.join("experiment.toml");
-    let text = experiment.to_toml()?;
-    // On a full disk a write leaves the file empty, so a run that is continued without a change writes nothing.
-    if std::fs::read(&document).ok().as_deref() != Some(text.as_bytes()) {
-        std::fs::write(&document, text).map_err(Error::file("write", document))?;
-    }
+    let begun = store.map(|store| begin(&store, &options.run, &experiment)).transpose()?;
+    let Epoch { epoch, run: id } = opening::share_epoch(&world, begun)?;
     let ledger = match &resume {
         Some(snapshot) => accounting(snapshot).map_err(|error| incompatible(&options.run, error))?,
         None => Ledger::new(),
     };
+    let ledger = ledger.part_of(world.rank(), world.size());
     let ledger = ledger.with_tasks(spec.tasks.iter().map(|task| task.name.clone()));
     let layout = Arc::new(UnrollLayout::new(UnrollShape::new(&spec, &experiment)));
-    let config = batches(&experiment);
+    let config = batches(&experiment.share(world.size())?);
     let batcher = Batcher::new(layout, config, Phase::begin(epoch), ledger);
     let publisher = Publisher::new(epoch);
-    let mut assets = catalogue.assets()?;
+    let mut assets = assets(&catalogue, &files.join("assets"))?;
     if let Some(low_level) = &low_level {
-        assets.push(low_level.offer(&options.run, experiment.transfer.low_level.clone())?);
+        assets.push(low_level.offer(files, experiment.transfer.low_level.clone())?);
     }
     let service = Service::new(service::Setup {
         run: options.run.clone(),
-        id: store.run()?,
+        id,
         security,
         limits: options.limits.clone(),
         experiment: experiment.clone(),
@@ -73,6 +78,7 @@ pub(super) fn prepare(
         batcher: batcher.clone(),
         publisher: publisher.clone(),
         quarantine: options.quarantine.clone(),
+        placement: (world.size() > 1).then(|| Placement::new(world.rank(), addresses)),
     })?;
     let run = options.run.clone();
     let handle = service.trainer();
@@ -83,6 +89,7 @@ pub(super) fn prepare(
         pose,
         low_level,
         backend,
+        world,
         run,
         epoch,
         resume,
@@ -91,6 +98,27 @@ pub(super) fn prepare(
         service: handle,
     };
     Ok((parts, service))
+}
+
+/// The files that actors may not have, cut to the clips in use.
+fn assets(catalogue: &Catalogue, cuts: &Path) -> Result<Vec<Asset>> {
+    catalogue.assets(Some(cuts)).or_else(|error| {
+        // On a full disk for instance, or where a clip has a name that we do not write.
+        tracing::warn!("actors get whole files of clips: {}", comic_proto::chain(&error));
+        Ok(catalogue.assets(None)?)
+    })
+}
+
+/// Begins another epoch of the run, and writes the experiment into its directory.
+fn begin(store: &Store, run: &Path, experiment: &Experiment) -> Result<Epoch> {
+    let epoch = store.begin_epoch()?;
+    let document = run.join("experiment.toml");
+    let text = experiment.to_toml()?;
+    // On a full disk a write leaves the file empty, so a run that is continued without a change writes nothing.
+    if std::fs::read(&document).ok().as_deref() != Some(text.as_bytes()) {
+        std::fs::write(&document, text).map_err(Error::file("write", document))?;
+    }
+    Ok(Epoch { epoch, run: store.run()? })
 }
 
 /// The newest checkpoint, if there is one and the run may resume from it.

@@ -22,6 +22,7 @@ use super::intake::Intake;
 use super::join::{self, Join, JoinTerms};
 use super::memory::IngestLimits;
 use super::offer::{NewestCheckpoint, Offer, description};
+use super::placement::Placement;
 use super::quarantine::{Quarantine, QuarantineArguments};
 use super::room::Room;
 use super::roster::{Absent, Roster};
@@ -64,6 +65,8 @@ pub struct Setup {
     pub publisher: Publisher,
     /// Where invalid unrolls go.
     pub quarantine: QuarantineArguments,
+    /// Which actors belong elsewhere, if several learners train this run.
+    pub placement: Option<Placement>,
 }
 
 impl Setup {
@@ -133,7 +136,7 @@ impl Service {
     pub fn new(setup: Setup) -> Result<Self> {
         let message_limit = setup.message_limit()?;
         let common = Common::new(&setup);
-        let Setup { run, id, security, limits, experiment, spec, assets, quarantine, .. } = setup;
+        let Setup { run, id, security, limits, experiment, spec, assets, quarantine, placement, .. } = setup;
         let Common { publisher, roster, room, shutdown, prometheus, .. } = common.clone();
         let terms = JoinTerms::new(id, &experiment, &spec, assets.iter().map(description).collect())?;
         let quarantine = Quarantine::start(&quarantine, &prometheus)?;
@@ -148,8 +151,9 @@ impl Service {
             limits,
             prometheus: prometheus.clone(),
         };
+        let placement = placement.map(Arc::new);
         let calls = Calls {
-            join: common.join(terms),
+            join: common.join(terms, placement.clone()),
             assets: Assets::new(assets, checkpoint.clone(), shutdown.clone()),
             evaluations: evaluations.clone(),
             status: status.clone(),
@@ -163,7 +167,7 @@ impl Service {
             unrolls: Arc::new(Unrolls { intake, message_limit, room, shutdown: shutdown.clone() }),
             parameters: Arc::new(Parameters { publisher, roster, shutdown: shutdown.clone() }),
             shutdown,
-            trainer: TrainerHandle { run: id, prometheus, evaluations, checkpoint, status, ingest },
+            trainer: TrainerHandle { run: id, prometheus, evaluations, checkpoint, status, ingest, placement },
         })
     }
 
@@ -228,7 +232,7 @@ impl Common {
             run,
             experiment: experiment.name.clone(),
             started: Instant::now(),
-            capacity: (experiment.unroll.ahead as u64 + 1) * experiment.unroll.batch as u64,
+            capacity: batcher.capacity() as u64,
             metrics: Mutex::new(String::from("{}")),
             batcher,
             publisher,
@@ -240,10 +244,10 @@ impl Common {
         }
     }
 
-    fn join(&self, terms: JoinTerms) -> Join {
+    fn join(&self, terms: JoinTerms, placement: Option<Arc<Placement>>) -> Join {
         let Self { batcher, publisher, roster, assignments, shutdown, prometheus, .. } = self.clone();
         let (epoch, joins) = (publisher.epoch(), join::joins());
-        Join { terms, batcher, roster, assignments, shutdown, prometheus, epoch, joins }
+        Join { terms, batcher, roster, assignments, shutdown, prometheus, epoch, joins, placement }
     }
 
     fn intake(&self, spec: &TaskSpec, quarantine: Option<Quarantine>) -> Intake {
@@ -278,12 +282,25 @@ pub struct TrainerHandle {
     checkpoint: NewestCheckpoint,
     status: Arc<StatusBoard>,
     ingest: IngestLimits,
+    placement: Option<Arc<Placement>>,
 }
 
 impl TrainerHandle {
     /// The run's number, which no other run has.
     pub fn id(&self) -> u64 {
         self.run
+    }
+
+    /// The number of actors that are connected, if anyone asks.
+    pub fn actors(&self) -> u64 {
+        self.placement.as_ref().map_or(0, |_| self.status.actors())
+    }
+
+    /// Tells how many actors each rank has, for those that come.
+    pub fn place_actors(&self, actors: &[u64]) {
+        if let Some(placement) = &self.placement {
+            placement.count(actors);
+        }
     }
 
     /// Notes that the trainer moves. A learner whose trainer does not move is not healthy.

@@ -11,6 +11,7 @@ use tonic::Status;
 
 use super::assignments::{Assignment, Assignments, Denied};
 use super::peer::{Owner, Peer};
+use super::placement::Placement;
 use super::roster::{Joined, Name, Roster, superseded};
 use super::shutdown::Shutdown;
 use crate::error::{Error, Result};
@@ -73,6 +74,8 @@ pub(super) struct Join {
     pub(super) epoch: u64,
     /// Limits the joins under each name of each owner.
     pub(super) joins: Joins,
+    /// Only if several learners train this run.
+    pub(super) placement: Option<Arc<Placement>>,
 }
 
 /// The limit on the joins under each name. The owner is part of it, so that nobody uses up the joins of a name of others.
@@ -89,7 +92,12 @@ impl Join {
     /// Answers a request on the connection of this peer, and counts the answer.
     pub(super) fn answer(&self, request: &JoinRequest, peer: Option<&Peer>) -> Result<JoinReply, Status> {
         let owner = peer.and_then(|peer| peer.owner);
-        let answer = self.check(request, owner).and_then(|()| self.accept(request, owner));
+        let checked = self.check(request, owner);
+        if let (Ok(()), Some(learner)) = (&checked, self.elsewhere(request)) {
+            self.prometheus.joins.of("elsewhere").inc();
+            return Ok(JoinReply { learner, ..JoinReply::default() });
+        }
+        let answer = checked.and_then(|()| self.accept(request, owner));
         let result = answer.as_ref().map_or_else(|Refusal(result, _)| *result, |_| "joined");
         self.prometheus.joins.of(result).inc();
         if let Ok(JoinReply { actor, .. }) = &answer {
@@ -98,6 +106,15 @@ impl Join {
             tracing::info!(actor, incarnation, peer = ?address, "actor joined");
         }
         answer.map_err(|Refusal(_, status)| status)
+    }
+
+    /// Where the actor has to go, if it belongs to another rank.
+    fn elsewhere(&self, request: &JoinRequest) -> Option<String> {
+        // At the end of a run every rank says so, and another one may have ended.
+        let placement = self.placement.as_ref().filter(|_| !self.shutdown.run_is_over())?;
+        let incarnation = format!("{:016x}", request.incarnation);
+        let name = if request.name.is_empty() { &incarnation } else { &request.name };
+        placement.elsewhere(name, request.actor, Instant::now()).map(str::to_owned)
     }
 
     /// Checks what does not depend on other actors.
@@ -182,6 +199,7 @@ impl Join {
             next_sequence,
             environments,
             run: self.terms.run,
+            learner: String::new(),
         })
     }
 

@@ -42,10 +42,15 @@ impl Shutdown {
         Signal(self.closing.subscribe())
     }
 
+    /// Whether actors are told that the run is over.
+    pub(super) fn run_is_over(&self) -> bool {
+        self.publisher.run_is_over()
+    }
+
     /// The status with which a stream ends when the service closes: `None` when the run is over, because then the parameters
     /// have told the actor so.
     pub(super) fn status(&self) -> Option<Status> {
-        (!self.publisher.run_is_over()).then(|| Status::unavailable("the learner is draining: reconnect"))
+        (!self.run_is_over()).then(|| Status::unavailable("the learner is draining: reconnect"))
     }
 }
 

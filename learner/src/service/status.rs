@@ -42,6 +42,12 @@ impl StatusBoard {
         *self.metrics.lock() = json;
     }
 
+    /// The number of actors that are connected.
+    pub(super) fn actors(&self) -> u64 {
+        let Census { alive, slow, .. } = self.roster.census(Instant::now());
+        alive + slow
+    }
+
     /// What `GetStatus` answers.
     pub(super) fn status(&self) -> v1::Status {
         let accounting = self.batcher.accounting();

@@ -5,7 +5,7 @@ use comic_networks::{NormaliserStatistics, Policy as _, to_safetensors};
 use tch::{Device, Kind, Tensor};
 
 use crate::adam::{self, Adam};
-use crate::algorithm::descent::{Gradients, descend};
+use crate::algorithm::descent::{Gradients, descend, gradients_of};
 use crate::algorithm::error::Error;
 use crate::algorithm::loss_report::Losses;
 use crate::algorithm::masked_mean::masked_mean;
@@ -76,11 +76,11 @@ impl Algorithm for Svg0Learner {
         let total = terms.total();
         let [critic, policy] = [self.critic, self.policy].map(|group| self.adam.parameters(group));
         let parameters: Vec<&Tensor> = critic.iter().chain(policy).collect();
-        let mut critic_gradients = Tensor::f_run_backward(&[&total], &parameters, false, false)?;
+        let mut critic_gradients = gradients_of(&total, &parameters)?;
         let policy_gradients = critic_gradients.split_off(critic.len());
         // Each has its own limit: a large error of the critic does not slow down the policy.
-        let critic = Gradients::new(&self.adam, self.critic, critic_gradients);
-        let policy = Gradients::new(&self.adam, self.policy, policy_gradients);
+        let critic = Gradients::new(self.critic, critic_gradients);
+        let policy = Gradients::new(self.policy, policy_gradients);
         let norms = [critic.norm(), policy.norm()];
         let limit = optimiser.max_gradient_norm;
         let period = svg0.target_period as i64;

@@ -14,7 +14,8 @@ use crate::train::writer::Writer;
 /// The checkpoints of a run that trains.
 #[derive(Debug)]
 pub(super) struct Checkpoints {
-    writer: Writer,
+    /// The thread that writes; only rank 0 writes.
+    writer: Option<Writer>,
     /// Seconds between two of them.
     interval: f64,
     written: Instant,
@@ -23,23 +24,24 @@ pub(super) struct Checkpoints {
 }
 
 impl Checkpoints {
-    /// Opens the checkpoint directory of `run`, and starts the thread that writes.
+    /// Opens the checkpoint directory of `run`, if this rank writes any, and starts the thread that writes.
     ///
     /// # Errors
     /// When the directory cannot be made, or the system gives no thread.
-    pub(super) fn start(run: &Path, learner: &Learner, service: TrainerHandle) -> Result<Self> {
-        let writer = Writer::start(Store::open(run, learner.checkpoints_kept)?, service)?;
+    pub(super) fn start(run: Option<&Path>, learner: &Learner, service: TrainerHandle) -> Result<Self> {
+        let start = |run| Writer::start(Store::open(run, learner.checkpoints_kept)?, service);
+        let writer = run.map(start).transpose()?;
         Ok(Self { writer, interval: learner.checkpoint_seconds, written: Instant::now(), good: Arc::default() })
     }
 
-    /// Whether the newest checkpoint is old enough for another one.
-    pub(super) fn is_due(&self) -> bool {
-        self.written.elapsed().as_secs_f64() >= self.interval
+    /// Whether the newest checkpoint is old enough for another one, and is on disk: training does not wait for one.
+    pub(super) fn are_due(&self) -> bool {
+        self.writer.is_some() && self.written.elapsed().as_secs_f64() >= self.interval && !self.is_busy()
     }
 
     /// Whether the thread still writes: until it has finished, another request may have to wait.
     pub(super) fn is_busy(&self) -> bool {
-        self.writer.is_busy()
+        self.writer.as_ref().is_some_and(Writer::is_busy)
     }
 
     /// Keeps a state in memory as the last good one.
@@ -59,7 +61,7 @@ impl Checkpoints {
     pub(super) fn write(&mut self, name: Name, snapshot: Snapshot) -> Result<()> {
         self.set_good(snapshot);
         self.written = Instant::now();
-        self.writer.write(name, Arc::clone(&self.good))
+        self.writer.as_mut().map_or(Ok(()), |writer| writer.write(name, Arc::clone(&self.good)))
     }
 
     /// Keeps the checkpoint that was evaluated if it is the best.
@@ -67,7 +69,7 @@ impl Checkpoints {
     /// # Errors
     /// When the writing thread has ended.
     pub(super) fn judge(&self, evaluated: Evaluated) -> Result<()> {
-        self.writer.judge(evaluated)
+        self.writer.as_ref().map_or(Ok(()), |writer| writer.judge(evaluated))
     }
 
     /// Waits until everything is on disk.
@@ -75,6 +77,6 @@ impl Checkpoints {
     /// # Errors
     /// When the last snapshot could not be written.
     pub(super) fn finish(self) -> Result<()> {
-        self.writer.finish()
+        self.writer.map_or(Ok(()), Writer::finish)
     }
 }

@@ -10,11 +10,12 @@ use crate::checkpoint::Snapshot;
 use crate::device::Backend;
 use crate::publish::Publisher;
 use crate::service::TrainerHandle;
+use crate::world::World;
 
 /// What a trainer is made of.
 #[derive(Debug)]
 pub struct TrainerParts {
-    /// The resolved experiment.
+    /// The resolved experiment, of all ranks together.
     pub experiment: Experiment,
     /// The task's sizes and names.
     pub spec: TaskSpec,
@@ -24,7 +25,9 @@ pub struct TrainerParts {
     pub low_level: Option<Bytes>,
     /// The device.
     pub backend: Backend,
-    /// The run's directory.
+    /// The ranks that train the run.
+    pub world: World,
+    /// The run's directory; only rank 0 writes there.
     pub run: PathBuf,
     /// The learner epoch.
     pub epoch: u64,

@@ -7,6 +7,7 @@ use std::time::Duration;
 use comic_experiment::{Experiment, TaskSpec};
 use comic_proto::v1::{EpisodeEnd, UnrollHeader};
 use comic_replay::{AccountingByTask, Batch};
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
 use crate::algorithm::loss_report::{LossValues, Losses};
@@ -18,19 +19,23 @@ use crate::observe::evaluation::Evaluation;
 use crate::observe::metrics_file::{MetricsFile, Position, Waited};
 use crate::observe::page::State;
 use crate::observe::prometheus::Prometheus;
+use crate::observe::window::Window;
 use crate::service::TrainerHandle;
 use crate::train::parts::Ending;
 
 /// Counters, metric lines, and evaluations that came in.
 #[derive(Debug)]
 pub(super) struct Reports {
-    metrics: MetricsFile,
+    /// What this rank counted since the last line.
+    window: Window,
+    /// What is written; only rank 0 writes.
+    metrics: Option<MetricsFile>,
     /// Shows the newest metrics, and collects the evaluations that actors report.
     service: TrainerHandle,
     prometheus: Arc<Prometheus>,
     /// Seconds between two lines.
     interval: f64,
-    tasks: Vec<String>,
+    spec: TaskSpec,
     /// The newest finite losses, as a line shows them.
     losses: Map<String, Value>,
     /// The last update's losses, if reading them at once would mean to wait for the device.
@@ -40,18 +45,31 @@ pub(super) struct Reports {
     waited: Waited,
 }
 
+/// What one rank counted.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Counted {
+    window: Window,
+    accounting: AccountingByTask,
+}
+
 impl Reports {
-    /// Opens the metrics of `run`.
+    /// Opens the metrics of `run`, if this rank writes any.
     ///
     /// # Errors
     /// When their file cannot be opened.
-    pub(super) fn open(run: &Path, experiment: &Experiment, spec: &TaskSpec, service: TrainerHandle) -> Result<Self> {
+    pub(super) fn open(
+        run: Option<&Path>,
+        experiment: &Experiment,
+        spec: &TaskSpec,
+        service: TrainerHandle,
+    ) -> Result<Self> {
         Ok(Self {
-            metrics: MetricsFile::open(run, experiment, spec)?,
+            window: Window::default(),
+            metrics: run.map(|run| MetricsFile::open(run, experiment, spec)).transpose()?,
             prometheus: service.prometheus.clone(),
             service,
             interval: experiment.learner.metrics_seconds,
-            tasks: spec.tasks.iter().map(|task| task.name.clone()).collect(),
+            spec: spec.clone(),
             losses: Map::new(),
             deferred: None,
             replay: None,
@@ -61,29 +79,34 @@ impl Reports {
 
     /// Begins a learner epoch at this progress.
     pub(super) fn begin(&mut self, progress: &Progress, accounting: AccountingByTask) {
-        self.metrics.begin(progress.epoch, progress.environment_steps, accounting);
+        if let Some(metrics) = &mut self.metrics {
+            metrics.begin(progress.epoch, progress.environment_steps, accounting);
+        }
     }
 
     /// Ends the learner epoch.
     pub(super) fn end(&mut self, ended: &Result<Ending>) {
-        self.metrics.end(match ended {
+        let state = match ended {
             Ok(Ending::Budget) => State::Over,
             Ok(Ending::Stopped) => State::Stopped,
             Err(_) => State::Failed,
-        });
+        };
+        if let Some(metrics) = &mut self.metrics {
+            metrics.end(state);
+        }
     }
 
     /// Writes the run's page if the last one is a minute old.
     pub(super) fn write_page_when_due(&mut self) {
-        self.metrics.write_page_when_due();
+        if let Some(metrics) = &mut self.metrics {
+            metrics.write_page_when_due();
+        }
     }
 
-    /// Counts the rows and episodes of a batch that was used, and returns its environment steps.
-    pub(super) fn count_rows(&mut self, batch: &Batch) -> u64 {
-        let mut environment_steps = 0;
-        for (rows, task) in self.metrics.count_rows(batch).into_iter().zip(&self.tasks) {
-            environment_steps += rows.environment_steps;
-            self.prometheus.count_rows(task, rows);
+    /// Counts the rows and episodes of a batch that was used.
+    pub(super) fn count_rows(&mut self, batch: &Batch) {
+        for (rows, task) in self.window.count_rows(batch, &self.spec).into_iter().zip(&self.spec.tasks) {
+            self.prometheus.count_rows(&task.name, rows);
         }
         for UnrollHeader { actor, incarnation, sequence, version, .. } in batch.headers() {
             tracing::trace!(actor, incarnation = format_args!("{incarnation:016x}"), sequence, version, "trained on");
@@ -91,15 +114,16 @@ impl Reports {
         let episodes = batch.headers().iter().flat_map(|header| &header.episodes);
         let diverged = episodes.filter(|episode| episode.end() == EpisodeEnd::Diverged).count();
         self.prometheus.episodes_diverged.inc_by(diverged as u64);
-        environment_steps
     }
 
     /// Counts an update of so many gradient steps on a batch whose parameters were `version`; the duration is counted by
     /// [`count_duration`](Self::count_duration).
     pub(super) fn count_update(&mut self, batch: &Batch, version: u64, steps: u64) {
         self.prometheus.gradient_steps.inc_by(steps);
-        self.metrics.count_update();
-        self.metrics.count_episodes(batch.headers(), version);
+        self.window.count_episodes(batch.headers(), version, &self.spec);
+        if let Some(metrics) = &mut self.metrics {
+            metrics.count_update();
+        }
     }
 
     /// Counts the duration of an update on unrolls of these ages, in versions.
@@ -126,7 +150,9 @@ impl Reports {
 
     /// Counts gradient steps that were skipped.
     pub(super) fn count_skipped(&mut self, skipped: u64) {
-        self.metrics.count_skipped(skipped);
+        if let Some(metrics) = &mut self.metrics {
+            metrics.count_skipped(skipped);
+        }
         self.prometheus.updates_skipped.inc_by(skipped);
     }
 
@@ -151,15 +177,17 @@ impl Reports {
             return;
         }
         self.losses = losses.entries().iter().map(|(name, value)| ((*name).to_string(), json!(value))).collect();
-        if self.tasks.len() > 1 && losses.temperatures.len() == self.tasks.len() {
-            let named = self.tasks.iter().cloned().zip(losses.temperatures.iter().map(|eta| json!(eta)));
+        let tasks = &self.spec.tasks;
+        if tasks.len() > 1 && losses.temperatures.len() == tasks.len() {
+            let named =
+                tasks.iter().map(|task| task.name.clone()).zip(losses.temperatures.iter().map(|eta| json!(eta)));
             self.losses.insert("temperatures".to_string(), Value::Object(named.collect()));
         }
     }
 
     /// Whether the last line is old enough for another one.
     pub(super) fn are_due(&self) -> bool {
-        self.metrics.elapsed() >= self.interval
+        self.metrics.as_ref().is_some_and(|metrics| metrics.elapsed() >= self.interval)
     }
 
     /// Writes the evaluations that actors reported since the last time, and returns what they say of checkpoints. Those of a
@@ -180,19 +208,29 @@ impl Reports {
             }
             possible
         });
-        self.metrics.keep_evaluations(&evaluations);
+        if let Some(metrics) = &mut self.metrics {
+            metrics.keep_evaluations(&evaluations);
+        }
         evaluations.iter().filter_map(|evaluation| evaluation.evaluated()).collect()
     }
 
-    /// Writes a line of metrics if it says anything new.
-    pub(super) fn write_news(&mut self, progress: &Progress, accounting: AccountingByTask) {
-        if self.metrics.has_news(&accounting) {
-            self.write(progress, accounting);
-        }
+    /// What this rank counted since the last time.
+    pub(super) fn take_counted(&mut self, accounting: AccountingByTask) -> Counted {
+        Counted { window: std::mem::take(&mut self.window), accounting }
     }
 
-    /// Writes a line of metrics, and shows it as the run's status.
-    pub(super) fn write(&mut self, progress: &Progress, accounting: AccountingByTask) {
+    /// Writes a line of metrics of what all ranks `counted`, and shows it as the run's status. Leaves it out if it says nothing new,
+    /// unless it is the `last` one.
+    pub(super) fn write(&mut self, progress: &Progress, counted: Vec<Counted>, last: bool) {
+        let Some(metrics) = &mut self.metrics else { return };
+        let (mut window, mut accounting) = (Window::default(), AccountingByTask::default());
+        for counted in counted {
+            window += &counted.window;
+            accounting += counted.accounting;
+        }
+        if !last && !metrics.has_news(&window, &accounting) {
+            return;
+        }
         let position = Position {
             seconds: progress.seconds,
             environment_steps: progress.environment_steps,
@@ -202,7 +240,7 @@ impl Reports {
             epoch: progress.epoch,
             waited: self.waited,
         };
-        let line = self.metrics.write(position, accounting, self.losses.clone(), self.replay);
+        let line = metrics.write(position, &window, accounting, self.losses.clone(), self.replay);
         tracing::info!(target: "metrics", "{line}");
         self.service.set_metrics(line);
     }

@@ -81,7 +81,7 @@ impl State {
             ("task.json", serde_json::to_vec_pretty(spec).map_err(json("task.json"))?),
             ("policy.safetensors", self.algorithm.policy_parameters()?),
             ("target.safetensors", self.target.to_vec()),
-            ("learner.safetensors", tensors::to_bytes(&learned)?),
+            (snapshot::LEARNED, tensors::to_bytes(&learned)?),
             (PROGRESS, serde_json::to_vec_pretty(&self.progress).map_err(json(PROGRESS))?),
             ("accounting.json", serde_json::to_vec_pretty(accounting).map_err(json("accounting.json"))?),
         ];
@@ -106,7 +106,7 @@ impl State {
     /// # Errors
     /// As of [`restore`](Self::restore).
     pub(super) fn restore_learned(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let mut tensors = tensors::from_bytes(snapshot.part("learner.safetensors")?)?;
+        let mut tensors = tensors::from_bytes(snapshot.part(snapshot::LEARNED)?)?;
         self.statistics.restore(&mut tensors)?;
         let loaded = self.algorithm.load_state(&tensors);
         loaded.map_err(Error::within("the checkpoint does not fit the experiment's networks"))

@@ -7,12 +7,13 @@ use comic_replay::Batch;
 use tch::{Kind, Tensor};
 
 use crate::error::{Error, Result};
+use crate::world::World;
 
 /// The statistics of proprioception, which all tasks share, and of each task's own observation.
 #[derive(Debug)]
 pub struct ObservationStatistics {
-    /// Rows of the batches seen, padding included.
-    rows: f64,
+    /// Rows of the batches seen, padding included; float64.
+    rows: Tensor,
     proprioception: Statistics,
     /// By the task's name.
     tasks: Vec<(String, Statistics)>,
@@ -23,7 +24,7 @@ impl ObservationStatistics {
     pub fn new(spec: &TaskSpec) -> Self {
         let of_task = |name: &String| (name.clone(), Statistics::new(spec.task as i64));
         Self {
-            rows: 0.0,
+            rows: Tensor::from(0.0),
             proprioception: Statistics::new(spec.proprioception as i64),
             tasks: spec.tasks.iter().map(|task| of_task(&task.name)).collect(),
         }
@@ -31,7 +32,7 @@ impl ObservationStatistics {
 
     /// Rows of the batches seen. A count of rows, not of steps: the difference is one row in an unroll, and padding.
     pub fn rows(&self) -> f64 {
-        self.rows
+        self.rows.double_value(&[])
     }
 
     /// Whether there are no statistics yet for one of these tasks.
@@ -39,10 +40,35 @@ impl ObservationStatistics {
         tasks.iter().any(|task| self.tasks.get(*task).is_some_and(|(_, statistics)| statistics.count() == 0.0))
     }
 
-    /// Adds the observations of a batch.
+    /// Adds the observations of this batch, and of those of all other ranks.
+    ///
+    /// # Errors
+    /// When another rank is lost.
+    pub fn absorb(&mut self, batch: &Batch, world: &World) -> Result<()> {
+        let mut added = self.emptied();
+        added.count(batch);
+        world.sum_all(added.sums())?;
+        for (sum, added) in self.sums().zip(added.sums()) {
+            *sum += &*added;
+        }
+        Ok(())
+    }
+
+    /// The same without observations.
+    fn emptied(&self) -> Self {
+        let tasks = self.tasks.iter().map(|(task, statistics)| (task.clone(), statistics.emptied())).collect();
+        Self { rows: self.rows.zeros_like(), proprioception: self.proprioception.emptied(), tasks }
+    }
+
+    fn sums(&mut self) -> impl Iterator<Item = &mut Tensor> {
+        let of_tasks = self.tasks.iter_mut().flat_map(|(_, statistics)| statistics.sums());
+        std::iter::once(&mut self.rows).chain(self.proprioception.sums()).chain(of_tasks)
+    }
+
+    /// Counts the observations of a batch.
     ///
     /// If there are several tasks, a row that begins an episode counts only if a step follows it, because it may be padding.
-    pub fn absorb(&mut self, batch: &Batch) {
+    fn count(&mut self, batch: &Batch) {
         let tasks = batch.tasks();
         let length = batch.layout.shape().length;
         let (valid, first) = (batch.f32(Field::Valid), batch.f32(Field::First));
@@ -85,7 +111,7 @@ impl ObservationStatistics {
 
     /// As tensors, for a checkpoint.
     pub fn state(&self) -> Vec<(String, Tensor)> {
-        let rows = (ROWS.to_string(), Tensor::from(self.rows));
+        let rows = (ROWS.to_string(), self.rows.copy());
         std::iter::once(rows).chain(self.named().flat_map(|(name, statistics)| statistics.state(&name))).collect()
     }
 
@@ -95,7 +121,7 @@ impl ObservationStatistics {
     /// When a tensor is missing or of another shape.
     pub fn restore(&mut self, tensors: &mut Vec<(String, Tensor)>) -> Result<()> {
         let find = |wanted: &str| tensors.iter().find(|(name, _)| name == wanted).map(|(_, tensor)| tensor.copy());
-        let rows = find(ROWS).and_then(|rows| f64::try_from(rows).ok());
+        let rows = find(ROWS).and_then(|rows| f64::try_from(rows).ok()).map(Tensor::from);
         self.rows = rows.ok_or_else(|| Error::Checkpoint(format!("the checkpoint has no {ROWS}")))?;
         let named = std::iter::once((PROPRIOCEPTION.to_string(), &mut self.proprioception))
             .chain(self.tasks.iter_mut().map(|(task, statistics)| (of_task(task), statistics)));
@@ -125,7 +151,7 @@ fn of_task(task: &str) -> String {
 /// Running sums over rows, in float64.
 #[derive(Debug)]
 pub struct Statistics {
-    count: f64,
+    count: Tensor,
     sum: Tensor,
     squares: Tensor,
 }
@@ -134,7 +160,15 @@ impl Statistics {
     /// Nothing seen yet, for rows `width` wide.
     pub fn new(width: i64) -> Self {
         let zeros = || Tensor::zeros([width], (Kind::Double, tch::Device::Cpu));
-        Self { count: 0.0, sum: zeros(), squares: zeros() }
+        Self { count: Tensor::from(0.0), sum: zeros(), squares: zeros() }
+    }
+
+    fn emptied(&self) -> Self {
+        Self::new(self.sum.size()[0])
+    }
+
+    fn sums(&mut self) -> impl Iterator<Item = &mut Tensor> {
+        [&mut self.count, &mut self.sum, &mut self.squares].into_iter()
     }
 
     /// Adds rows `[…, width]`.
@@ -148,13 +182,13 @@ impl Statistics {
 
     /// Rows seen.
     pub fn count(&self) -> f64 {
-        self.count
+        self.count.double_value(&[])
     }
 
     /// Mean and standard deviation, `[width]` each, float32. A component that never changes gets deviation 1, so that it is
     /// not divided by 0.
     pub fn mean_and_std(&self) -> (Tensor, Tensor) {
-        let count = self.count.max(1.0);
+        let count = self.count().max(1.0);
         let mean = &self.sum / count;
         let variance = (&self.squares / count - mean.square()).clamp_min(0.0);
         let std = variance.sqrt();
@@ -166,7 +200,7 @@ impl Statistics {
     /// As tensors, for a checkpoint.
     pub fn state(&self, name: &str) -> Vec<(String, Tensor)> {
         vec![
-            (format!("{name}.count"), Tensor::from(self.count)),
+            (format!("{name}.count"), self.count.copy()),
             (format!("{name}.sum"), self.sum.copy()),
             (format!("{name}.squares"), self.squares.copy()),
         ]
@@ -180,7 +214,7 @@ impl Statistics {
         if sum.size() != self.sum.size() || squares.size() != self.squares.size() {
             return None;
         }
-        *self = Self { count, sum, squares };
+        *self = Self { count: Tensor::from(count), sum, squares };
         Some(())
     }
 }
@@ -194,7 +228,8 @@ mod tests {
     use comic_proto::{UnrollBuffer, UnrollLayout, UnrollShape};
 
     use super::*;
-    use crate::observe::metrics_file::{MetricsFile, Position, Rows};
+    use crate::observe::metrics_file::{MetricsFile, Position};
+    use crate::observe::window::{Rows, Window};
 
     /// Two tasks of one clip each.
     fn spec() -> TaskSpec {
@@ -238,7 +273,7 @@ mod tests {
         let spec = spec();
         let mut statistics = ObservationStatistics::new(&spec);
         assert!(statistics.lacks(&[1]));
-        statistics.absorb(&batch(&spec));
+        statistics.absorb(&batch(&spec), &World::alone()).unwrap();
         let normaliser = statistics.to_normaliser().unwrap();
         assert_eq!(normaliser.task_mean, [2.0, 20.0]);
         assert!((normaliser.proprioception_mean[0] - 8.0).abs() < 1e-5, "{normaliser:?}");
@@ -250,7 +285,7 @@ mod tests {
     fn a_checkpoint_restores_them() {
         let spec = spec();
         let mut statistics = ObservationStatistics::new(&spec);
-        statistics.absorb(&batch(&spec));
+        statistics.absorb(&batch(&spec), &World::alone()).unwrap();
         let mut state = statistics.state();
         state.push(("policy".into(), Tensor::from(1.0)));
         let mut restored = ObservationStatistics::new(&spec);
@@ -266,11 +301,12 @@ mod tests {
         let (spec, run) = (spec(), tempfile::tempdir().unwrap());
         let mut metrics = MetricsFile::open(run.path(), &Experiment::default(), &spec).unwrap();
         let rows = |environment_steps, padding| Rows { rows: 3, environment_steps, padding };
-        assert_eq!(metrics.count_rows(&batch(&spec)), [rows(3, 0), rows(1, 1)]);
+        let mut window = Window::default();
+        assert_eq!(window.count_rows(&batch(&spec), &spec), [rows(3, 0), rows(1, 1)]);
         let position = Position { environment_steps: 4, updates: 1, ..Position::default() };
         let mut accounting = comic_replay::AccountingByTask::default();
         accounting.tasks.insert("get-up".into(), comic_replay::TaskAccounting { trained: 7, ..Default::default() });
-        let line = metrics.write(position, accounting, serde_json::Map::new(), None);
+        let line = metrics.write(position, &window, accounting, serde_json::Map::new(), None);
         let line: serde_json::Value = serde_json::from_str(&line).unwrap();
         assert_eq!(line["tasks"]["get-up"]["accounting"]["trained"], 7);
         assert_eq!(line["tasks"]["tracking"]["environment_steps"], 3);

@@ -1,17 +1,16 @@
 //! The trainer: one OS thread that owns the device. Batches in, parameters out.
 
-use std::path::Path;
 use std::time::{Duration, Instant};
 
 use comic_experiment::{Experiment, TaskSpec};
-use comic_replay::{Batch, Batcher, Next, Reason};
+use comic_replay::{Batch, Batcher, LedgerSnapshot, Next, Reason};
 
 use crate::algorithm::Parts;
 use crate::algorithm::experience::Experience;
 use crate::algorithm::loss_report::{LossValues, Losses};
-use crate::algorithm::replay::Replay;
 use crate::algorithms;
 use crate::checkpoint::saved_replay::SavedReplay;
+use crate::checkpoint::snapshot::LEARNED;
 use crate::checkpoint::{Name, Snapshot, incompatible};
 use crate::device::Backend;
 use crate::error::{Error, Result};
@@ -22,9 +21,12 @@ use crate::train::budget::BudgetClock;
 use crate::train::checkpoints::Checkpoints;
 use crate::train::parts::{Ending, TrainerParts};
 use crate::train::reports::Reports;
+use crate::train::resumed_replay::begin_replay;
+use crate::train::rounds::{Contents, Round, Said, check_equality};
 use crate::train::skipped_steps::{Recovery, SkippedSteps, remedies};
 use crate::train::state::State;
 use crate::train::versions::Versions;
+use crate::world::{MEETING, SILENCE, World};
 
 /// How often a trainer without batches looks at the clock.
 const PATIENCE: Duration = Duration::from_millis(500);
@@ -48,6 +50,7 @@ pub struct Trainer {
     reports: Reports,
     checkpoints: Checkpoints,
     service: TrainerHandle,
+    world: World,
 }
 
 impl Trainer {
@@ -62,6 +65,7 @@ impl Trainer {
             pose,
             low_level,
             backend,
+            world,
             run,
             epoch,
             resume,
@@ -70,12 +74,14 @@ impl Trainer {
             service,
         } = parts;
         backend.train_here()?;
-        let parts = Parts { experiment: &experiment, spec: &spec, pose: &pose, device: backend.device() };
+        let share = experiment.share(world.size())?;
+        let parts = Parts { experiment: &share, spec: &spec, pose: &pose, device: backend.device(), world: &world };
         let mut state = State::new(parts, low_level, service.id(), epoch)?;
         if let Some(snapshot) = &resume {
             state.restore(snapshot, service.id(), epoch).map_err(|error| incompatible(&run, error))?;
         }
-        let mut reports = Reports::open(&run, &experiment, &spec, service.clone())?;
+        let own_run = world.is_first().then_some(run.as_path());
+        let mut reports = Reports::open(own_run, &experiment, &spec, service.clone())?;
         reports.begin(&state.progress, batcher.accounting_by_task());
         let mut experience = algorithms::experience(parts, batcher.layout())?;
         let saved_replay = experiment.replay.save.then(|| SavedReplay::of(&run));
@@ -89,8 +95,8 @@ impl Trainer {
             waited: Duration::ZERO,
             skipped_steps: SkippedSteps::new(experiment.learner.restore_after),
             budget: BudgetClock::new(experiment.budget.clone(), state.progress.seconds),
-            versions: Versions::new(batcher.clone(), publisher, experiment.unroll.lockstep),
-            checkpoints: Checkpoints::start(&run, &experiment.learner, service.clone())?,
+            versions: Versions::new(batcher.clone(), publisher, &experiment),
+            checkpoints: Checkpoints::start(own_run, &experiment.learner, service.clone())?,
             experiment,
             spec,
             backend,
@@ -98,6 +104,7 @@ impl Trainer {
             state,
             reports,
             service,
+            world,
         };
         match resume {
             Some(snapshot) => trainer.checkpoints.set_good(snapshot),
@@ -113,15 +120,18 @@ impl Trainer {
     /// When gradient steps are still skipped after the last good state was restored, or when the disk refuses.
     pub fn run(mut self) -> Result<Ending> {
         let trained = self.train_to_the_end();
-        let Self { checkpoints, saved_replay, state, mut reports, .. } = self;
+        let Self { checkpoints, saved_replay, state, mut reports, world, .. } = self;
         // What the writer was given is good after an error, too.
         let written = checkpoints.finish();
         let ended = trained.and_then(|ending| {
             written?;
-            match saved_replay {
-                Some(saved) => saved.remove_earlier(state.progress.updates).map(|()| ending),
-                None => Ok(ending),
+            if let Some(saved) = saved_replay {
+                saved.remove_earlier(state.progress.updates)?;
             }
+            // No rank ends well before the last checkpoint is on disk, which may take long.
+            world.wait_for(MEETING);
+            world.exchange(())?;
+            Ok(ending)
         });
         reports.end(&ended);
         ended
@@ -131,9 +141,7 @@ impl Trainer {
         let ending = self.train()?;
         self.report_deferred()?;
         self.take_evaluations()?;
-        self.state.progress.seconds = self.budget.seconds();
-        self.show_replay();
-        self.reports.write(&self.state.progress, self.batcher.accounting_by_task());
+        self.write_metrics(true)?;
         self.write_last_checkpoint()?;
         Ok(ending)
     }
@@ -142,28 +150,63 @@ impl Trainer {
         self.reports.write_page_when_due();
         match self.state.progress.version {
             0 => self.publish()?,
-            _ => self.versions.announce(&self.state),
+            _ => self.versions.announce(&self.state)?,
         }
-        while self.budget.used(&self.state.progress) < 1.0 {
-            match self.next_batch()? {
-                Next::Batch(batch) => self.learn(batch)?,
-                Next::Elapsed => {}
-                Next::Closed => return Ok(Ending::Stopped),
+        self.world.wait_for(SILENCE);
+        // A batch that waits for those of the other ranks.
+        let mut held = None;
+        loop {
+            let next = match held.take() {
+                Some(batch) => Next::Batch(batch),
+                None if self.budget.used(&self.state.progress) >= 1.0 => Next::Elapsed,
+                None => self.next_batch(),
+            };
+            let round = self.decide(&next)?;
+            if round.metrics {
+                self.write_metrics(false)?;
+            }
+            match (next, &round.batch) {
+                (Next::Batch(batch), Some(whole)) => self.learn(batch, whole, &round)?,
+                _ if round.used >= 1.0 => return Ok(Ending::Budget),
+                _ if round.stops => return Ok(Ending::Stopped),
+                (Next::Batch(batch), None) => held = Some(batch),
+                (Next::Elapsed | Next::Closed, _) => {}
             }
         }
-        Ok(Ending::Budget)
+    }
+
+    /// What all ranks do next.
+    fn decide(&mut self, next: &Next) -> Result<Round> {
+        self.service.beat();
+        let batch = match next {
+            Next::Batch(batch) => Some(Contents::of(batch, self.spec.tasks.len())),
+            Next::Elapsed | Next::Closed => None,
+        };
+        let said = Said {
+            batch,
+            stops: self.batcher.is_closed(),
+            actors: self.service.actors(),
+            used: self.budget.used(&self.state.progress),
+            checkpoint: self.checkpoints.are_due(),
+            metrics: self.reports.are_due(),
+        };
+        let round = Round::of(&self.world, said)?;
+        self.service.place_actors(&round.actors);
+        self.reports.write_page_when_due();
+        Ok(round)
     }
 
     /// One batch: gradient steps on it, its accounting, and new parameters when they are due.
-    fn learn(&mut self, batch: Batch) -> Result<()> {
+    fn learn(&mut self, batch: Batch, whole: &Contents, round: &Round) -> Result<()> {
+        self.budget.start();
         let began = Instant::now();
         let _update = tracing::debug_span!("update", update = self.state.progress.updates + 1).entered();
-        if self.collect(&batch) {
-            return self.skip_batch(batch);
+        if self.collect(&batch, &whole.tasks)? {
+            return self.skip_batch(batch, round);
         }
-        let (steps, losses) = self.take_gradient_steps(&batch)?;
+        let (steps, losses) = self.take_gradient_steps(&batch, round.used)?;
         let publishes = self.state.algorithm.publishes_after(self.state.progress.updates + 1, steps);
-        let restored = self.report_when_ready(losses, publishes || self.checkpoints.is_due())?;
+        let restored = self.report_when_ready(losses, publishes || round.checkpoint)?;
         let version = self.state.progress.version;
         self.state.progress.updates += 1;
         self.state.progress.gradient_steps += steps;
@@ -173,40 +216,42 @@ impl Trainer {
         if restored || publishes {
             self.publish()?;
         } else {
-            self.versions.repeat(&mut self.state);
+            self.versions.repeat(&mut self.state)?;
         }
-        self.account(batch);
+        self.state.progress.environment_steps += whole.environment_steps;
+        self.reports.count_rows(&batch);
+        self.batcher.trained(batch);
         self.reports.count_duration(began.elapsed(), ages);
-        self.after_update()
+        self.after_update(round)
     }
 
     /// Adds a batch to the statistics of the observations while they are still collected. They take effect with the next
-    /// publication. Says whether the batch is the first one of a task.
-    fn collect(&mut self, batch: &Batch) -> bool {
+    /// publication. Says whether the batch is the first one of a task; `tasks` are those of all ranks' batches.
+    fn collect(&mut self, batch: &Batch, tasks: &[usize]) -> Result<bool> {
         let (wanted, seen) = (self.experiment.network.normaliser_steps as f64, self.state.statistics.rows());
-        let first = wanted > 0.0 && self.state.statistics.lacks(&batch.tasks());
+        let first = wanted > 0.0 && self.state.statistics.lacks(tasks);
         if first || seen < wanted {
-            self.state.statistics.absorb(batch);
+            self.state.statistics.absorb(batch, &self.world)?;
         }
-        first
+        Ok(first)
     }
 
     /// The first batch of a task only sets the scale of its observations, because without it the networks would learn
     /// nothing. Unrolls so far were made with another scale.
-    fn skip_batch(&mut self, batch: Batch) -> Result<()> {
+    fn skip_batch(&mut self, batch: Batch, round: &Round) -> Result<()> {
         self.versions.supersede(&self.state);
         // Also after a gradient step that was skipped, which changed no parameter: the next batch needs the scale.
         match self.state.algorithm.is_finite() {
             true => self.versions.publish(&mut self.state)?,
-            false => self.versions.repeat(&mut self.state),
+            false => self.versions.repeat(&mut self.state)?,
         }
         self.batcher.discard(batch, Reason::Superseded);
-        self.after_update()
+        self.after_update(round)
     }
 
     /// The gradient steps on a batch: how many, and the mean of their losses.
-    fn take_gradient_steps(&mut self, batch: &Batch) -> Result<(u64, Option<Losses>)> {
-        self.state.algorithm.set_progress(self.budget.used(&self.state.progress));
+    fn take_gradient_steps(&mut self, batch: &Batch, used: f64) -> Result<(u64, Option<Losses>)> {
+        self.state.algorithm.set_progress(used);
         let mut losses = Vec::new();
         let random = &mut self.state.progress.random;
         for step in 0..self.experience.take(batch, random)? {
@@ -224,22 +269,11 @@ impl Trainer {
         Ok((steps, losses))
     }
 
-    fn next_batch(&mut self) -> Result<Next> {
-        self.service.beat();
+    fn next_batch(&mut self) -> Next {
         let began = Instant::now();
         let next = self.experience.next(&self.batcher, PATIENCE);
         self.waited += began.elapsed();
-        self.write_metrics_when_due()?;
-        if matches!(next, Next::Batch(_)) {
-            self.budget.start();
-        }
-        Ok(next)
-    }
-
-    /// Counts a batch as trained on, and frees its memory.
-    fn account(&mut self, batch: Batch) {
-        self.state.progress.environment_steps += self.reports.count_rows(&batch);
-        self.batcher.trained(batch);
+        next
     }
 
     /// Publishes the online policy as the next version, if it is sound: actors that cannot act would send nothing that
@@ -250,8 +284,7 @@ impl Trainer {
         }
         let update = self.state.progress.updates;
         tracing::warn!(update, "not published: the last gradient steps were not finite");
-        self.versions.repeat(&mut self.state);
-        Ok(())
+        self.versions.repeat(&mut self.state)
     }
 
     /// Whether the parameters can be published and restored: every one is a number, and the last gradient step was taken.
@@ -312,10 +345,10 @@ impl Trainer {
         Ok(())
     }
 
-    fn after_update(&mut self) -> Result<()> {
-        self.write_metrics_when_due()?;
-        // While the last one is still being written, training does not wait.
-        if !self.checkpoints.is_due() || self.checkpoints.is_busy() {
+    fn after_update(&mut self, round: &Round) -> Result<()> {
+        // Only a learner alone may look again after its update.
+        let due = round.checkpoint || (self.world.size() == 1 && self.checkpoints.are_due());
+        if !due {
             return Ok(());
         }
         // Before an older checkpoint is removed, it is judged by what was reported.
@@ -323,18 +356,16 @@ impl Trainer {
         self.write_checkpoint_if_sound(Name::Updates(self.state.progress.updates))
     }
 
-    fn write_metrics_when_due(&mut self) -> Result<()> {
-        self.reports.write_page_when_due();
-        if !self.reports.are_due() {
-            return Ok(());
-        }
+    /// Writes a line of metrics of what all ranks counted since the last one.
+    fn write_metrics(&mut self, last: bool) -> Result<()> {
         // While a checkpoint is being written, evaluations wait, and training does not.
         if !self.checkpoints.is_busy() {
             self.take_evaluations()?;
         }
         self.state.progress.seconds = self.budget.seconds();
         self.show_replay();
-        self.reports.write_news(&self.state.progress, self.batcher.accounting_by_task());
+        let counted = self.world.exchange(self.reports.take_counted(self.batcher.accounting_by_task()))?;
+        self.reports.write(&self.state.progress, counted, last);
         Ok(())
     }
 
@@ -397,7 +428,11 @@ impl Trainer {
 
     fn snapshot(&mut self) -> Result<Snapshot> {
         self.state.progress.seconds = self.budget.seconds();
-        self.state.snapshot(&self.experiment, &self.spec, &self.batcher.snapshot())
+        let ledgers = self.world.exchange(self.batcher.snapshot())?;
+        let ledger = LedgerSnapshot::of_ranks(ledgers).unwrap_or_else(|| self.batcher.snapshot());
+        let snapshot = self.state.snapshot(&self.experiment, &self.spec, &ledger)?;
+        check_equality(&self.world, snapshot.part(LEARNED)?, self.state.progress.updates)?;
+        Ok(snapshot)
     }
 
     /// How much memory the learner's buffers can take, now that every size is known.
@@ -405,33 +440,11 @@ impl Trainer {
         Bounds::new(&Sizes {
             replay: self.experience.replay().map_or(0, |replay| replay.memory()),
             ahead: self.experiment.unroll.ahead,
-            batch: self.experiment.unroll.batch,
+            batch: self.experiment.unroll.batch / self.world.size(),
             unroll: self.batcher.layout().size(),
             ingest: self.service.ingest(),
             parameters: self.state.target.len(),
             snapshot: self.checkpoints.good().parts.values().map(Vec::len).sum(),
         })
     }
-}
-
-/// Begins with the replay that was saved with the checkpoint after `resumed` updates, or with an empty one.
-fn begin_replay(replay: &mut Replay, saved: Option<&SavedReplay>, resumed: Option<u64>, run: &Path) -> Result<()> {
-    let updates = resumed.unwrap_or(0);
-    let Some(saved) = saved else {
-        if resumed.is_some() {
-            tracing::warn!("the replay begins empty, because replay.save is off");
-        }
-        return Ok(());
-    };
-    saved.tidy(updates)?;
-    match saved.open(updates)?.filter(|_| resumed.is_some()) {
-        Some((path, mut file)) => {
-            let remedy = format!("{}: remove it to begin with an empty replay", path.display());
-            replay.read_from(&mut file).map_err(|error| incompatible(run, Error::within(remedy)(error)))?;
-        }
-        None if resumed.is_some() => tracing::warn!("the replay begins empty: none was saved with this checkpoint"),
-        None => {}
-    }
-    // While one is replaced, there are two.
-    saved.check_room((2 * replay.memory()).saturating_sub(saved.size(updates)))
 }

@@ -1,6 +1,8 @@
 //! Publishing versions of the parameters.
 
 use bytes::Bytes;
+use comic_experiment::{Experiment, PublishedNumber};
+use comic_networks::to_bfloat16;
 use comic_replay::{Batcher, Phase};
 
 use crate::error::Result;
@@ -13,13 +15,15 @@ pub(super) struct Versions {
     batcher: Batcher,
     publisher: Publisher,
     lockstep: bool,
+    number: PublishedNumber,
     /// Unrolls of versions before this one are superseded.
     oldest: u64,
 }
 
 impl Versions {
-    pub(super) fn new(batcher: Batcher, publisher: Publisher, lockstep: bool) -> Self {
-        Self { batcher, publisher, lockstep, oldest: 0 }
+    pub(super) fn new(batcher: Batcher, publisher: Publisher, experiment: &Experiment) -> Self {
+        let (lockstep, number) = (experiment.unroll.lockstep, experiment.learner.published_number);
+        Self { batcher, publisher, lockstep, number, oldest: 0 }
     }
 
     /// Publishes the online policy as the next version. From now on it is the target network, with which actors act. Statistics
@@ -32,24 +36,35 @@ impl Versions {
         state.set_normaliser()?;
         state.target = Bytes::from(state.algorithm.policy_parameters()?);
         state.progress.version += 1;
-        self.announce(state);
-        Ok(())
+        self.announce(state)
     }
 
     /// In lockstep, publishes the same parameters as the next version. There, actors make one unroll of each environment
     /// with each version, so they need a version after every batch.
-    pub(super) fn repeat(&self, state: &mut State) {
+    ///
+    /// # Errors
+    /// As of [`announce`](Self::announce).
+    pub(super) fn repeat(&self, state: &mut State) -> Result<()> {
         if self.lockstep {
             state.progress.version += 1;
-            self.announce(state);
+            self.announce(state)?;
         }
+        Ok(())
     }
 
     /// Tells actors and batcher of the newest version, for instance after a restart.
-    pub(super) fn announce(&self, state: &State) {
+    ///
+    /// # Errors
+    /// When the parameters are damaged, for instance in a checkpoint.
+    pub(super) fn announce(&self, state: &State) -> Result<()> {
+        let parameters = match self.number {
+            PublishedNumber::Float32 => state.target.clone(),
+            PublishedNumber::Bfloat16 => Bytes::from(to_bfloat16(&state.target)?),
+        };
         let (epoch, version, oldest) = (state.progress.epoch, state.progress.version, self.oldest);
         self.batcher.set_phase(Phase { epoch, version, oldest });
-        self.publisher.publish(version, &state.target);
+        self.publisher.publish(version, &parameters);
+        Ok(())
     }
 
     /// With the next version, unrolls of all versions so far are superseded.

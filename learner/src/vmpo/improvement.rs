@@ -3,8 +3,9 @@
 use comic_experiment::Vmpo;
 use tch::{Kind, Tensor};
 
-use crate::algorithm::masked_mean::masked_mean;
+use crate::algorithm::masked_mean::ValidSteps;
 use crate::vmpo::multipliers::Multipliers;
+use crate::world::{Result, World};
 
 /// The inputs of the losses: one number a step, every tensor of the same shape.
 #[derive(Debug)]
@@ -21,10 +22,12 @@ pub struct Evidence<'a> {
     pub kl_weights: Option<&'a Tensor>,
     /// The whole KL(behaviour ‖ π), if there is a control variate.
     pub kl: Option<&'a Tensor>,
-    /// 1 where the step is a transition; a step with 0 has no influence, whatever its other numbers are.
-    pub valid: &'a Tensor,
+    /// The steps that are transitions; another step has no influence, whatever its numbers are.
+    pub valid: &'a ValidSteps,
     /// The steps that each E-step ranks, booleans: one group for each η, and no step is in two groups.
     pub groups: &'a [Tensor],
+    /// The ranks whose steps all this is about.
+    pub world: &'a World,
 }
 
 /// V-MPO's limits on the KLs, and the fraction of the steps that it ranks highest.
@@ -57,7 +60,8 @@ impl From<&Vmpo> for KlLimits {
     }
 }
 
-/// The losses, scalars that carry gradient, and the mean KLs they were made from.
+/// The losses, scalars that carry gradient, and the mean KLs they were made from: this rank's share of each. Those of all ranks add up
+/// to the whole, and so do their gradients.
 #[derive(Debug)]
 pub struct Improvement {
     /// L_π.
@@ -95,54 +99,69 @@ impl Improvement {
 ///
 /// Each group has its own D̃ and η. L_π and L_η are the means over the groups, weighted by each group's fraction of the
 /// valid steps (D). So a step counts the same whatever its group, and a group without a step has no influence.
-pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits: &KlLimits) -> Improvement {
-    let mask = evidence.valid.gt(0.5);
-    let (mut policy, temperature) = expectation_steps(evidence, &mask, multipliers, limits);
+///
+/// # Errors
+/// When another rank is lost.
+pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits: &KlLimits) -> Result<Improvement> {
+    let valid = evidence.valid;
+    let (mut policy, temperature) = expectation_steps(evidence, multipliers, limits)?;
     if let Some(kl) = evidence.kl {
-        policy = &policy + masked_mean(&(evidence.log_prob + kl), evidence.valid) * limits.control_variate;
+        policy = &policy + valid.mean(&(evidence.log_prob + kl)) * limits.control_variate;
     }
-    let kl_mean = masked_mean(evidence.kl_mean, evidence.valid);
-    let kl_std = masked_mean(evidence.kl_std, evidence.valid);
+    // The share of a limit that the whole mean is held to.
+    let constraint = |kl: &Tensor, alpha: &Tensor, epsilon: f64| {
+        alpha * (epsilon / evidence.world.size() as f64 - kl.detach()) + alpha.detach() * kl
+    };
+    let kl_mean = valid.mean(evidence.kl_mean);
+    let kl_std = valid.mean(evidence.kl_std);
     let gaussian = constraint(&kl_mean, &multipliers.alpha_mean(), limits.epsilon_mean)
         + constraint(&kl_std, &multipliers.alpha_std(), limits.epsilon_std);
-    let kl_weights = evidence.kl_weights.map(|kl| masked_mean(kl, evidence.valid));
+    let kl_weights = evidence.kl_weights.map(|kl| valid.mean(kl));
     let alpha = match (&kl_weights, multipliers.alpha_discrete()) {
         (Some(kl), Some(multiplier)) => gaussian + constraint(kl, &multiplier, limits.epsilon_discrete),
         _ => gaussian,
     };
-    Improvement {
+    Ok(Improvement {
         policy,
         temperature,
         alpha,
         kl_mean: kl_mean.detach(),
         kl_std: kl_std.detach(),
         kl_weights: kl_weights.map(|kl| kl.detach()),
-    }
+    })
 }
 
-fn expectation_steps(
-    evidence: &Evidence,
-    mask: &Tensor,
-    multipliers: &Multipliers,
-    limits: &KlLimits,
-) -> (Tensor, Tensor) {
-    let steps = mask.sum(Kind::Float).clamp_min(1.0);
+fn expectation_steps(evidence: &Evidence, multipliers: &Multipliers, limits: &KlLimits) -> Result<(Tensor, Tensor)> {
+    let (world, valid) = (evidence.world, evidence.valid);
+    let advantage = world.gather(evidence.advantage)?.detach();
     let (mut policies, mut temperatures) = (Vec::new(), Vec::new());
     for (group, eta) in evidence.groups.iter().zip(multipliers.temperatures().unbind(0)) {
-        let mask = mask.logical_and(group);
-        let share = mask.sum(Kind::Float) / &steps;
-        let (of_policy, of_temperature) = expectation_step(evidence, &mask, &eta, limits);
-        policies.push(of_policy * &share);
-        temperatures.push(of_temperature * share);
+        let mask = world.gather(&valid.mask().logical_and(group))?;
+        let fraction = mask.sum(Kind::Float) / valid.count();
+        let step = expectation_step(&advantage, &mask, &eta, limits);
+        let [weights, selected] = [&step.weights, &step.selected].map(|all| world.own_part(all));
+        let log_prob = evidence.log_prob.where_scalarother(&selected, 0.0);
+        policies.push(-(weights * log_prob).sum(Kind::Float) * &fraction);
+        // Every rank has computed the whole of it.
+        temperatures.push(step.temperature * fraction / world.size() as f64);
     }
     let sum = |terms: &[Tensor]| Tensor::stack(terms, 0).sum(Kind::Float);
-    (sum(&policies), sum(&temperatures))
+    Ok((sum(&policies), sum(&temperatures)))
 }
 
-fn expectation_step(evidence: &Evidence, mask: &Tensor, eta: &Tensor, limits: &KlLimits) -> (Tensor, Tensor) {
-    let advantage = evidence.advantage.detach();
-    let selected = top(&advantage, mask, limits.top_fraction);
-    let scaled = &advantage / eta;
+/// The E-step of one group, over the steps of all ranks.
+struct ExpectationStep {
+    /// D̃, booleans.
+    selected: Tensor,
+    /// ψ.
+    weights: Tensor,
+    /// L_η.
+    temperature: Tensor,
+}
+
+fn expectation_step(advantage: &Tensor, mask: &Tensor, eta: &Tensor, limits: &KlLimits) -> ExpectationStep {
+    let selected = top(advantage, mask, limits.top_fraction);
+    let scaled = advantage / eta;
     // The log-sum-exp subtracts the maximum. If no step is valid, the maximum is set to 0. Otherwise it would be −∞ on a CPU,
     // which gives NaN, and the smallest finite number on XLA, which overflows below.
     let maximum = scaled.detach().where_scalarother(&selected, f64::NEG_INFINITY).max();
@@ -153,8 +172,7 @@ fn expectation_step(evidence: &Evidence, mask: &Tensor, eta: &Tensor, limits: &K
     let count = selected.sum(Kind::Float).clamp_min(1.0);
     let temperature = eta * (sum.log() + &maximum - count.log() + limits.epsilon_eta);
     let weights = (&exponentials / &sum).detach();
-    let log_prob = evidence.log_prob.where_scalarother(&selected, 0.0);
-    (-(weights * log_prob).sum(Kind::Float), temperature)
+    ExpectationStep { selected, weights, temperature }
 }
 
 /// The mask of D̃, by a threshold: no shape depends on how many steps are valid.
@@ -165,8 +183,4 @@ fn top(advantage: &Tensor, mask: &Tensor, fraction: f64) -> Tensor {
     let rank = (mask.sum(Kind::Double) * fraction).floor().clamp_min(1.0).to_kind(Kind::Int64) - 1;
     let threshold = sorted.index_select(0, &rank.reshape([1]));
     advantage.ge_tensor(&threshold).logical_and(mask)
-}
-
-fn constraint(kl: &Tensor, alpha: &Tensor, epsilon: f64) -> Tensor {
-    alpha * (epsilon - kl.detach()) + alpha.detach() * kl
 }

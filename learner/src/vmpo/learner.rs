@@ -8,17 +8,18 @@ use comic_proto::Field;
 use tch::{Device, Kind, Tensor, nn};
 
 use crate::adam::{self, Adam};
-use crate::algorithm::descent::{Gradients, descend};
+use crate::algorithm::descent::{Gradients, descend, gradients_of};
 use crate::algorithm::error::Error;
 use crate::algorithm::loss_report::Losses;
-use crate::algorithm::masked_mean::masked_mean;
+use crate::algorithm::masked_mean::ValidSteps;
 use crate::algorithm::minibatch::MinibatchTensors;
 use crate::algorithm::stores::{named, trainable};
 use crate::algorithm::{Algorithm, made_on};
 use crate::vmpo::improvement::{Evidence, KlLimits, policy_improvement};
 use crate::vmpo::multipliers::Multipliers;
-use crate::vmpo::report::{Descent, Pass, report};
+use crate::vmpo::report::{self, Descent, Pass};
 use crate::vmpo::returns::returns;
+use crate::world::{self, World};
 
 /// The online networks, the multipliers and Adam.
 ///
@@ -36,6 +37,7 @@ pub struct VmpoLearner {
     adam: Adam,
     networks_group: usize,
     multipliers_group: usize,
+    world: World,
 }
 
 impl VmpoLearner {
@@ -73,9 +75,16 @@ impl VmpoLearner {
             adam,
             networks_group,
             multipliers_group,
+            world: World::alone(),
         };
         learner.set_progress(0.0);
         Ok(learner)
+    }
+
+    /// This learner as a rank of `world`: its minibatches are shares of the whole.
+    #[must_use]
+    pub fn in_world(self, world: &World) -> Self {
+        Self { world: world.clone(), ..self }
     }
 
     /// The online policy's parameters: what actors need.
@@ -112,7 +121,7 @@ impl VmpoLearner {
         entries
     }
 
-    fn forward(&self, minibatch: &MinibatchTensors) -> Pass {
+    fn forward(&self, minibatch: &MinibatchTensors) -> Result<Pass, world::Error> {
         let length = minibatch.shape().unroll.length as i64;
         let Experiment { network, vmpo, .. } = &self.experiment;
         let [proprioception, task, valid, first] =
@@ -131,10 +140,10 @@ impl VmpoLearner {
         let targets = returns(reward, discount, valid, &values, vmpo.discount, vmpo.lambda);
         let (targets, values) = (rows(&targets), rows(&values.narrow(1, 0, length)));
         let valid_share = valid.mean(Kind::Float);
-        let valid = self.learnt_from(valid).reshape([-1]);
+        let valid = ValidSteps::new(&self.learnt_from(valid).reshape([-1]), &self.world)?;
         let errors = (&values - &targets).square().sum_dim_intlist(-1i64, false, Kind::Float) * 0.5;
         let latent_kl = match (&acting.latent_posterior, &acting.latent_prior, &network.latent.prior) {
-            (None, _, _) => valid.zeros_like(),
+            (None, _, _) => errors.zeros_like(),
             (Some(posterior), Some(prior), _) => posterior.kl(prior),
             (Some(posterior), None, Prior::Ar1 { alpha }) => {
                 posterior.kl_to_ar1(*alpha, &rows(previous_latent), &first.reshape([-1]))
@@ -143,28 +152,28 @@ impl VmpoLearner {
         };
         let [mean, std, log_weights] =
             [Field::Mean, Field::Std, Field::LogWeights].map(|field| rows(&minibatch[field]));
-        Pass {
+        Ok(Pass {
             behaviour: ActionDistribution::from_rows(&mean, &std, &log_weights),
             groups: self.groups(minibatch, &valid),
-            value_loss: masked_mean(&errors, &valid),
-            latent_kl: masked_mean(&latent_kl, &valid),
+            value_loss: valid.mean(&errors),
+            latent_kl: valid.mean(&latent_kl),
             acting,
             values,
             targets,
             valid,
             valid_share,
-        }
+        })
     }
 
     /// The steps of each task, if each task has an E-step of its own; otherwise all steps.
-    fn groups(&self, minibatch: &MinibatchTensors, valid: &Tensor) -> Vec<Tensor> {
+    fn groups(&self, minibatch: &MinibatchTensors, valid: &ValidSteps) -> Vec<Tensor> {
         match minibatch.routing().tasks() {
             Some(tasks) if self.experiment.vmpo.temperature_per_task => {
                 let length = minibatch.shape().unroll.length as i64;
                 let of_rows = tasks.unsqueeze(1).expand([-1, length], false).reshape([-1]);
                 (0..self.spec.tasks.len() as i64).map(|task| of_rows.eq(task)).collect()
             }
-            _ => vec![valid.ones_like().to_kind(Kind::Bool)],
+            _ => vec![valid.mask().ones_like()],
         }
     }
 
@@ -189,10 +198,10 @@ impl VmpoLearner {
 
     /// Clips the networks' gradients if the experiment says so, and steps networks and multipliers if every number is finite.
     fn descend(&mut self, total: &Tensor, networks: Vec<Tensor>, multipliers: Vec<Tensor>) -> Result<Descent, Error> {
-        let networks = Gradients::new(&self.adam, self.networks_group, networks);
+        let networks = Gradients::new(self.networks_group, networks);
         let norm = networks.norm();
         let networks = networks.clipped(self.experiment.optimiser.max_gradient_norm);
-        let multipliers = Gradients::new(&self.adam, self.multipliers_group, multipliers);
+        let multipliers = Gradients::new(self.multipliers_group, multipliers);
         let finite = descend(&mut self.adam, total, &[networks, multipliers])?;
         self.multipliers.project();
         Ok(Descent { norm, finite })
@@ -204,7 +213,7 @@ impl Algorithm for VmpoLearner {
     /// entropy bonus.
     fn step(&mut self, minibatch: &MinibatchTensors) -> Result<Losses, Error> {
         minibatch.check(&self.spec, &self.experiment)?;
-        let pass = self.forward(minibatch);
+        let pass = self.forward(minibatch)?;
         let advantage = (&pass.targets - pass.values.detach()).sum_dim_intlist(-1i64, false, Kind::Float);
         let policy = &pass.acting.action;
         let kl_weights = policy.kl_weights(&pass.behaviour);
@@ -219,8 +228,9 @@ impl Algorithm for VmpoLearner {
             kl_weights: kl_weights.as_ref(),
             valid: &pass.valid,
             groups: &pass.groups,
+            world: &self.world,
         };
-        let improvement = policy_improvement(&evidence, &self.multipliers, &KlLimits::from(vmpo));
+        let improvement = policy_improvement(&evidence, &self.multipliers, &KlLimits::from(vmpo))?;
         let mut total =
             improvement.total() + &pass.value_loss * vmpo.value_weight + &pass.latent_kl * network.latent.beta;
         if vmpo.action_gradient != 0.0 {
@@ -228,19 +238,21 @@ impl Algorithm for VmpoLearner {
             let gain = (derivative * policy.mean()).sum_dim_intlist(-1i64, false, Kind::Float);
             // Divided by η, as the advantages are: L_π is about the reward divided by η.
             let gain = gain / self.temperature_of_rows(&pass.groups);
-            total = &total - masked_mean(&gain, &pass.valid) * vmpo.action_gradient;
+            total = &total - pass.valid.mean(&gain) * vmpo.action_gradient;
         }
         if vmpo.entropy != 0.0 {
             // A new tensor: an in-place sum would write over what the graph holds.
-            let bonus = masked_mean(&policy.entropy(), &pass.valid) * vmpo.entropy;
+            let bonus = pass.valid.mean(&policy.entropy()) * vmpo.entropy;
             total = &total - &bonus;
         }
         let networks = self.adam.parameters(self.networks_group);
         let inputs: Vec<&Tensor> = networks.iter().chain([self.multipliers.parameter()]).collect();
-        let mut gradients = Tensor::f_run_backward(&[&total], &inputs, false, false)?;
+        let mut gradients = gradients_of(&total, &inputs)?;
+        let mut losses = report::shares(&pass, &total, &improvement, &self.world)?;
+        self.world.sum_all(gradients.iter_mut().chain([&mut losses]))?;
         let multipliers = gradients.split_off(networks.len());
-        let descent = self.descend(&total, gradients, multipliers)?;
-        Ok(report(&pass, &descent, &total, &improvement, &self.multipliers))
+        let descent = self.descend(&report::total(&losses), gradients, multipliers)?;
+        Ok(report::report(&losses, &descent, &self.multipliers))
     }
 
     fn publishes_after(&self, updates: u64, _: u64) -> bool {

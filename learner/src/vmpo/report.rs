@@ -4,9 +4,10 @@ use comic_networks::{Acting, ActionDistribution};
 use tch::{Kind, Tensor};
 
 use crate::algorithm::loss_report::Losses;
-use crate::algorithm::masked_mean::masked_mean;
+use crate::algorithm::masked_mean::ValidSteps;
 use crate::vmpo::improvement::Improvement;
 use crate::vmpo::multipliers::Multipliers;
+use crate::world::{Result, World};
 
 /// One forward pass over a minibatch; N = B·T rows.
 pub(super) struct Pass {
@@ -17,8 +18,8 @@ pub(super) struct Pass {
     pub(super) values: Tensor,
     /// G_t, `[N, R]`.
     pub(super) targets: Tensor,
-    /// 1 for the steps that are learnt from, `[N]`.
-    pub(super) valid: Tensor,
+    /// The steps that are learnt from, `[N]`.
+    pub(super) valid: ValidSteps,
     /// The steps that each E-step ranks, `[N]` booleans; together all of them.
     pub(super) groups: Vec<Tensor>,
     /// Fraction of the rows that are transitions.
@@ -37,36 +38,66 @@ pub(super) struct Descent {
     pub(super) finite: Tensor,
 }
 
-/// The report of a step that differentiated `total`, and after which the multipliers are these.
-pub(super) fn report(
-    pass: &Pass,
-    descent: &Descent,
-    total: &Tensor,
-    improvement: &Improvement,
-    multipliers: &Multipliers,
-) -> Losses {
+/// This rank's shares of the numbers of a report. Those of all ranks add up to the whole.
+///
+/// # Errors
+/// When another rank is lost.
+pub(super) fn shares(pass: &Pass, total: &Tensor, improvement: &Improvement, world: &World) -> Result<Tensor> {
+    let zero = pass.value_loss.zeros_like();
+    let std = pass.acting.action.std().mean_dim(-1i64, false, Kind::Float);
+    let [unexplained, variance] = variances(pass, world)?;
+    let shares: [&Tensor; SHARES] = [
+        total,
+        &improvement.policy,
+        &improvement.temperature,
+        &improvement.alpha,
+        &pass.value_loss,
+        &pass.latent_kl,
+        &improvement.kl_mean,
+        &improvement.kl_std,
+        improvement.kl_weights.as_ref().unwrap_or(&zero),
+        &pass.valid.mean(&std),
+        &(&pass.valid_share / world.size() as f64),
+        &unexplained,
+        &variance,
+    ];
+    Ok(Tensor::stack(&shares.map(|share| share.detach().reshape([])), 0))
+}
+
+/// Numbers in [`shares`].
+const SHARES: usize = 13;
+
+/// The loss that was differentiated, of the sum of all ranks' [`shares`].
+pub(super) fn total(sums: &Tensor) -> Tensor {
+    sums.select(0, 0)
+}
+
+/// The report of a step, from the sum of all ranks' [`shares`], and after which the multipliers are these.
+pub(super) fn report(sums: &Tensor, descent: &Descent, multipliers: &Multipliers) -> Losses {
     tch::no_grad(|| {
-        let zero = Tensor::zeros([1], (Kind::Float, pass.valid.device()));
+        let zero = Tensor::zeros([1], (Kind::Float, sums.device()));
         let temperatures = multipliers.temperatures();
         let [alpha_mean, alpha_std] = [multipliers.alpha_mean(), multipliers.alpha_std()];
         let alpha_discrete = multipliers.alpha_discrete();
-        let std = pass.acting.action.std().mean_dim(-1i64, false, Kind::Float);
+        let share = |index: i64| sums.select(0, index);
+        // The floor keeps the result finite if all returns are equal.
+        let explained = 1.0 - share(11) / share(12).clamp_min(1e-12);
         let named = [
             // The loss that was differentiated.
-            ("total_loss", total),
+            ("total_loss", &total(sums)),
             // L_π, L_η and L_α.
-            ("policy_loss", &improvement.policy),
-            ("temperature_loss", &improvement.temperature),
-            ("alpha_loss", &improvement.alpha),
+            ("policy_loss", &share(1)),
+            ("temperature_loss", &share(2)),
+            ("alpha_loss", &share(3)),
             // ½ (V − G)², mean over valid steps, summed over reward terms.
-            ("value_loss", &pass.value_loss),
+            ("value_loss", &share(4)),
             // KL of the latent to its prior, nats a step.
-            ("latent_kl", &pass.latent_kl),
+            ("latent_kl", &share(5)),
             // Mean KL_μ and KL_Σ to the behaviour policy, and that of a mixture's weights (0 for one Gaussian), nats a
             // step.
-            ("kl_mean", &improvement.kl_mean),
-            ("kl_std", &improvement.kl_std),
-            ("kl_weights", improvement.kl_weights.as_ref().unwrap_or(&zero)),
+            ("kl_mean", &share(6)),
+            ("kl_std", &share(7)),
+            ("kl_weights", &share(8)),
             // η after the step; the mean if there are several.
             ("temperature", &temperatures.mean(Kind::Float)),
             // α_μ, α_Σ and α_discrete (0 for one Gaussian) after the step.
@@ -74,26 +105,23 @@ pub(super) fn report(
             ("alpha_std", &alpha_std),
             ("alpha_discrete", alpha_discrete.as_ref().unwrap_or(&zero)),
             // Mean standard deviation of the policy over valid steps and action dimensions.
-            ("policy_std", &masked_mean(&std, &pass.valid)),
+            ("policy_std", &share(9)),
             // Global norm of the networks' gradients, before any clipping.
             ("gradient_norm", &descent.norm),
             // 1 − Var(G − V) / Var(G), of the return summed over reward terms.
-            ("variance_explained", &variance_explained(pass)),
+            ("variance_explained", &explained),
             // Fraction of the rows that are transitions.
-            ("valid_share", &pass.valid_share),
+            ("valid_share", &share(10)),
         ];
         Losses::pack(named, &temperatures, &descent.finite)
     })
 }
 
-/// 1 − Var(G − V) / Var(G) over the valid steps, of the return summed over its terms.
-fn variance_explained(pass: &Pass) -> Tensor {
-    let variance = |terms: &Tensor| {
-        let total = terms.sum_dim_intlist(-1i64, false, Kind::Float);
-        let mean = masked_mean(&total, &pass.valid);
-        masked_mean(&(total - mean).square(), &pass.valid)
-    };
-    let unexplained = variance(&(&pass.targets - &pass.values));
-    // The floor keeps the result finite if all returns are equal.
-    1.0 - unexplained / variance(&pass.targets).clamp_min(1e-12)
+/// The shares of Var(G − V) and Var(G) over the valid steps, of the return summed over its terms.
+fn variances(pass: &Pass, world: &World) -> Result<[Tensor; 2]> {
+    let totals = [&pass.targets - &pass.values, pass.targets.shallow_clone()]
+        .map(|terms| terms.detach().sum_dim_intlist(-1i64, false, Kind::Float));
+    let means = world.sum(&Tensor::stack(&totals.each_ref().map(|total| pass.valid.mean(total)), 0))?;
+    let variance = |index: usize| pass.valid.mean(&(&totals[index] - means.select(0, index as i64)).square());
+    Ok([variance(0), variance(1)])
 }

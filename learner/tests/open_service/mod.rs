@@ -29,6 +29,7 @@ pub(crate) fn open_service(
         batcher: batcher.clone(),
         publisher: publisher.clone(),
         quarantine: QuarantineArguments::default(),
+        placement: None,
     })
     .unwrap()
 }

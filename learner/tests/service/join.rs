@@ -160,6 +160,7 @@ async fn a_service_whose_parts_disagree_does_not_start() {
         batcher: world.batcher.clone(),
         publisher: world.publisher.clone(),
         quarantine: QuarantineArguments::default(),
+        placement: None,
     };
     let (mut longer, mut later) = (setup(), setup());
     longer.experiment.unroll.length += 1;

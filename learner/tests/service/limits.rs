@@ -164,6 +164,7 @@ async fn a_limit_that_is_too_small_for_an_unroll_is_a_wrong_configuration() {
             batcher: world.batcher.clone(),
             publisher: Publisher::new(EPOCH),
             quarantine: QuarantineArguments::default(),
+            placement: None,
         };
         let refused = Service::new(setup).unwrap_err();
         assert!(refused.exit_code() == 2 && refused.to_string().contains(option), "{refused}");

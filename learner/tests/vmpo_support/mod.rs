@@ -9,6 +9,7 @@ use comic_learner::algorithm::shape::MinibatchShape;
 use comic_learner::algorithm::{Algorithm, Parts};
 use comic_learner::algorithms;
 use comic_learner::vmpo::VmpoLearner;
+use comic_learner::world::World;
 use comic_networks::{Acting, Policy as _, RecurrentState, Routing};
 use comic_proto::{Field, UnrollLayout, UnrollShape};
 use tch::{Device, Kind, Tensor};
@@ -89,7 +90,9 @@ pub(crate) fn learner_of(spec: &TaskSpec, experiment: &Experiment, seed: i64) ->
 
 /// The learner of the experiment's algorithm.
 pub(crate) fn algorithm_on(device: Device, spec: &TaskSpec, experiment: &Experiment, seed: i64) -> Box<dyn Algorithm> {
-    seeded(seed, || algorithms::learner(Parts { experiment, spec, pose: &POSE, device }).unwrap())
+    seeded(seed, || {
+        algorithms::learner(Parts { experiment, spec, pose: &POSE, device, world: &World::alone() }).unwrap()
+    })
 }
 
 fn seeded<L>(seed: i64, make: impl FnOnce() -> L) -> L {
@@ -264,6 +267,35 @@ impl Unrolls {
         }
         arrays.clip_mut().copy_from_slice(&self.clip);
         arrays
+    }
+
+    /// The `part`-th of `parts` equal parts, in the order of the unrolls.
+    pub(crate) fn part(&self, part: usize, parts: usize) -> Self {
+        fn cut<T: Clone>(values: &[T], part: usize, parts: usize) -> Vec<T> {
+            let length = values.len() / parts;
+            values[part * length..(part + 1) * length].to_vec()
+        }
+        let floats = |values: &Vec<f32>| cut(values, part, parts);
+        Self {
+            count: self.count / parts,
+            proprioception: floats(&self.proprioception),
+            task: floats(&self.task),
+            previous_latent: floats(&self.previous_latent),
+            latent_noise: floats(&self.latent_noise),
+            action: floats(&self.action),
+            mean: floats(&self.mean),
+            std: floats(&self.std),
+            action_gradient: floats(&self.action_gradient),
+            reward: floats(&self.reward),
+            discount: floats(&self.discount),
+            valid: floats(&self.valid),
+            log_weights: floats(&self.log_weights),
+            first: floats(&self.first),
+            state: floats(&self.state),
+            clip: cut(&self.clip, part, parts),
+            tasks: cut(&self.tasks, part, parts),
+            task_count: self.task_count,
+        }
     }
 
     pub(crate) fn minibatch(&self) -> MinibatchTensors {

@@ -33,6 +33,8 @@ pub(super) struct Script {
     /// Answers the first unroll as one of another learner epoch.
     pub(super) rejoin: bool,
     pub(super) refuse: bool,
+    /// It sends every actor to this learner: host and port.
+    pub(super) elsewhere: Option<String>,
     /// For so long after its start it has no place for an actor.
     pub(super) full_for: Duration,
     /// A newer process of the same name has joined.
@@ -166,6 +168,9 @@ impl Learner for FakeLearner {
         if self.inner.script.superseded {
             return Err(Status::aborted("a newer process"));
         }
+        if let Some(learner) = self.inner.script.elsewhere.clone() {
+            return Ok(Response::new(JoinReply { learner, ..JoinReply::default() }));
+        }
         let mut experiment = self.inner.experiment.lock().unwrap().clone();
         if self.inner.script.lockstep {
             (experiment.unroll.lockstep, experiment.unroll.ahead) = (true, 0);
@@ -184,6 +189,7 @@ impl Learner for FakeLearner {
             next_sequence: 0,
             environments: self.inner.script.environments,
             run: RUN,
+            learner: String::new(),
         }))
     }
 

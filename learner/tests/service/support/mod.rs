@@ -129,6 +129,7 @@ impl World {
             batcher: batcher.clone(),
             publisher: publisher.clone(),
             quarantine,
+            placement: None,
         };
         let service = Service::new(setup).unwrap();
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();

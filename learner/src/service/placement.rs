@@ -1,0 +1,135 @@
+//! Which rank an actor belongs to, when several learners train one run.
+
+use std::collections::{HashMap, VecDeque};
+use std::time::{Duration, Instant};
+
+use comic_replay::home;
+use parking_lot::Mutex;
+
+/// How long a rank may not know yet of an actor that was sent to it.
+const ON_THE_WAY: Duration = Duration::from_secs(5);
+/// Most names that are remembered, as many as actors in the roster. When there are more, all are forgotten.
+const CAPACITY: usize = 65_536;
+
+/// Sends every actor to its rank. An actor that has an index belongs to the rank that the index says, for ever. A new one goes where the
+/// fewest are, or to the rank of the last process of its name, which then knows that it replaces it.
+#[derive(Debug)]
+pub struct Placement {
+    rank: usize,
+    /// Where actors reach each rank: host and port.
+    addresses: Vec<String>,
+    state: Mutex<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    /// Actors of each rank, as it last said.
+    actors: Vec<u64>,
+    /// Actors that were sent to a rank lately.
+    sent: VecDeque<(Instant, usize)>,
+    /// The rank of each name.
+    names: HashMap<String, usize>,
+}
+
+impl Placement {
+    /// For the rank `rank`, when actors reach the ranks at these addresses.
+    pub fn new(rank: usize, addresses: Vec<String>) -> Self {
+        let state = State { actors: vec![0; addresses.len()], ..State::default() };
+        Self { rank, addresses, state: Mutex::new(state) }
+    }
+
+    /// Notes how many actors each rank has.
+    pub fn count(&self, actors: &[u64]) {
+        let mut state = self.state.lock();
+        if actors.len() == state.actors.len() {
+            state.actors.copy_from_slice(actors);
+        }
+    }
+
+    /// Where an actor has to go; `None` if it belongs here. `name` is what stays the same when it asks again: its name, or for one without
+    /// a name its incarnation. Only rank 0 sends new actors elsewhere.
+    pub fn elsewhere(&self, name: &str, index: Option<u64>, now: Instant) -> Option<&str> {
+        let rank = match index {
+            Some(index) => {
+                let rank = home(index, self.addresses.len());
+                self.state.lock().remember(name, rank);
+                rank
+            }
+            None if self.rank == 0 => self.state.lock().place(name, now),
+            None => self.rank,
+        };
+        self.addresses.get(rank).filter(|_| rank != self.rank).map(String::as_str)
+    }
+}
+
+impl State {
+    fn place(&mut self, name: &str, now: Instant) -> usize {
+        if let Some(rank) = self.names.get(name) {
+            return *rank;
+        }
+        while self.sent.front().is_some_and(|(when, _)| now.duration_since(*when) >= ON_THE_WAY) {
+            self.sent.pop_front();
+        }
+        let on_the_way = |rank: usize| self.sent.iter().filter(|(_, sent)| *sent == rank).count() as u64;
+        let loads = self.actors.iter().enumerate().map(|(rank, actors)| (actors + on_the_way(rank), rank));
+        let rank = loads.min().map_or(0, |(_, rank)| rank);
+        if self.sent.len() < CAPACITY {
+            self.sent.push_back((now, rank));
+        }
+        self.remember(name, rank);
+        rank
+    }
+
+    fn remember(&mut self, name: &str, rank: usize) {
+        if self.names.len() >= CAPACITY {
+            self.names.clear();
+        }
+        self.names.insert(name.to_owned(), rank);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn placement(rank: usize) -> Placement {
+        Placement::new(rank, ["a:1", "b:2", "c:3"].map(String::from).to_vec())
+    }
+
+    #[test]
+    fn new_actors_go_where_the_fewest_are() {
+        let (placement, now) = (placement(0), Instant::now());
+        let names = ["1", "2", "3", "4", "5", "6"];
+        let placed: Vec<_> = names.map(|name| placement.elsewhere(name, None, now)).to_vec();
+        assert_eq!(placed, [None, Some("b:2"), Some("c:3"), None, Some("b:2"), Some("c:3")]);
+        placement.count(&[9, 2, 8]);
+        let later = now + ON_THE_WAY;
+        assert_eq!(placement.elsewhere("7", None, later), Some("b:2"));
+    }
+
+    #[test]
+    fn an_actor_with_an_index_belongs_to_one_rank_whoever_is_asked() {
+        for rank in 0..3 {
+            let found = placement(rank).elsewhere("", Some(7), Instant::now()).map(str::to_owned);
+            assert_eq!(found.as_deref(), (rank != 1).then_some("b:2"));
+        }
+    }
+
+    #[test]
+    fn a_process_goes_where_the_last_one_of_its_name_was() {
+        let (placement, now) = (placement(0), Instant::now());
+        assert_eq!(placement.elsewhere("one", None, now), None);
+        assert_eq!(placement.elsewhere("two", None, now), Some("b:2"));
+        placement.count(&[0, 50, 0]);
+        assert_eq!(placement.elsewhere("two", None, now), Some("b:2"));
+        // Also if rank 0 was started anew, and has only heard of the process that is replaced.
+        let placement = self::placement(0);
+        placement.elsewhere("three", Some(5), now);
+        assert_eq!(placement.elsewhere("three", None, now), Some("c:3"));
+    }
+
+    #[test]
+    fn another_rank_than_the_first_keeps_the_new_actors_that_come_to_it() {
+        assert_eq!(placement(2).elsewhere("", None, Instant::now()), None);
+    }
+}

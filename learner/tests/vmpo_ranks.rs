@@ -1,0 +1,202 @@
+//! Several learners that train one run together do what one learner does with all of their unrolls.
+
+#![allow(clippy::unwrap_used, reason = "a helper of tests may fail like a test")]
+
+mod vmpo_support;
+
+use std::net::{SocketAddr, TcpListener};
+use std::thread;
+
+use comic_experiment::{Experiment, Prior, TaskSpec};
+use comic_learner::algorithm::Algorithm as _;
+use comic_learner::algorithm::error::Error;
+use comic_learner::algorithm::loss_report::LossValues;
+use comic_learner::vmpo::VmpoLearner;
+use comic_learner::world::{self, World};
+use tch::{Kind, Tensor};
+use vmpo_support::{Numbers, Unrolls, difference, every_low_level, experiment, joint_spec, learner_of, spec, state};
+
+/// Runs every rank of a world in a thread of its own, and returns what each computes.
+fn in_world<R: Send + 'static>(size: usize, rank: impl Fn(World) -> R + Clone + Send + 'static) -> Vec<R> {
+    let listener = TcpListener::bind((std::net::Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address: SocketAddr = listener.local_addr().unwrap();
+    let mut listener = Some(listener);
+    let meet = |index: usize| {
+        let (listener, rank) = (listener.take(), rank.clone());
+        thread::spawn(move || rank(World::meet(index, size, address, listener).unwrap()))
+    };
+    let ranks: Vec<_> = (0..size).map(meet).collect();
+    ranks.into_iter().map(|rank| rank.join().unwrap()).collect()
+}
+
+/// A learner after a step on each of these unrolls, and what the steps reported.
+fn trained(
+    spec: &TaskSpec,
+    experiment: &Experiment,
+    world: &World,
+    batches: &[Unrolls],
+) -> (VmpoLearner, Vec<LossValues>) {
+    let mut learner = learner_of(spec, experiment, 1).in_world(world);
+    let step =
+        |unrolls: &Unrolls| learner.step(&unrolls.part(world.rank(), world.size()).minibatch()).unwrap().to_values();
+    let losses = batches.iter().map(step).collect();
+    (learner, losses)
+}
+
+/// Unrolls whose advantages, lengths and tasks differ from rank to rank.
+fn batches(experiment: &Experiment, spec: &TaskSpec, count: u64) -> Vec<Unrolls> {
+    let batch = |seed: u64| {
+        let mut unrolls = Unrolls::recorded(experiment, spec, seed, 12);
+        if experiment.vmpo.action_gradient != 0.0 {
+            unrolls.action_gradient = Numbers::new(seed + 200).take(unrolls.action.len());
+        }
+        unrolls
+    };
+    (0..count).map(batch).collect()
+}
+
+/// Compares the ranks of a world with one learner. Returns the largest differences of their states and of their losses.
+fn compare(spec: &TaskSpec, experiment: &Experiment, size: usize, steps: u64) -> (f64, f64) {
+    let batches = batches(experiment, spec, steps);
+    let (alone, expected) = trained(spec, experiment, &World::alone(), &batches);
+    let ranks = in_world(size, {
+        let (spec, experiment) = (spec.clone(), experiment.clone());
+        move |world| trained(&spec, &experiment, &world, &batches)
+    });
+    let mut differences = (0f64, 0f64);
+    for (learner, losses) in &ranks {
+        assert_eq!(state(learner), state(&ranks[0].0), "the ranks are not equal, bit for bit");
+        assert_eq!(losses, &ranks[0].1);
+        differences.0 = differences.0.max(difference(&alone, learner));
+        for (found, expected) in losses.iter().zip(&expected) {
+            for ((name, found), (_, expected)) in found.entries().iter().zip(expected.entries()) {
+                // 1 − a ratio near 1 is known as well as the ratio.
+                let least = if *name == "variance_explained" { 1.0 } else { 1e-2 };
+                let scale = f64::from(expected.abs()).max(least);
+                let difference = f64::from((found - expected).abs()) / scale;
+                assert!(difference < 1e-3, "{name} is {found} and {expected}");
+                differences.1 = differences.1.max(difference);
+            }
+        }
+    }
+    differences
+}
+
+/// Every term of the loss.
+fn everything(mut experiment: Experiment) -> Experiment {
+    experiment.network.latent.prior = Prior::Ar1 { alpha: 0.95 };
+    experiment.vmpo.entropy = 0.01;
+    experiment.vmpo.control_variate = 0.5;
+    experiment.vmpo.action_gradient = 0.2;
+    experiment.network.value_lstm = vec![6];
+    experiment.vmpo.value_burn_in = 2;
+    experiment.optimiser.max_gradient_norm = 1.0;
+    experiment
+}
+
+#[test]
+fn a_gradient_step_of_two_ranks_is_that_of_one_learner() {
+    for experiment in every_low_level() {
+        let (state, losses) = compare(&spec(), &experiment, 2, 1);
+        assert!(state < 1e-5 && losses < 1e-5, "{}: {state:e}, {losses:e}", experiment.network.low_level);
+    }
+    let (state, losses) = compare(&spec(), &everything(experiment()), 2, 1);
+    assert!(state < 1e-5 && losses < 1e-5, "{state:e}, {losses:e}");
+}
+
+#[test]
+fn each_task_has_its_own_best_half_of_all_ranks() {
+    let mut experiment = everything(experiment());
+    experiment.vmpo.temperature_per_task = true;
+    // Joint training has no recurrent value function.
+    experiment.network.value_lstm.clear();
+    experiment.vmpo.value_burn_in = 0;
+    for steps in 1..=4 {
+        let (state, losses) = compare(&joint_spec(), &experiment, 2, steps);
+        assert!(state < 1e-5 && losses < 1e-5, "{steps}: {state:e}, {losses:e}");
+    }
+}
+
+#[test]
+fn thirty_updates_of_two_and_of_three_ranks_are_those_of_one_learner() {
+    for size in [2, 3] {
+        let (state, losses) = compare(&spec(), &everything(experiment()), size, 30);
+        assert!(state < 1e-5 && losses < 1e-5, "{size} ranks: {state:e}, {losses:e}");
+    }
+}
+
+#[test]
+fn a_rank_without_a_valid_step_adds_nothing() {
+    let mut batch = Unrolls::recorded(&experiment(), &spec(), 1, 4);
+    let steps = batch.valid.len();
+    batch.valid[steps / 2..].fill(0.0);
+    let (alone, _) = trained(&spec(), &experiment(), &World::alone(), std::slice::from_ref(&batch));
+    let ranks = in_world(2, move |world| trained(&spec(), &experiment(), &world, std::slice::from_ref(&batch)).0);
+    for rank in &ranks {
+        assert!(difference(&alone, rank) < 1e-5);
+    }
+}
+
+#[test]
+fn a_step_that_is_not_finite_on_one_rank_is_taken_on_none() {
+    let batch = Unrolls::recorded(&experiment(), &spec(), 1, 4);
+    let ranks = in_world(2, move |world| {
+        let mut learner = learner_of(&spec(), &experiment(), 1).in_world(&world);
+        let before = state(&learner);
+        let mut own = batch.part(world.rank(), 2);
+        if world.rank() == 1 {
+            own.reward.fill(f32::NAN);
+        }
+        let losses = learner.step(&own.minibatch()).unwrap().to_values();
+        (losses.skipped, state(&learner) == before)
+    });
+    assert_eq!(ranks, [(1, true), (1, true)]);
+}
+
+#[test]
+fn a_rank_that_is_gone_ends_the_step_of_the_others_with_an_error_that_says_so() {
+    let batch = Unrolls::recorded(&experiment(), &spec(), 1, 4);
+    let ranks = in_world(2, move |world| {
+        let mut learner = learner_of(&spec(), &experiment(), 1).in_world(&world);
+        let own = batch.part(world.rank(), 2).minibatch();
+        learner.step(&own).unwrap();
+        if world.rank() == 1 {
+            return None;
+        }
+        let before = state(&learner);
+        let error = learner.step(&own).unwrap_err();
+        assert!(matches!(error, Error::World(world::Error::Lost { rank: 0, .. })), "{error}");
+        assert_eq!(state(&learner), before);
+        Some(error.to_string())
+    });
+    let message = ranks[0].as_deref().unwrap();
+    for part in ["rank 0 lost another rank", "newest checkpoint"] {
+        assert!(message.contains(part), "no `{part}` in {message}");
+    }
+}
+
+#[test]
+fn what_ranks_say_and_send_arrives_in_their_order() {
+    let ranks = in_world(3, |world| {
+        let said = world.exchange((world.rank(), "x".repeat(world.rank() * 1000))).unwrap();
+        let sent = world.broadcast(vec![7 + world.rank() as u8; 5000]).unwrap();
+        let sum = world.sum(&Tensor::from_slice(&[1i64 << world.rank(), -1])).unwrap();
+        let own = Tensor::from_slice(&[world.rank() as f32; 2]).reshape([2, 1]);
+        let all = world.gather(&own).unwrap();
+        assert_eq!(world.own_part(&all), own);
+        (
+            said,
+            sent,
+            Vec::<i64>::try_from(sum).unwrap(),
+            Vec::<f32>::try_from(all.to_kind(Kind::Float).reshape([-1])).unwrap(),
+        )
+    });
+    for (said, sent, sum, all) in ranks {
+        assert_eq!(
+            said.iter().map(|(rank, text)| (*rank, text.len())).collect::<Vec<_>>(),
+            [(0, 0), (1, 1000), (2, 2000)]
+        );
+        assert!(sent.iter().all(|byte| *byte == 7), "not that of rank 0");
+        assert_eq!((sum, all), (vec![7, -3], vec![0.0, 0.0, 1.0, 1.0, 2.0, 2.0]));
+    }
+}
