@@ -21,7 +21,9 @@ impl Error {
             | Self::Access(_)
             | Self::Networks(comic_networks::Error::Experiment(_)) => 2,
             Self::Within { source, .. } => source.exit_code(),
-            Self::World(world::Error::Lost { .. } | world::Error::Meeting { .. }) => LOST,
+            Self::World(
+                world::Error::Lost { .. } | world::Error::Meeting { .. } | world::Error::Unreachable { .. },
+            ) => LOST,
             Self::World(_)
             | Self::Networks(_)
             | Self::Accounting(_)

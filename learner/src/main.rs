@@ -2,6 +2,7 @@
 
 use std::io::{IsTerminal as _, Write as _};
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use clap::{CommandFactory as _, Parser as _};
 use comic_learner::STOPPED;
@@ -18,7 +19,7 @@ use tracing_subscriber::fmt::format::FmtSpan;
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
-    let options = Options::parse();
+    let options = Arc::new(Options::parse());
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
     let log = tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
@@ -48,7 +49,7 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(options: &Options) -> Result<ExitCode> {
+fn run(options: &Arc<Options>) -> Result<ExitCode> {
     match &options.command {
         Some(command) => run_command(command, options)?,
         None if options.print => comic_learner::run::print(options)?,

@@ -10,7 +10,7 @@ use clap::Args;
 use comic_experiment::{DeviceName, Experiment};
 
 use crate::error::{Error, Result};
-use crate::world::{MEETING, World};
+use crate::world::{self, MEETING, World};
 
 /// How long rank 0's own name may have no address yet, or that of a former pod.
 const NAMING: Duration = Duration::from_secs(120);
@@ -116,6 +116,10 @@ impl Meeting {
         };
         tracing::info!(rank, size, %rendezvous, "waiting for the other ranks");
         let (address, listener) = rendezvous.reach(rank)?;
+        if listener.is_some() {
+            // Some systems give a machine's own name a loopback address, which the other machines cannot reach.
+            tracing::info!(%address, "the other ranks can meet this one here");
+        }
         let own = match advertise {
             Some(advertised) => advertised.clone(),
             None => Rendezvous::of(advertised(serving, address)?),
@@ -143,23 +147,30 @@ impl Rendezvous {
             };
             let patience = if rank == 0 { NAMING } else { MEETING };
             if begun.elapsed() >= patience || error.kind() == ErrorKind::AddrInUse {
-                let remedy = match rank {
-                    0 => "it must be an address of this machine, with a free port",
-                    _ => "rank 0 does not listen there",
-                };
-                return Err(Error::system(format!("--rendezvous {self}: {remedy}"))(error));
+                return Err(match rank {
+                    0 => Error::system(format!(
+                        "--rendezvous {self}: it must be an address of this machine, with a free port"
+                    ))(error),
+                    _ => world::Error::Unreachable { rank, rendezvous: self.to_string(), source: error }.into(),
+                });
             }
             std::thread::sleep(AGAIN);
         }
     }
 
     fn attempt(&self, rank: usize) -> std::io::Result<(SocketAddr, Option<TcpListener>)> {
-        let address = (self.host.as_str(), self.port).to_socket_addrs()?.next().ok_or(ErrorKind::NotFound)?;
-        if rank == 0 {
-            return Ok((address, Some(TcpListener::bind(address)?)));
+        let mut failed = std::io::Error::from(ErrorKind::NotFound);
+        for address in (self.host.as_str(), self.port).to_socket_addrs()? {
+            let reached = match rank {
+                0 => TcpListener::bind(address).map(Some),
+                _ => TcpStream::connect_timeout(&address, ATTEMPT).map(|_| None),
+            };
+            match reached {
+                Ok(listener) => return Ok((address, listener)),
+                Err(error) => failed = error,
+            }
         }
-        TcpStream::connect_timeout(&address, ATTEMPT)?;
-        Ok((address, None))
+        Err(failed)
     }
 }
 

@@ -7,6 +7,7 @@ mod prepare;
 use std::io::Write as _;
 use std::net::SocketAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use comic_experiment::Experiment;
@@ -59,14 +60,14 @@ pub fn print(options: &Options) -> Result<()> {
 ///
 /// # Errors
 /// A wrong experiment, unusable clips, a run directory of another experiment, an address in use, a disk that fails.
-pub fn run(options: &Options) -> Result<Ending> {
+pub fn run(options: &Arc<Options>) -> Result<Ending> {
     let experiment = options.document.resolve()?;
     options.world.check(&experiment)?;
     tch::set_num_threads(threads::of(&experiment) as i32);
     runtime()?.block_on(serve_and_train(options, experiment))
 }
 
-async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<Ending> {
+async fn serve_and_train(options: &Arc<Options>, experiment: Experiment) -> Result<Ending> {
     // First, so that no signal is missed.
     let mut signals = Signals::new()?;
     let security = Security::new(&options.security, options.address)?;
@@ -75,14 +76,8 @@ async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<En
     let open = || Store::open(&options.run, experiment.learner.checkpoints_kept);
     let store = (options.world.rank == 0).then(open).transpose()?;
     let _lock = store.as_ref().map(Store::lock).transpose()?;
-    // Another rank keeps what its actors fetch only as long as it runs.
-    let scratch = || tempfile::tempdir().map_err(Error::system("there is no temporary directory: set TMPDIR"));
-    let scratch = store.is_none().then(scratch).transpose()?;
-    let files = scratch.as_ref().map_or(options.run.as_path(), TempDir::path);
-    let meeting = meet(options, local_address(&listeners.actors)?, &mut signals).await?;
-    // After the lock, so that only the learner that has the run takes the device. It may block: nothing else runs yet.
-    let backend = Backend::open(&experiment.learner)?;
-    let (parts, service) = prepare::prepare(options, experiment, backend, security, store, files, meeting)?;
+    let begun = Begun { options: Arc::clone(options), experiment, security, store };
+    let (parts, service, _scratch) = begin(begun, local_address(&listeners.actors)?, &mut signals).await?;
     let (batcher, publisher, epoch) = (parts.batcher.clone(), parts.publisher.clone(), parts.epoch);
     let trained_before = batcher.accounting().trained;
     let mut training = start_trainer(parts)?;
@@ -115,21 +110,46 @@ async fn serve_and_train(options: &Options, experiment: Experiment) -> Result<En
     Ok(ending)
 }
 
-/// Meets the other ranks. A signal ends the process meanwhile: nothing has begun.
-async fn meet(options: &Options, serving: SocketAddr, signals: &mut Signals) -> Result<Meeting> {
-    let arguments = options.world.clone();
-    if arguments.world_size == 1 {
-        return Meeting::hold(&arguments, serving);
+/// What a learner epoch begins with.
+struct Begun {
+    options: Arc<Options>,
+    experiment: Experiment,
+    security: Security,
+    store: Option<Store>,
+}
+
+/// The parts, the service, and the directory of what actors fetch, if it is not the run's.
+type Parts = (TrainerParts, Service, Option<TempDir>);
+
+/// Meets the other ranks and prepares the parts. With several ranks that may take minutes, in which a signal ends the process: nothing
+/// has begun.
+async fn begin(begun: Begun, serving: SocketAddr, signals: &mut Signals) -> Result<Parts> {
+    if begun.options.world.world_size == 1 {
+        return meet_and_prepare(begun, serving);
     }
     tokio::select! {
-        meeting = tokio::task::spawn_blocking(move || Meeting::hold(&arguments, serving)) => {
-            meeting.map_err(|_| Error::Panicked("the thread that meets the other ranks"))?
+        parts = tokio::task::spawn_blocking(move || meet_and_prepare(begun, serving)) => {
+            parts.map_err(|_| Error::Panicked("the thread that meets the other ranks"))?
         }
         () = signals.first() => {
-            tracing::info!("told to stop before all ranks were here: nothing has changed");
+            tracing::info!("told to stop before training began");
             signal_hook::low_level::exit(STOPPED.into())
         }
     }
+}
+
+fn meet_and_prepare(begun: Begun, serving: SocketAddr) -> Result<Parts> {
+    let Begun { options, experiment, security, store } = begun;
+    let meeting = Meeting::hold(&options.world, serving)?;
+    // Only the learner that has the run takes the device.
+    let backend = Backend::open(&experiment.learner)?;
+    // Another rank than the first keeps what its actors fetch only as long as it runs.
+    let scratch = || tempfile::Builder::new().prefix("comic-learner-").tempdir();
+    let scratch = store.is_none().then(scratch).transpose();
+    let scratch = scratch.map_err(Error::system("there is no directory for temporary files: set TMPDIR"))?;
+    let files = scratch.as_ref().map_or_else(|| options.run.clone(), |scratch| scratch.path().to_path_buf());
+    let (parts, service) = prepare::prepare(&options, experiment, backend, security, store, &files, meeting)?;
+    Ok((parts, service, scratch))
 }
 
 /// Tells the actors that the run is over, and gives them this time to hear it, and more if one is away.

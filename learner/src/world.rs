@@ -57,6 +57,18 @@ pub enum Error {
         /// What c10d says.
         reason: String,
     },
+    /// Rank 0 does not listen at the rendezvous.
+    #[error(
+        "rank {rank} cannot reach rank 0 at --rendezvous {rendezvous}: it must be an address at which rank 0 listens"
+    )]
+    Unreachable {
+        /// This rank.
+        rank: usize,
+        /// The rendezvous, as given.
+        rendezvous: String,
+        /// Why the last attempt failed.
+        source: std::io::Error,
+    },
     /// A rank ended, or does not answer.
     #[error(
         "rank {rank} lost another rank, so the update cannot be finished: {reason}. When all ranks are started again, they continue \

@@ -59,9 +59,12 @@ pub fn to_bfloat16(document: &[u8]) -> Result<Vec<u8>, Error> {
 /// The beginning of the names of a normaliser's statistics.
 const NORMALISER: &str = "normaliser.";
 
-/// The upper half of the nearest float32 that has a bfloat16, of two equally near ones the even one. The number is finite, and may become
-/// infinite, which every reader refuses.
+/// The upper half of the nearest float32 that has a bfloat16, of two equally near ones the even one. A large number may become infinite,
+/// which every reader refuses, as it does a NaN.
 fn nearest_bfloat16(value: f32) -> u16 {
+    if value.is_nan() {
+        return 0x7fc0;
+    }
     let bits = value.to_bits();
     let even = (bits >> 16) & 1;
     (bits.wrapping_add(0x7fff + even) >> 16) as u16

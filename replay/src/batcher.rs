@@ -14,6 +14,7 @@ use crate::batch::{Batch, TakeBack};
 use crate::buffer::Buffer;
 use crate::config::{BatchOrder, Config};
 use crate::ledger::{JoinError, Joined, Ledger, SequenceStatus};
+use crate::next::Next;
 use crate::phase::Phase;
 use crate::snapshot::LedgerSnapshot;
 
@@ -33,17 +34,6 @@ pub enum Outcome {
     /// Actor and incarnation have no account; the actor must join first.
     NotJoined,
     /// The batcher is closed; nothing was recorded.
-    Closed,
-}
-
-/// The result of waiting for a batch.
-#[derive(Debug)]
-pub enum Next {
-    /// A batch.
-    Batch(Batch),
-    /// The time has elapsed.
-    Elapsed,
-    /// The batcher is closed.
     Closed,
 }
 

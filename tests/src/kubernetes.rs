@@ -110,6 +110,31 @@ impl Cluster {
         Ok(cluster)
     }
 
+    /// The number of learners: 1, or as many as the learner's Indexed Job has pods, and as the learners are told.
+    ///
+    /// # Errors
+    /// When these numbers differ.
+    pub fn ranks(&self) -> Result<usize> {
+        let job = self.learner.spec.as_ref().context("no spec")?;
+        let told = option(container(self.learner_pod()?)?, "--world-size").ok().map(str::parse::<i32>).transpose()?;
+        let numbers = [told, job.parallelism, job.completions];
+        let indexed = job.completion_mode.as_deref() == Some("Indexed");
+        match told {
+            None => ensure!(numbers == [None; 3] && !indexed, "more than one learner: {numbers:?}"),
+            Some(size) => ensure!(size > 1 && numbers == [told; 3] && indexed, "{numbers:?} learners"),
+        }
+        Ok(usize::try_from(told.unwrap_or(1))?)
+    }
+
+    /// The host where actors begin: the learner's Service, or the pod of rank 0 behind it.
+    ///
+    /// # Errors
+    /// When the number of learners is not clear.
+    pub fn host(&self) -> Result<String> {
+        let service = self.service.metadata.name.as_deref().unwrap_or_default();
+        Ok(if self.ranks()? == 1 { service.to_owned() } else { format!("comic-learner-0.{service}") })
+    }
+
     /// The learner's pod, the actors' pod and the evaluator's pod.
     ///
     /// # Errors

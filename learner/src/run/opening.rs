@@ -22,8 +22,7 @@ pub(super) struct Epoch {
     pub(super) run: u64,
 }
 
-/// Checks that all ranks have the experiment and the clips of rank 0. Each may have another device of the same kind, and its files at
-/// other paths.
+/// Checks that all ranks have the experiment and the clips of rank 0. Each may have another device of the same kind.
 ///
 /// # Errors
 /// [`Error::Configuration`] with every field and file that is different.
@@ -39,7 +38,6 @@ pub(super) fn check_equality(world: &World, experiment: &Experiment, catalogue: 
     if std::mem::discriminant(&first.learner.device) == std::mem::discriminant(&experiment.learner.device) {
         first.learner.device = experiment.learner.device;
     }
-    first.transfer.low_level.clone_from(&experiment.transfer.low_level);
     let differs = |Difference { field, ours, theirs }| format!("{field} is {ours} there and {theirs} here");
     let mut differences: Vec<String> = first.differences(experiment)?.into_iter().map(differs).collect();
     let others = own.iter().filter(|file| !files.contains(file));

@@ -299,7 +299,7 @@ impl TrainerHandle {
     /// Tells how many actors each rank has, for those that come.
     pub fn place_actors(&self, actors: &[u64]) {
         if let Some(placement) = &self.placement {
-            placement.count(actors);
+            placement.count(actors, Instant::now());
         }
     }
 

@@ -8,6 +8,8 @@ use parking_lot::Mutex;
 
 /// How long a rank may not know yet of an actor that was sent to it.
 const ON_THE_WAY: Duration = Duration::from_secs(5);
+/// How long a rank may have no actor before that is said, and said again.
+const ALONE: Duration = Duration::from_secs(60);
 /// Most names that are remembered, as many as actors in the roster. When there are more, all are forgotten.
 const CAPACITY: usize = 65_536;
 
@@ -29,6 +31,8 @@ struct State {
     sent: VecDeque<(Instant, usize)>,
     /// The rank of each name.
     names: HashMap<String, usize>,
+    /// Since when a rank has no actor, or since the last warning of it.
+    waits_since: Option<Instant>,
 }
 
 impl Placement {
@@ -38,11 +42,18 @@ impl Placement {
         Self { rank, addresses, state: Mutex::new(state) }
     }
 
-    /// Notes how many actors each rank has.
-    pub fn count(&self, actors: &[u64]) {
+    /// Notes how many actors each rank has. Warns when one has had none for long while others have some: every batch waits for it.
+    pub fn count(&self, actors: &[u64], now: Instant) {
         let mut state = self.state.lock();
         if actors.len() == state.actors.len() {
             state.actors.copy_from_slice(actors);
+        }
+        let waits = self.rank == 0 && actors.contains(&0) && actors.iter().any(|actors| *actors > 0);
+        if !waits {
+            state.waits_since = None;
+        } else if now.duration_since(*state.waits_since.get_or_insert(now)) >= ALONE {
+            state.waits_since = Some(now);
+            tracing::warn!(?actors, "a rank has no actor, and every batch waits for its share: start more actors");
         }
     }
 
@@ -102,7 +113,7 @@ mod tests {
         let names = ["1", "2", "3", "4", "5", "6"];
         let placed: Vec<_> = names.map(|name| placement.elsewhere(name, None, now)).to_vec();
         assert_eq!(placed, [None, Some("b:2"), Some("c:3"), None, Some("b:2"), Some("c:3")]);
-        placement.count(&[9, 2, 8]);
+        placement.count(&[9, 2, 8], now);
         let later = now + ON_THE_WAY;
         assert_eq!(placement.elsewhere("7", None, later), Some("b:2"));
     }
@@ -120,7 +131,7 @@ mod tests {
         let (placement, now) = (placement(0), Instant::now());
         assert_eq!(placement.elsewhere("one", None, now), None);
         assert_eq!(placement.elsewhere("two", None, now), Some("b:2"));
-        placement.count(&[0, 50, 0]);
+        placement.count(&[0, 50, 0], now);
         assert_eq!(placement.elsewhere("two", None, now), Some("b:2"));
         // Also if rank 0 was started anew, and has only heard of the process that is replaced.
         let placement = self::placement(0);

@@ -128,8 +128,7 @@ impl Trainer {
             if let Some(saved) = saved_replay {
                 saved.remove_earlier(state.progress.updates)?;
             }
-            // No rank ends well before the last checkpoint is on disk, which may take long.
-            world.wait_for(MEETING);
+            // No rank ends well before the last checkpoint is on disk.
             world.exchange(())?;
             Ok(ending)
         });
@@ -138,7 +137,12 @@ impl Trainer {
     }
 
     fn train_to_the_end(&mut self) -> Result<Ending> {
+        // Each has prepared itself in its own time.
+        self.world.exchange(())?;
+        self.world.wait_for(SILENCE);
         let ending = self.train()?;
+        // The disk of rank 0 may be slow.
+        self.world.wait_for(MEETING);
         self.report_deferred()?;
         self.take_evaluations()?;
         self.write_metrics(true)?;
@@ -152,7 +156,6 @@ impl Trainer {
             0 => self.publish()?,
             _ => self.versions.announce(&self.state)?,
         }
-        self.world.wait_for(SILENCE);
         // A batch that waits for those of the other ranks.
         let mut held = None;
         loop {
@@ -178,12 +181,8 @@ impl Trainer {
     /// What all ranks do next.
     fn decide(&mut self, next: &Next) -> Result<Round> {
         self.service.beat();
-        let batch = match next {
-            Next::Batch(batch) => Some(Contents::of(batch, self.spec.tasks.len())),
-            Next::Elapsed | Next::Closed => None,
-        };
         let said = Said {
-            batch,
+            batch: next.batch().map(|batch| Contents::of(batch, self.spec.tasks.len())),
             stops: self.batcher.is_closed(),
             actors: self.service.actors(),
             used: self.budget.used(&self.state.progress),
@@ -206,7 +205,9 @@ impl Trainer {
         }
         let (steps, losses) = self.take_gradient_steps(&batch, round.used)?;
         let publishes = self.state.algorithm.publishes_after(self.state.progress.updates + 1, steps);
-        let restored = self.report_when_ready(losses, publishes || round.checkpoint)?;
+        // Only a learner alone may look at the clock again.
+        let due = round.checkpoint || (self.world.size() == 1 && self.checkpoints.are_due());
+        let restored = self.report_when_ready(losses, publishes || due)?;
         let version = self.state.progress.version;
         self.state.progress.updates += 1;
         self.state.progress.gradient_steps += steps;
@@ -222,7 +223,7 @@ impl Trainer {
         self.reports.count_rows(&batch);
         self.batcher.trained(batch);
         self.reports.count_duration(began.elapsed(), ages);
-        self.after_update(round)
+        self.after_update(due)
     }
 
     /// Adds a batch to the statistics of the observations while they are still collected. They take effect with the next
@@ -246,7 +247,7 @@ impl Trainer {
             false => self.versions.repeat(&mut self.state)?,
         }
         self.batcher.discard(batch, Reason::Superseded);
-        self.after_update(round)
+        self.after_update(round.checkpoint)
     }
 
     /// The gradient steps on a batch: how many, and the mean of their losses.
@@ -345,9 +346,8 @@ impl Trainer {
         Ok(())
     }
 
-    fn after_update(&mut self, round: &Round) -> Result<()> {
-        // Only a learner alone may look again after its update.
-        let due = round.checkpoint || (self.world.size() == 1 && self.checkpoints.are_due());
+    /// Writes a checkpoint if one is due.
+    fn after_update(&mut self, due: bool) -> Result<()> {
         if !due {
             return Ok(());
         }
