@@ -89,6 +89,29 @@ async fn containers_survive_kills_and_cuts_and_the_accounting_balances() -> Resu
     Ok(())
 }
 
+#[tokio::test]
+async fn containers_of_two_learners_survive_the_loss_of_one() -> Result<()> {
+    let project = Project::new("ranks", &["compose.yaml", "compose.data-parallel.yaml"]);
+    project.up(2)?;
+    let before = trains_on_with(1, &project, "each learner trains with an actor of its own").await?;
+    let [first, second] = [project.container("learner")?, project.container("learner-1")?];
+    second.until_log_holds("actor joined", LIMIT).await?;
+    first.until_log_holds("written checkpoint", LIMIT).await?;
+    second.docker(&["kill"])?;
+    first.until_log_holds("rank 0 lost another rank", LIMIT).await?;
+    // Docker starts the first one again. One that was killed by hand it does not.
+    project.up(2)?;
+    let after = trains_on_with(1, &project, "both resume, and the actors find them").await?;
+    ensure!(after["learner_epoch"].as_u64() > before["learner_epoch"].as_u64(), "the learner epoch did not grow");
+    ensure!(second.log()?.matches("actor joined").count() == 2, "its actor did not come back: {}", second.log()?);
+    for learner in [&first, &second] {
+        learner.until_is(".State.Health.Status", "healthy", LIMIT).await?;
+    }
+    project.compose(&["stop", "learner"])?;
+    ensure!(first.inspect(".State.ExitCode")? == "4", "SIGTERM did not reach the learner: {}", first.log()?);
+    Ok(())
+}
+
 /// Each container runs as a user without privileges, on a read-only file system, with the program as process 1, and healthy.
 async fn check_containers(project: &Project) -> Result<()> {
     for (service, program) in [("learner", "comic-learner"), ("actor", "comic-actor"), ("evaluator", "comic-actor")] {
