@@ -232,7 +232,10 @@ proptest! {
 
     #[test]
     fn permuting_a_batch_changes_nothing(seed in 0u64..1000, order in Just((0..UNROLLS).collect::<Vec<_>>()).prop_shuffle()) {
-        let minibatch = unrolls(seed).minibatch();
+        let mut unrolls = unrolls(seed);
+        // The gradient of the value's bias is the mean error. Without this, errors of both signs can cancel and leave their rounding.
+        unrolls.reward.iter_mut().for_each(|reward| *reward -= 0.2);
+        let minibatch = unrolls.minibatch();
         let permuted = minibatch.select(&order);
         prop_assert!(compare(&minibatch, &permuted) < 2e-6);
     }
