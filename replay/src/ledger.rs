@@ -159,10 +159,10 @@ impl Ledger {
             entry.heard = self.clock;
             return Ok(Joined { actor: *actor, next_sequence: entry.next_sequence });
         }
-        // Every index below `next_actor` was assigned in this run, unless several ranks counted apart. An index without an
-        // entry was closed. An index of
-        // another incarnation was assigned again after a restart from a checkpoint without this actor; then the actor
-        // gets a new account. An actor with an index that is not assigned yet gets a new account, too.
+        // Every index below `next_actor` was assigned in this run, unless several ranks counted apart. So an index without an
+        // entry was closed. An index of another incarnation was assigned again after a restart from a checkpoint without
+        // this actor; then the actor gets a new account. An actor with an index that is not assigned yet gets a new
+        // account, too, and so does one without an entry if several ranks counted apart.
         let closed = |actor: &u64| !self.sparse && *actor < self.next_actor && !self.entries.contains_key(actor);
         if let Some(actor) = claimed.filter(closed) {
             return Err(JoinError::Closed { actor, incarnation });
