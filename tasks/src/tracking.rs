@@ -1,6 +1,7 @@
 //! Multi-clip motion-capture tracking (dm_control's `locomotion/tasks/reference_pose/tracking.py`).
 
 mod environment;
+mod failures;
 mod gradient;
 mod observation;
 mod reference;

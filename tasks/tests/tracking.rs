@@ -351,3 +351,85 @@ fn start_noise_moves_the_starts_of_training_alone() {
     // Twice 0.5 rad/s, of 22,400 draws.
     assert!((deviation(2.0, true) - 1.0).abs() < 0.02);
 }
+
+/// The clips and start frames of some episodes of training with wild actions, in which the body falls.
+fn starts_of(environment: &mut TrackingEnvironment, episodes: usize) -> Vec<(usize, usize)> {
+    let mut starts = Vec::new();
+    for _ in 0..episodes {
+        environment.reset();
+        let episode = environment.episode();
+        starts.push((episode.clip, episode.start));
+        for step in 0.. {
+            if environment.step(&wild(step)).outcome != Outcome::Running {
+                break;
+            }
+        }
+    }
+    starts
+}
+
+#[test]
+fn with_starts_by_failures_the_seed_alone_still_decides_the_episodes() {
+    let config = Tracking { failure_starts: 0.5, ..Tracking::default() };
+    let task = task_of(&config, &["walk", "squat"]);
+    let (mut one, mut other) = (task.tracking_environment(1), task.tracking_environment(2));
+    // Another history must not matter.
+    starts_of(&mut other, 5);
+    one.reseed(9);
+    other.reseed(9);
+    let starts = starts_of(&mut one, 10);
+    assert_eq!(starts, starts_of(&mut other, 10));
+    assert_ne!(starts, starts_of(&mut task.tracking_environment(10), 10));
+}
+
+#[test]
+fn evaluations_do_not_count_as_failures() {
+    let config = Tracking { failure_starts: 1.0, ..Tracking::default() };
+    let task = task_of(&config, &["walk", "squat"]);
+    let (mut one, mut other) = (task.tracking_environment(1), task.tracking_environment(1));
+    for start in 0..20 {
+        one.reset_to(1, start).unwrap();
+        for step in 0.. {
+            if one.step(&wild(step)).outcome != Outcome::Running {
+                break;
+            }
+        }
+    }
+    assert_eq!(starts_of(&mut one, 10), starts_of(&mut other, 10));
+}
+
+#[test]
+fn without_starts_by_failures_nothing_of_an_episode_changes_the_next_start() {
+    let task = task_of(&Tracking::default(), &["walk", "squat"]);
+    let (mut one, mut other) = (task.tracking_environment(1), task.tracking_environment(1));
+    let mut starts = Vec::new();
+    for _ in 0..10 {
+        other.reset();
+        starts.push((other.episode().clip, other.episode().start));
+    }
+    assert_eq!(starts_of(&mut one, 10), starts);
+}
+
+#[test]
+fn an_episode_never_leaves_its_clip() {
+    let config = Tracking { failure_starts: 0.5, ..lenient() };
+    let clips = ["run", "walk"];
+    let (task, catalogue) = (task_of(&config, &clips), catalogue(&clips));
+    let look_ahead = config.reference_steps.iter().max().unwrap();
+    let mut environment = task.tracking_environment(4);
+    for _ in 0..30 {
+        environment.reset();
+        let episode = environment.episode();
+        let clip = catalogue.load(episode.clip).unwrap();
+        for step in 1.. {
+            let outcome = environment.step(&[0.0; 56]).outcome;
+            // The reference is the frame of this clip, and of no other, to the last frame of the episode.
+            let reference = environment.scenery().reference.unwrap();
+            assert_eq!(reference[7..], clip.motion.joints[episode.start + step]);
+            if outcome != Outcome::Running {
+                assert_eq!(episode.start + step + look_ahead + 1, clip.steps());
+                break;
+            }
+        }
+    }
+}

@@ -24,6 +24,10 @@ pub struct Tracking {
     pub time_limit: f64,
     /// Start every episode at its clip's first frame instead of a random one.
     pub always_start_at_clip_start: bool,
+    /// Share of the starts of training that are drawn by failures (D, after BeyondMimic's adaptive sampling): at the places
+    /// where the environment's own episodes failed, and up to 1.5 s before them. The other starts are all equally likely.
+    /// Each environment counts its own episodes, so lockstep stays reproducible. Evaluations count for nothing.
+    pub failure_starts: f64,
     /// Noise of the starts of training, as a factor (D): a start of training differs from its frame by normal numbers whose
     /// standard deviations are this number times 0.1 rad (joint angles), 0.5 rad/s (velocities of the joints and angular
     /// velocities of the root) and 0.3 m/s (velocity of the root). A policy that was never off its reference cannot come back
@@ -91,6 +95,7 @@ impl Default for Tracking {
             termination_error: TerminationError::DmControl,
             time_limit: 30.0,
             always_start_at_clip_start: false,
+            failure_starts: 0.0,
             start_noise: 0.0,
             preset_actuators: false,
             observations: ["body_height", "reference_rel_bodies_pos_local", "reference_rel_bodies_quats"]
@@ -124,6 +129,11 @@ impl TaskParameters for Tracking {
         section.ensure("termination_threshold", termination_threshold, *termination_threshold > 0.0, POSITIVE)?;
         section.ensure("time_limit", time_limit, *time_limit > 0.0, "must be positive seconds")?;
         section.deviation("start_noise", self.start_noise)?;
+        let share = self.failure_starts;
+        section.ensure("failure_starts", share, (0.0..=1.0).contains(&share), "must be 0 to 1")?;
+        let choice = share == 0.0 || !self.always_start_at_clip_start;
+        let remedy = "must be 0 with tracking.always_start_at_clip_start, which leaves no start to choose";
+        section.ensure("failure_starts", share, choice, remedy)?;
         let GradientOfReward { decay, root_velocity, .. } = self.gradient;
         section.ensure("gradient.decay", decay, (0.0..=1.0).contains(&decay), "must be in [0, 1]")?;
         for (name, power) in TRACKING_REWARD_TERMS.iter().zip(self.gradient.powers()) {

@@ -10,6 +10,7 @@ use rand::SeedableRng;
 use rand_distr::{Distribution as _, StandardNormal};
 use rand_pcg::Pcg64;
 
+use super::failures::Failures;
 use super::gradient::differentiate;
 use super::observation::{Observation, View};
 use super::reference::Reference;
@@ -80,6 +81,10 @@ pub struct TrackingEnvironment {
     /// Whether the episode lasted to the clip's end, or to the time limit.
     lasted: bool,
     diverged: bool,
+    /// Where episodes of training failed, if starts are drawn by it.
+    failures: Option<Failures>,
+    /// The episode is one of training, and is not over.
+    training: bool,
     /// Records steps for the derivative of the reward, if somebody wants it.
     tape: Option<GradientTape>,
 }
@@ -88,6 +93,7 @@ impl TrackingEnvironment {
     fn new(task: Arc<TrackingTask>, seed: u64) -> Self {
         let data = task.models.data();
         let random = Pcg64::seed_from_u64(seed);
+        let failures = task.failures();
         let mut environment = Self {
             task,
             data,
@@ -99,6 +105,8 @@ impl TrackingEnvironment {
             error: 0.0,
             lasted: false,
             diverged: false,
+            failures,
+            training: false,
             tape: None,
         };
         environment.reset();
@@ -158,12 +166,21 @@ impl TrackingEnvironment {
         self.error = reward::termination_error(task.config.termination_error, &task.walker, data, reference, frame);
         self.previous.copy_from_slice(data.qpos());
         (self.clip, self.start, self.frame) = (clip, frame, frame);
-        (self.lasted, self.diverged) = (false, false);
+        (self.lasted, self.diverged, self.training) = (false, false, false);
+    }
+
+    /// The episode is over, or a caller steps after its end, which counts for nothing.
+    fn end_episode(&mut self, failed: bool) {
+        let first = self.reference().first;
+        if let (Some(failures), true) = (&mut self.failures, std::mem::take(&mut self.training)) {
+            failures.record(self.clip, first + self.start..first + self.frame + 1, failed);
+        }
     }
 
     /// `began` says whether the step was recorded.
     fn diverge(&mut self, began: bool) -> Step {
         self.diverged = true;
+        self.end_episode(true);
         if let Some(tape) = &mut self.tape {
             tape.diverge(began);
         }
@@ -189,11 +206,15 @@ impl TrackingEnvironment {
 
 impl Environment for TrackingEnvironment {
     fn reset(&mut self) {
-        let (clip, start) = self.task.starts.draw(&mut self.random);
+        let (clip, start) = match &self.failures {
+            Some(failures) => failures.draw(&self.task.starts, &mut self.random),
+            None => self.task.starts.draw(&mut self.random),
+        };
         let first = self.task.references[clip].first;
         let frame = start.saturating_sub(first);
         let (qpos, qvel) = self.draw_state(clip, frame);
         self.place(clip, frame, [&qpos, &qvel]);
+        self.training = true;
     }
 
     fn reset_to(&mut self, clip: usize, start: usize) -> Result<(), Error> {
@@ -314,11 +335,16 @@ impl Simulated for TrackingEnvironment {
             tape.end_step(reward, outcome != Outcome::Running);
         }
         let discount = if outcome == Outcome::Terminated { 0.0 } else { 1.0 };
-        Step { reward_terms, discount, outcome, head_height: task.walker.head_height(data) }
+        let step = Step { reward_terms, discount, outcome, head_height: task.walker.head_height(data) };
+        if outcome != Outcome::Running {
+            self.end_episode(outcome == Outcome::Terminated);
+        }
+        step
     }
 
     fn reseed(&mut self, seed: u64) {
         self.random = Pcg64::seed_from_u64(seed);
+        self.failures = self.task.failures();
     }
 
     fn model(&self) -> Arc<MjModel> {

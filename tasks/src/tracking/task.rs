@@ -3,6 +3,7 @@
 use comic_clips::{Catalogue, Entry, WalkerModel};
 use comic_experiment::{TRACKING_OBSERVATIONS, TaskSpec, Tracking};
 
+use super::failures::Failures;
 use super::observation::Observation;
 use super::reference::Reference;
 use super::starts::Starts;
@@ -21,6 +22,8 @@ pub struct TrackingTask {
     pub(super) models: Models,
     pub(super) references: Vec<Reference>,
     pub(super) starts: Starts,
+    /// Of an environment that has not failed yet; `None` if failures do not count.
+    failures: Option<Failures>,
     pub(super) observations: Vec<Observation>,
     /// The largest reference step.
     pub(super) look_ahead: usize,
@@ -62,6 +65,9 @@ impl TrackingTask {
         let starts = Starts::new(entries, look_ahead, min_steps, config.always_start_at_clip_start)
             .ok_or(Error::NoStarts { min_steps })?;
 
+        let share = config.failure_starts;
+        let failures = (share > 0.0).then(|| Failures::new(share, first.dt, entries, starts.clips()));
+
         let model = humanoid::build(kind)?;
         let walker = Walker::new(kind, &model)?;
         let models = Models::new(model, substeps(&first.name, first.dt)?);
@@ -73,7 +79,24 @@ impl TrackingTask {
             ..TaskSpec::tracking(config, entries.iter().map(|entry| entry.name.clone()).collect())
                 .map_err(unknown_observation)?
         };
-        Ok(Self { config: config.clone(), walker, models, references, starts, observations, look_ahead, spec })
+        Ok(Self {
+            config: config.clone(),
+            walker,
+            models,
+            references,
+            starts,
+            failures,
+            observations,
+            look_ahead,
+            spec,
+        })
+    }
+}
+
+impl TrackingTask {
+    /// The table of an environment's failures, without any.
+    pub(super) fn failures(&self) -> Option<Failures> {
+        self.failures.clone()
     }
 }
 
