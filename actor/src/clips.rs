@@ -1,4 +1,4 @@
-//! `comic-actor clips`: lists, checks, imports, merges and fetches motion capture.
+//! `comic-actor clips`: lists, checks, imports, edits, merges and fetches motion capture.
 //!
 //! # Layout
 //! One file for each sub-command. It parses and prints; `comic-clips` does the work. Only `download` uses the network.
@@ -7,8 +7,11 @@ mod check;
 mod download;
 mod fetch;
 mod import;
+mod join;
 mod list;
 mod merge;
+mod mirror;
+mod speed;
 mod table;
 
 use std::io::Write as _;
@@ -22,7 +25,7 @@ use crate::Error;
 const EXIT_CODES: &str = "\
 Exit codes: 0 when done, 1 when `check` found defects or a download failed, 2 when files or arguments are wrong.";
 
-/// Lists, checks, imports, merges and fetches motion capture.
+/// Lists, checks, imports, edits, merges and fetches motion capture.
 #[derive(Args, Clone, Debug)]
 #[command(after_help = EXIT_CODES)]
 pub struct Clips {
@@ -36,8 +39,14 @@ enum Command {
     List(list::List),
     /// Finds every defect of a file's clips: penetration, floating, joint limits, jumps, NaN.
     Check(check::Check),
-    /// Makes clips from the CMU database's ASF and AMC files.
+    /// Makes clips from motion capture: ASF and AMC, BVH, or SMPL files.
     Import(import::Import),
+    /// Writes mirrored clips: left and right exchanged.
+    Mirror(mirror::Mirror),
+    /// Writes faster or slower clips.
+    Speed(speed::Speed),
+    /// Writes clips with the legs of one clip and the arms of another.
+    Join(join::Join),
     /// Merges the clips of several files into one.
     Merge(merge::Merge),
     /// Fetches DeepMind's clips of 2020, 455 MiB.
@@ -54,6 +63,9 @@ impl Clips {
             Command::List(list) => list.run(),
             Command::Check(check) => check.run(),
             Command::Import(import) => import.run(),
+            Command::Mirror(mirror) => mirror.run(),
+            Command::Speed(speed) => speed.run(),
+            Command::Join(join) => join.run(),
             Command::Merge(merge) => merge.run(),
             Command::Fetch(fetch) => fetch.run(),
         }

@@ -8,7 +8,8 @@ use parts::Shape;
 
 use crate::humanoid::JOINTS;
 use crate::spatial::{
-    IDENTITY, Matrix, Quaternion, Vector, about, add, dot, matrix, multiply, norm, normalize, rotate, scale, subtract,
+    IDENTITY, Matrix, Quaternion, Vector, about, add, matrix, multiply, norm, normalize, rotate, scale, subtract,
+    unrotate,
 };
 
 /// The number of bodies, with the free frame and the root.
@@ -79,6 +80,17 @@ fn axis(joint: usize) -> usize {
     }
 }
 
+/// Index of the body that carries this one; the first body carries itself.
+pub(crate) fn parent(body: usize) -> usize {
+    table::BODIES[body].parent
+}
+
+/// The joints of [`JOINTS`] that turn a body against its parent.
+pub(crate) fn hinges(body: usize) -> std::ops::Range<usize> {
+    let (first, end) = table::BODIES[body].hinges;
+    first..end
+}
+
 pub(crate) fn geoms() -> &'static [Geom] {
     &table::GEOMS
 }
@@ -132,16 +144,34 @@ impl Frames {
 
     /// Height of the lowest point of a geom, m, world frame.
     pub(crate) fn bottom(&self, geom: &Geom) -> f64 {
+        let [a, b] = self.low_points(geom);
+        a[2].min(b[2])
+    }
+
+    /// The lowest point of each end of a capsule, m, world frame. A sphere or an ellipsoid has one lowest point, which is
+    /// given twice.
+    pub(crate) fn low_points(&self, geom: &Geom) -> [Vector; 2] {
         let rotation = &self.rotation[geom.body];
-        let center = self.position[geom.body][2] + dot(&rotation[2], &geom.position);
-        // The world's z axis in the geom's frame.
+        let center = add(self.position[geom.body], rotate(rotation, geom.position));
         let local = matrix(geom.quaternion);
-        let up: Vector = std::array::from_fn(|column| (0..3).map(|row| rotation[2][row] * local[row][column]).sum());
+        // The columns of the geom's rotation are its axes in the world frame.
+        let axes: Matrix = rotation.map(|row| unrotate(&local, row));
+        // The world's z axis in the geom's frame.
+        let up = axes[2];
         match geom.shape {
-            Shape::Sphere { radius } => center - radius,
-            Shape::Capsule { radius, half_length } => center - radius - half_length * up[2].abs(),
+            Shape::Sphere { radius } => [subtract(center, [0.0, 0.0, radius]); 2],
+            Shape::Capsule { radius, half_length } => {
+                let middle = subtract(center, [0.0, 0.0, radius]);
+                let half = scale(half_length, axes.map(|row| row[2]));
+                [add(middle, half), subtract(middle, half)]
+            }
             Shape::Ellipsoid { semi_axes } => {
-                center - norm(&[semi_axes[0] * up[0], semi_axes[1] * up[1], semi_axes[2] * up[2]])
+                // The point of an ellipsoid with the semi-axes D farthest along the unit vector u is D² u / |D u|.
+                let scaled: Vector = std::array::from_fn(|axis| semi_axes[axis] * up[axis]);
+                let depth = norm(&scaled);
+                let point: Vector = std::array::from_fn(|axis| semi_axes[axis] * scaled[axis] / depth);
+                let [x, y, _] = subtract(center, rotate(&axes, point));
+                [[x, y, center[2] - depth]; 2]
             }
         }
     }

@@ -72,7 +72,7 @@ pub(crate) fn load(name: &str) -> Result<Clip, Error> {
         let clip = find(name)?;
         (clip.name, clip.dt, clip.motion())
     };
-    Ok(Clip { name: name.into(), model: WalkerModel::Cmu2020, dt, motion, features: None })
+    Ok(Clip { name: name.into(), made_from: None, model: WalkerModel::Cmu2020, dt, motion, features: None })
 }
 
 fn find(name: &str) -> Result<&'static Stored, Error> {

@@ -45,6 +45,9 @@ pub struct Asset {
     pub size: u64,
 }
 
+/// The name of a clip, its header, and what it was made from.
+type Described = (String, (Header, Option<String>));
+
 enum Source {
     Builtin,
     File { source: String, file: ClipFile },
@@ -83,6 +86,27 @@ impl Catalogue {
         Ok(catalogue)
     }
 
+    /// Without the clips that were made from others ([`Entry::made_from`]).
+    ///
+    /// # Errors
+    /// [`Error::NoOriginals`] when no clip with a weight above 0 is left.
+    pub fn originals(mut self) -> Result<Self, Error> {
+        let kept = |entry: &Entry| entry.made_from.is_none();
+        let mut of_entry = self.entries.iter();
+        self.source_of.retain(|_| of_entry.next().is_some_and(kept));
+        self.entries.retain(kept);
+        if self.entries.iter().all(|entry| entry.weight == 0.0) { Err(Error::NoOriginals) } else { Ok(self) }
+    }
+
+    /// The clips of an evaluation. With `originals`, these are [`Catalogue::originals`] if a task of `experiment`
+    /// follows clips. Other tasks have no reference, so they must not fail for lack of originals.
+    ///
+    /// # Errors
+    /// As [`Catalogue::originals`].
+    pub fn for_evaluation(self, experiment: &Experiment, originals: bool) -> Result<Self, Error> {
+        if originals && follows_clips(experiment) { self.originals() } else { Ok(self) }
+    }
+
     /// All clips. The index of a clip is its index in this slice.
     pub fn entries(&self) -> &[Entry] {
         &self.entries
@@ -93,8 +117,7 @@ impl Catalogue {
     /// # Errors
     /// [`Error::JointTimestep`].
     pub fn check_joint(&self, experiment: &Experiment) -> Result<(), Error> {
-        let tracks = experiment.tasks().iter().any(|(task, _)| *task == TaskName::Tracking);
-        if experiment.joint.is_empty() || !tracks {
+        if experiment.joint.is_empty() || !follows_clips(experiment) {
             return Ok(());
         }
         match self.entries.iter().find(|entry| !entry.steps_every(CONTROL_TIMESTEP)) {
@@ -185,7 +208,7 @@ impl Catalogue {
             return Err(Error::BuiltinSelection { source_name: source.source.clone() });
         }
         let (own, steps, dt) = builtin::describe(name)?;
-        self.add(source, Source::Builtin, vec![(own.into(), Header { steps, dt, model: WalkerModel::Cmu2020 })])
+        self.add(source, Source::Builtin, vec![(own.into(), (Header { steps, dt, model: WalkerModel::Cmu2020 }, None))])
     }
 
     fn add_file(&mut self, source: &ClipSource, path: Option<&Path>) -> Result<(), Error> {
@@ -202,10 +225,10 @@ impl Catalogue {
         self.add(source, Source::File { source: source.source.clone(), file }, clips)
     }
 
-    fn add(&mut self, source: &ClipSource, opened: Source, clips: Vec<(String, Header)>) -> Result<(), Error> {
-        for (name, Header { steps, dt, model }) in clips {
+    fn add(&mut self, source: &ClipSource, opened: Source, clips: Vec<Described>) -> Result<(), Error> {
+        for (name, (Header { steps, dt, model }, made_from)) in clips {
             let (start_step, end_step, weight) = (source.start_step, source.end_step, source.weight);
-            let entry = Entry { name, steps, dt, model, start_step, end_step, weight };
+            let entry = Entry { name, made_from, steps, dt, model, start_step, end_step, weight };
             entry.check_range()?;
             self.entries.push(entry);
             self.source_of.push(self.sources.len());
@@ -219,6 +242,11 @@ impl fmt::Debug for Catalogue {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter.debug_struct("Catalogue").field("entries", &self.entries).finish_non_exhaustive()
     }
+}
+
+/// Whether a task of the experiment has the clips as its reference.
+fn follows_clips(experiment: &Experiment) -> bool {
+    experiment.tasks().iter().any(|(task, _)| *task == TaskName::Tracking)
 }
 
 /// The names of the clips in `file` that `source` selects, sorted.

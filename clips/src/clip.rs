@@ -7,6 +7,9 @@ use crate::humanoid::WalkerModel;
 pub struct Clip {
     /// The clip's name in its file, or a built-in clip's own name.
     pub name: String,
+    /// What this clip was made of if it is a copy, for instance `mirror CMU_007_01`; see [`edit`](crate::edit). `None`
+    /// for a recording, and for a clip whose file says nothing.
+    pub made_from: Option<String>,
     /// The body that the clip was made for.
     pub model: WalkerModel,
     /// Seconds between frames.

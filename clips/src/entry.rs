@@ -14,6 +14,8 @@ const TIMESTEP_TOLERANCE: f64 = 1e-9;
 pub struct Entry {
     /// The clip's name in its file, or a built-in clip's own name (not its alias).
     pub name: String,
+    /// What the clip was made of if it is a copy; see [`Clip::made_from`](crate::Clip::made_from).
+    pub made_from: Option<String>,
     /// T, the number of frames of the whole clip.
     pub steps: usize,
     /// Seconds between frames.

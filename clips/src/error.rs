@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use crate::file::STEPS;
 use crate::humanoid::WalkerModel;
 
 /// Every error of this crate. Each message names the file and the item, and says what to do.
@@ -223,6 +224,26 @@ pub enum Error {
         /// The allowed values.
         expected: &'static str,
     },
+    /// No clip can be made of this one, or this one cannot be written.
+    #[error("clip `{name}`: {reason}")]
+    Edit {
+        /// The clip.
+        name: String,
+        /// What is wrong, and what is expected.
+        reason: String,
+    },
+    /// A clip has no frames, or more than this program reads.
+    #[error(
+        "clip `{name}` has {steps} frames; a clip in a file must have {} to {}, so split a longer motion",
+        STEPS.start(),
+        STEPS.end()
+    )]
+    Length {
+        /// The clip.
+        name: String,
+        /// T, the number of frames.
+        steps: usize,
+    },
     /// The output file exists already.
     #[error("{} exists; add --force to replace it, or name another file", path.display())]
     Exists {
@@ -249,6 +270,11 @@ pub enum Error {
         /// The name.
         name: String,
     },
+    /// Every clip with a weight above 0 was made from others.
+    #[error(
+        "every clip with a weight above 0 was made from others; leave out --originals, or name clips that were not"
+    )]
+    NoOriginals,
     /// The experiment has no clip source with a weight above 0.
     #[error("clips: no source has a weight above 0; name a file or a built-in clip")]
     NoSources,

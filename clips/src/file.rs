@@ -15,13 +15,18 @@ use crate::humanoid::WalkerModel;
 
 /// Allowed number of frames: at most 50 minutes at 0.03 s. The longest clip of CMU has 6,371 frames. The limit bounds
 /// the memory that a hostile `num_steps` can claim to 340 MB.
-const STEPS: RangeInclusive<u64> = 1..=100_000;
+pub(crate) const STEPS: RangeInclusive<u64> = 1..=100_000;
 /// Longest allowed time step, s. dm_control's files have 0.03 and 0.05.
 const LONGEST_TIMESTEP: f64 = 1.0;
 /// Greatest difference between the norm of a quaternion and 1.
 pub(crate) const NORM_TOLERANCE: f64 = 1e-2;
 /// Bytes of the largest dataset of the longest clip: 31 quaternions per frame.
 const LARGEST_READ: usize = 100_000 * 31 * 4 * size_of::<f64>();
+
+/// The attribute of a clip that was made from others. It is this program's own; dm_control does not read it.
+pub(crate) const MADE_FROM: &str = "made_from";
+/// Greatest length of its text, bytes.
+const LONGEST_ORIGIN: usize = 4096;
 
 /// A dataset as the file stores it.
 pub(crate) struct Stored {
@@ -58,6 +63,16 @@ pub(crate) struct Header {
     pub(crate) model: WalkerModel,
 }
 
+/// Checks the text of [`MADE_FROM`]. Terminals show it, so no character of it may control them. The error says what is
+/// allowed.
+pub(crate) fn check_origin(text: &str) -> Result<(), String> {
+    if text.len() <= LONGEST_ORIGIN && !text.chars().any(char::is_control) { Ok(()) } else { Err(allowed_origin()) }
+}
+
+fn allowed_origin() -> String {
+    format!("must be a text of at most {LONGEST_ORIGIN} bytes without control characters")
+}
+
 /// An open file. Reading needs no lock, and reads from the disk only what it returns.
 pub(crate) struct ClipFile {
     path: PathBuf,
@@ -89,10 +104,10 @@ impl ClipFile {
         &self.path
     }
 
-    /// Reads the attributes of these clips, without their datasets.
-    pub(crate) fn headers(&self, names: &[String]) -> Result<Vec<Header>, Error> {
+    /// Reads the attributes of these clips, without their datasets: the header, and what the clip was made from.
+    pub(crate) fn headers(&self, names: &[String]) -> Result<Vec<(Header, Option<String>)>, Error> {
         let root = self.root()?;
-        names.iter().map(|name| self.header(&root, name)).collect()
+        names.iter().map(|name| Ok((self.header(&root, name)?, self.made_from(&root, name)?))).collect()
     }
 
     /// Reads the joint angles of a clip, rad, `[T][56]`.
@@ -106,6 +121,7 @@ impl ClipFile {
     pub(crate) fn load(&self, name: &str) -> Result<Clip, Error> {
         let root = self.root()?;
         let header = self.header(&root, name)?;
+        let made_from = self.made_from(&root, name)?;
         let walker = self.walker(&root, name, header)?;
         let bodies = header.model.bodies();
         let motion = Motion {
@@ -126,7 +142,7 @@ impl ClipFile {
         walker.check_quaternions("quaternion", motion.quaternion.as_flattened())?;
         walker.check_quaternions("body_quaternions", &features.body_quaternions)?;
         let Header { dt, model, .. } = header;
-        Ok(Clip { name: name.into(), model, dt, motion, features: Some(features) })
+        Ok(Clip { name: name.into(), made_from, model, dt, motion, features: Some(features) })
     }
 
     /// Reads a clip for the check for defects: the header and each dataset that can be read. Only the shape of a
@@ -171,6 +187,21 @@ impl ClipFile {
             self.malformed(&format!("{item}@model"), reason)
         })?;
         Ok(Header { steps: steps as usize, dt, model })
+    }
+
+    /// What a clip was made from, if its file says so.
+    fn made_from(&self, root: &Group, name: &str) -> Result<Option<String>, Error> {
+        let item = format!("/{name}@{MADE_FROM}");
+        let attributes = self.guarded(&item, || root.group(name)?.attributes())?;
+        let Some(found) = attributes.iter().find(|found| found.name == MADE_FROM) else {
+            return Ok(None);
+        };
+        // Of an array, the reader may return the first text alone.
+        let text = if found.shape.is_empty() { self.guarded(&item, || found.read_string()).ok() } else { None };
+        match text.ok_or_else(allowed_origin).and_then(|text| check_origin(&text).map(|()| text)) {
+            Ok(text) => Ok(Some(text).filter(|text| !text.is_empty())),
+            Err(allowed) => Err(self.malformed(&item, format!("{allowed}; remove the attribute"))),
+        }
     }
 
     fn number(&self, group: &Group, item: &str, attribute: &str) -> Result<f64, Error> {

@@ -11,7 +11,7 @@
 
 mod amc;
 mod angles;
-mod arms;
+pub(crate) mod arms;
 mod asf;
 mod constants;
 mod floor;
@@ -28,16 +28,20 @@ use std::ops::Range;
 pub use constants::{Constants, Floor, Take, UsedConstants};
 pub use manifest::read_manifest;
 
+pub(crate) use angles::THUMBS;
+pub(crate) use floor::Poses;
+pub(crate) use sole::SOLE;
+pub(crate) use velocity::motion;
+
 use crate::clip::{Clip, Features};
 use crate::error::Error;
 use crate::humanoid::WalkerModel;
 use crate::spatial::{Quaternion, Vector, about, multiply};
 use amc::Recording;
 use asf::Skeleton;
-use floor::Poses;
 
 /// Control time step of dm_control for the CMU clips, s.
-const DT: f64 = 0.03;
+pub(crate) const DT: f64 = 0.03;
 /// Recorded frames beyond the frames in use that the smoothing reads, on each side.
 const SMOOTHING_REACH: usize = 2;
 
@@ -86,7 +90,7 @@ pub fn import(take: &Take) -> Result<(Clip, UsedConstants), Error> {
     let motion = velocity::motion(poses, DT);
     let features = Features::of(&motion);
     let name = take.name.clone();
-    let clip = Clip { name, model: WalkerModel::Cmu2020, dt: DT, motion, features: Some(features) };
+    let clip = Clip { name, made_from: None, model: WalkerModel::Cmu2020, dt: DT, motion, features: Some(features) };
     Ok((clip, UsedConstants { scale, sole_degrees, floor, arm_regularisation, frames, notes }))
 }
 
@@ -139,7 +143,7 @@ fn find_soles(root: &Root, recorded: &[[f64; 56]], frames: &Range<usize>, notes:
 
 impl Poses {
     /// Moves all poses so that the first one is at x = y = 0.
-    fn start_at_origin(&mut self) {
+    pub(crate) fn start_at_origin(&mut self) {
         let [x, y, _] = self.position.first().copied().unwrap_or_default();
         for position in &mut self.position {
             position[0] -= x;

@@ -8,6 +8,7 @@
 //!   servo action that aims at a pose.
 //! - [`import`] makes clips from CMU's ASF and AMC files, [`check`] finds defects, [`ClipWriter`] writes files that
 //!   dm_control reads, and [`merge()`] joins several files. They compute body positions by forward kinematics.
+//! - [`edit`] makes more clips of existing ones: mirrored, faster or slower, or legs of one with arms of another.
 //! - [`spatial`] has vectors, rotation matrices and quaternions.
 //! - [`subset`] lists dm_control's named subsets, [`builtin_names`] the names that can follow `builtin:`, and
 //!   [`BUILTIN_TERMS`] the terms of those recordings.
@@ -23,6 +24,7 @@ mod catalogue;
 pub mod check;
 mod clip;
 mod cut;
+pub mod edit;
 mod entry;
 mod error;
 mod features;
@@ -31,6 +33,7 @@ mod humanoid;
 pub mod import;
 mod merge;
 mod nearest;
+pub mod retarget;
 pub mod spatial;
 mod subsets;
 mod write;

@@ -11,11 +11,12 @@ use tempfile::NamedTempFile;
 
 use crate::clip::{Clip, Features, Motion};
 use crate::error::Error;
+use crate::file::{MADE_FROM, STEPS, check_origin};
 
 /// Bytes of datasets that are kept in memory before they are written.
 const STAGED: usize = 64 << 20;
 /// Greatest length of a clip's name, bytes.
-const LONGEST_NAME: usize = 200;
+pub(crate) const LONGEST_NAME: usize = 200;
 /// Compression level; 6 is zlib's default.
 const DEFLATE: u32 = 6;
 
@@ -53,11 +54,19 @@ impl ClipWriter {
     /// Adds a clip. Forward kinematics of the V2020 body computes the features of a clip that has none.
     ///
     /// # Errors
-    /// [`Error::Name`], [`Error::NameTaken`], [`Error::Unwritable`].
+    /// [`Error::Name`], [`Error::NameTaken`], [`Error::Unwritable`]; [`Error::Length`] and [`Error::Edit`] for a number
+    /// of frames and a [`Clip::made_from`] that this program does not read back.
     pub fn add(&mut self, clip: &Clip) -> Result<(), Error> {
         let forbidden = |character: char| matches!(character, '/' | '.') || character.is_whitespace();
         if clip.name.is_empty() || clip.name.len() > LONGEST_NAME || clip.name.chars().any(forbidden) {
             return Err(Error::Name { name: clip.name.clone() });
+        }
+        if !STEPS.contains(&(clip.steps() as u64)) {
+            return Err(Error::Length { name: clip.name.clone(), steps: clip.steps() });
+        }
+        if let Some(Err(allowed)) = clip.made_from.as_deref().map(check_origin) {
+            let reason = format!("{MADE_FROM} {allowed}; make the clip of recordings with short and plain names");
+            return Err(Error::Edit { name: clip.name.clone(), reason });
         }
         if !self.names.insert(clip.name.clone()) {
             return Err(Error::NameTaken { name: clip.name.clone() });
@@ -71,6 +80,11 @@ impl ClipWriter {
             self.commit()?;
         }
         Ok(())
+    }
+
+    /// The number of clips that were added.
+    pub(crate) fn clips(&self) -> usize {
+        self.names.len()
     }
 
     fn commit(&mut self) -> Result<(), Error> {
@@ -135,13 +149,16 @@ fn datasets<'a>(motion: &'a Motion, features: &'a Features) -> [(&'static str, &
 }
 
 /// Stages one clip in dm_control's layout (`locomotion/mocap/loader.py`, `mocap.proto`). Its loader needs every group
-/// and attribute, so unknown ones are empty.
+/// and attribute, so unknown ones are empty. It ignores [`MADE_FROM`].
 fn stage(group: &mut StagedGroup<'_>, clip: &Clip, datasets: &[(&str, &[f64])]) {
     let steps = clip.steps();
     for date in ["year", "month", "day"] {
         group.set_attr(date, AttrValue::I64(0));
     }
     group.set_attr("dt", AttrValue::F64(clip.dt)).set_attr("num_steps", AttrValue::I64(steps as i64));
+    if let Some(made_from) = &clip.made_from {
+        group.set_attr(MADE_FROM, AttrValue::String(made_from.clone()));
+    }
     group.create_group("props");
     group.create_group_with("walkers", |walkers| {
         walkers.create_group_with("walker_0", |walker| {

@@ -2,8 +2,10 @@
 
 mod support;
 
-use comic_clips::{Catalogue, Features, WalkerModel, pose_to_action};
-use comic_experiment::ClipSource;
+use comic_clips::edit::mirror;
+use comic_clips::{Catalogue, ClipWriter, Error, Features, WalkerModel, pose_to_action};
+use comic_experiment::{ClipSource, Experiment, resolve};
+use hdf5_pure::{AttrValue, File};
 use support::{defects, golden, names, recordings, refused, tiny, wheel_clips, whole, with_ids};
 
 #[test]
@@ -165,4 +167,86 @@ fn a_catalogue_is_shared_between_threads() {
             scope.spawn(|| assert_eq!(catalogue.load(0).unwrap(), expected));
         }
     });
+}
+
+#[test]
+fn originals_are_the_clips_that_were_not_made_from_others() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("copies.h5");
+    let mut writer = ClipWriter::create(&path, false).unwrap();
+    let walk = Catalogue::open(&[ClipSource::whole("builtin:walk")]).unwrap().load(0).unwrap();
+    let mut copy = mirror(&walk).unwrap().0;
+    // The file's first clip is the copy.
+    copy.name = "A_mirror".into();
+    writer.add(&copy).unwrap();
+    writer.add(&walk).unwrap();
+    writer.finish().unwrap();
+
+    let sources = [whole(&path), ClipSource::whole("builtin:stand")];
+    let open = |sources: &[ClipSource]| Catalogue::open(sources).unwrap();
+    assert_eq!(names(&open(&sources)), ["A_mirror", "CMU_007_01", "stand"]);
+    let originals = open(&sources).originals().unwrap();
+    assert_eq!(names(&originals), ["CMU_007_01", "stand"]);
+    for (index, entry) in originals.entries().iter().enumerate() {
+        assert_eq!(originals.load(index).unwrap().name, entry.name);
+    }
+
+    let copies = [with_ids(&path, &["A_mirror"]), ClipSource { weight: 0.0, ..ClipSource::whole("builtin:stand") }];
+    for left in [&copies[..1], &copies] {
+        let error = open(left).originals().unwrap_err();
+        assert!(matches!(error, Error::NoOriginals), "{error}");
+    }
+
+    // Only an evaluation of a task that follows clips needs originals.
+    let experiment = |preset: &str| -> Experiment { resolve(preset, &[]).unwrap() };
+    for (preset, follows) in [("tracking-mlp", true), ("joint-get-up", true), ("get-up", false)] {
+        let (some, none) = (open(&sources), open(&copies[..1]));
+        let some = some.for_evaluation(&experiment(preset), true).unwrap();
+        assert_eq!(some.entries().len(), if follows { 2 } else { 3 }, "{preset}");
+        assert_eq!(none.for_evaluation(&experiment(preset), true).is_err(), follows, "{preset}");
+        let all = open(&sources).for_evaluation(&experiment(preset), false).unwrap();
+        assert_eq!(all.entries().len(), 3, "{preset}");
+    }
+}
+
+#[test]
+fn what_a_clip_was_made_from_is_a_short_text_or_an_error() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("hostile.h5");
+    let opened = |made_from: AttrValue| {
+        let file = File::create(&path).unwrap();
+        let group = file.root().create_group_with("walk", |clip| {
+            clip.set_attr("dt", AttrValue::F64(0.03)).set_attr("num_steps", AttrValue::I64(3));
+            clip.set_attr("made_from", made_from);
+            clip.create_group_with("walkers", |walkers| {
+                walkers.create_group_with("walker_0", |walker| {
+                    walker.set_attr("model", AttrValue::I64(4));
+                });
+            });
+        });
+        group.unwrap();
+        file.close().unwrap();
+        Catalogue::open(&[whole(&path)])
+    };
+    let longest = "mirror ".repeat(1000)[..4096].to_string();
+    for (text, expected) in [("", None), ("mirror a", Some("mirror a")), (&longest, Some(longest.as_str()))] {
+        let catalogue = opened(AttrValue::String(text.into())).unwrap();
+        assert_eq!(catalogue.entries()[0].made_from.as_deref(), expected);
+    }
+    let two = || vec!["mirror a".to_string(), "mirror b".into()];
+    let refused = [
+        AttrValue::String("m".repeat(4097)),
+        AttrValue::String("mirror \u{1b}[2J".into()),
+        AttrValue::String("mirror\na".into()),
+        AttrValue::String("mirror \u{9b}2J".into()),
+        AttrValue::I64(7),
+        AttrValue::F64Array(vec![1.0, 2.0]),
+        AttrValue::StringArray(two()),
+        AttrValue::AsciiStringArray(two()),
+    ];
+    let rule = "must be a text of at most 4096 bytes without control characters; remove the attribute";
+    for value in refused {
+        let message = opened(value).unwrap_err().to_string();
+        assert_eq!(message, format!("{}: /walk@made_from: {rule}", path.display()));
+    }
 }

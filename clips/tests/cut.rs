@@ -4,6 +4,7 @@
 
 use std::path::Path;
 
+use comic_clips::edit::speed;
 use comic_clips::{Catalogue, ClipWriter};
 use comic_experiment::ClipSource;
 
@@ -59,4 +60,22 @@ fn a_file_most_of_which_is_used_is_sent_as_it_is() {
     let cuts = directory.path().join("assets");
     assert_eq!(catalogue.assets(Some(&cuts)).unwrap(), catalogue.assets(None).unwrap());
     assert!(!cuts.exists());
+}
+
+#[test]
+fn the_part_of_a_file_says_what_its_clips_were_made_from() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("copies.h5");
+    let walk = Catalogue::open(&[ClipSource::whole("builtin:walk")]).unwrap().load(0).unwrap();
+    let mut writer = ClipWriter::create(&path, false).unwrap();
+    for percent in [80, 90, 110] {
+        writer.add(&speed(&walk, f64::from(percent) / 100.0).unwrap()).unwrap();
+    }
+    writer.finish().unwrap();
+    let sources = [some(path.to_str().unwrap(), &["CMU_007_01_x90"])];
+    let assets = Catalogue::open(&sources).unwrap().assets(Some(directory.path())).unwrap();
+    assert_ne!(assets[0].path, path, "it must be a part");
+    let part = Catalogue::open_with(&sources, |_| Some(assets[0].path.clone())).unwrap();
+    assert_eq!(part.entries()[0].made_from.as_deref(), Some("speed 0.9 CMU_007_01"));
+    assert_eq!(part.load(0).unwrap().made_from, part.entries()[0].made_from);
 }

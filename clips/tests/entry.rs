@@ -8,7 +8,8 @@ use proptest::prelude::*;
 use support::{golden, recordings, with_ids};
 
 fn entry(steps: usize, start_step: usize, end_step: Option<usize>) -> Entry {
-    Entry { name: "walk".into(), steps, dt: 0.03, model: Cmu2020, start_step, end_step, weight: 1.0 }
+    let (name, made_from) = ("walk".into(), None);
+    Entry { name, made_from, steps, dt: 0.03, model: Cmu2020, start_step, end_step, weight: 1.0 }
 }
 
 #[test]

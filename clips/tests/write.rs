@@ -5,7 +5,7 @@ mod support;
 
 use std::path::Path;
 
-use comic_clips::{Catalogue, Clip, ClipWriter, Error, Features, merge, subsets_with};
+use comic_clips::{Catalogue, Clip, ClipWriter, Error, Features, Motion, merge, subsets_with};
 use comic_experiment::ClipSource;
 use support::{names, tiny, whole, with_ids};
 
@@ -69,6 +69,27 @@ fn names_are_unique_and_valid_on_a_command_line() {
         let named = Clip { name: name.into(), ..clip.clone() };
         assert!(matches!(writer.add(&named), Err(Error::Name { .. })), "{name}");
     }
+}
+
+#[test]
+fn a_clip_that_could_not_be_read_back_is_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut writer = ClipWriter::create(&directory.path().join("out.h5"), false).unwrap();
+    let [clip, _] = clips().try_into().unwrap();
+    for steps in [0, 100_001] {
+        let motion = Motion { position: vec![[0.0; 3]; steps], ..Motion::default() };
+        let error = writer.add(&Clip { motion, features: None, ..clip.clone() }).unwrap_err();
+        assert!(matches!(error, Error::Length { .. }), "{error}");
+        let expected = format!(
+            "clip `TINY_001_01` has {steps} frames; a clip in a file must have 1 to 100000, so split a longer motion"
+        );
+        assert_eq!(error.to_string(), expected);
+    }
+    for made_from in ["m".repeat(4097), "mirror \u{1b}[2J".into()] {
+        let message = writer.add(&Clip { made_from: Some(made_from), ..clip.clone() }).unwrap_err().to_string();
+        assert!(message.contains("made_from must be a text of at most 4096 bytes"), "{message}");
+    }
+    writer.add(&Clip { made_from: Some("m".repeat(4096)), ..clip }).unwrap();
 }
 
 #[test]

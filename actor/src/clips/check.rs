@@ -2,7 +2,8 @@
 
 use clap::Args;
 use comic_clips::check::{
-    AIRBORNE, Checked, JOINT_EXCESS, JOINT_SPEED, LONGEST_FLIGHT, PENETRATION, ROOT_SPEED, ROOT_TURN, check,
+    AIRBORNE, Checked, DEEP_PENETRATION, HIGHEST_JUMP, JOINT_EXCESS, JOINT_SPEED, LEAST_FALL, LONGEST_FLIGHT,
+    MOST_FALL, MOST_JUMPS, OVERHANG, PENETRATION, ROOT_SPEED, ROOT_TURN, SHORTEST_FLIGHT, STILL, STILL_TIME, check,
 };
 use comic_experiment::ClipSource;
 
@@ -11,7 +12,10 @@ use crate::Error;
 
 /// Finds every defect of every clip; exits with 1 when there is any.
 ///
-/// Floor and joint limits are those of the CMU humanoid V2020. Clips of another body are checked for other defects only.
+/// Where no policy can follow a clip, the defect's description says that it cannot be followed.
+///
+/// Joint limits, floor, flights and balance are those of the CMU humanoid V2020. Clips of another body are checked for other
+/// defects only.
 #[derive(Args, Clone, Debug)]
 #[command(after_long_help = help())]
 pub(super) struct Check {
@@ -31,16 +35,24 @@ Defects, by limits of this project's choice:
   not_finite       NaN or infinity
   quaternion_norm  a quaternion's norm is off 1 by 0.01 or more
   joint_limit      a joint is over {JOINT_EXCESS} rad outside its range
-  penetration      a geom is over {PENETRATION} m deep in the floor, z = 0
-  floating         the whole body is over {AIRBORNE} m above the floor for over {LONGEST_FLIGHT} s
-  jump             from one frame to the next faster than {ROOT_SPEED} m/s or {ROOT_TURN} rad/s (root), {JOINT_SPEED} rad/s (joint)
+  penetration      a geom is over {PENETRATION} m deep in the floor, z = 0; over {DEEP_PENETRATION} m cannot be followed,
+                   except for hands, fingers, thumbs and toes
+
+Defects that cannot be followed. A flight is {SHORTEST_FLIGHT} s or more with the whole body over {AIRBORNE} m above the floor:
+  floating         a flight in which the centre of mass falls with under {LEAST_FALL} g, or one of over {LONGEST_FLIGHT} s
+  fall             a flight in which the centre of mass falls with over {MOST_FALL} g
+  jump_height      a flight in which the centre of mass rises by over {HIGHEST_JUMP} m
+  unbalanced       for over {STILL_TIME} s the centre of mass is slower than {STILL} m/s and over {OVERHANG} m beside all that
+                   touches the floor
+  jump             from one frame to the next faster than {ROOT_SPEED} m/s or {ROOT_TURN} rad/s (root), {JOINT_SPEED} rad/s (joint);
+                   a joint that does so in up to {MOST_JUMPS} frames can be followed
 
 With --json one array goes to standard output, an object for each clip:
   clip, frames   name and number of frames
-  body_checked   whether joints and floor were checked
+  body_checked   whether joints, floor, flights and balance were checked
   lowest_point   [lowest, highest] of the heights of the body's lowest point, m, or null
   defects        objects: kind (as above), item (dataset, joint, geom or root), frames (in how many), first_frame,
-                 worst (in m, rad, m/s, rad/s or a count, as the kind has it), detail (in words)"
+                 worst (in m, rad, m/s, rad/s, m/s² or a count, as the kind has it), detail (in words)"
     )
 }
 

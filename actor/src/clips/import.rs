@@ -1,28 +1,50 @@
 //! `comic-actor clips import`.
 
+mod skeletons;
+
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 use comic_clips::ClipWriter;
 use comic_clips::import::{Constants, Floor, Take, import, read_manifest};
+use comic_clips::retarget::{Axis, parse_unit};
 
 use super::print;
 use crate::Error;
 
-/// Makes clips of the CMU humanoid V2020 from ASF and AMC files of the CMU database (mocap.cs.cmu.edu), 120 frames a
-/// second.
+/// Makes clips of the CMU humanoid V2020 from motion capture: ASF and AMC files of the CMU database
+/// (mocap.cs.cmu.edu), BVH files of any skeleton, or recordings of AMASS (SMPL).
 ///
-/// Constants that are not given are computed from the recording. They are printed as options that make the same clip
-/// again.
+/// From ASF and AMC files the angles are copied, since the humanoid has the same skeleton. Constants that are not given
+/// are computed from the recording. They are printed as options that make the same clip again. A motion of another
+/// skeleton is fitted to the humanoid. Axes, unit and scale are found from it unless given. How well it fits is printed.
 #[derive(Args, Clone, Debug)]
+#[command(after_long_help = skeletons::HELP)]
 pub(super) struct Import {
     /// The subject's skeleton.
-    #[arg(long, value_name = "S.asf", requires = "amc", required_unless_present = "manifest")]
+    #[arg(long, value_name = "S.asf", requires = "amc")]
+    #[arg(required_unless_present_any = ["manifest", "bvh", "smpl"])]
     asf: Option<PathBuf>,
     /// The recording.
-    #[arg(long, value_name = "M.amc", requires = "asf", required_unless_present = "manifest")]
+    #[arg(long, value_name = "M.amc", group = "recording", requires = "asf")]
+    #[arg(required_unless_present_any = ["manifest", "bvh", "smpl"])]
     amc: Option<PathBuf>,
+    /// Motions of any skeleton; each gives a clip.
+    #[arg(long, value_name = "FILE.bvh", num_args = 1.., groups = ["recording", "skeleton"])]
+    bvh: Vec<PathBuf>,
+    /// Motions in AMASS's layout (SMPL, SMPL-H or SMPL-X); each gives a clip.
+    #[arg(long, value_name = "FILE.npz", num_args = 1.., groups = ["recording", "skeleton"])]
+    smpl: Vec<PathBuf>,
+    /// Which bone has which role, as a JSON or TOML object; see below. Bones with common names need no file.
+    #[arg(long, value_name = "FILE", requires = "skeleton")]
+    bones: Option<PathBuf>,
+    /// The axis that points up in the file: x, y, z, -x, -y or -z; found from the motion unless given.
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true, requires = "skeleton")]
+    up: Option<Axis>,
+    /// The file's unit of length: m, cm, mm, inch, CMU (its ASF files), or its length in m; found from the leg's length unless given.
+    #[arg(long, value_name = "UNIT", value_parser = parse_unit, requires = "skeleton")]
+    unit: Option<f64>,
     /// The new file.
     #[arg(long, value_name = "FILE.h5")]
     out: PathBuf,
@@ -31,13 +53,13 @@ pub(super) struct Import {
     force: bool,
     /// A JSON list of takes with their constants: all of them, or with --amc those of that recording. An object has
     /// key, asf, amc and optionally frames, sole_deg, floor, arm_reg, scale.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", conflicts_with = "skeleton")]
     manifest: Option<PathBuf>,
-    /// The clip's name; CMU_002_03 for 02_03.amc unless given.
+    /// The clip's name; CMU_002_03 for 02_03.amc, and walk_1 for "walk 1.bvh", unless given.
     #[arg(long, value_name = "CLIP", conflicts_with = "manifest")]
     name: Option<String>,
     /// Scale of the motion; the body's leg length / the subject's unless given.
-    #[arg(long, value_name = "FACTOR", requires = "amc")]
+    #[arg(long, value_name = "FACTOR", requires = "recording")]
     scale: Option<f64>,
     /// Degrees to subtract from the left and the right ankle, positive: toes up; computed from standing soles unless
     /// given.
@@ -46,19 +68,26 @@ pub(super) struct Import {
     /// The floor under the recording. sliding:PERCENTILE:HALF:SMOOTH follows a drifting floor, with windows in steps of
     /// 0.03 s (sliding:50:12:8). const:PERCENTILE is a level floor (const:30, for jumps). Computed from the heights unless
     /// given.
-    #[arg(long, value_name = "FLOOR", requires = "amc")]
+    #[arg(long, value_name = "FLOOR", requires = "recording")]
     floor: Option<Floor>,
     /// m/rad: how much arms keep their angles, rather than elbow and wrist their places, where a range is left; 0.2
     /// unless given.
     #[arg(long, value_name = "WEIGHT", requires = "amc")]
     arm_reg: Option<f64>,
     /// Recorded frames to take, counted from 0, without the last: 0..1200; all unless given.
-    #[arg(long, value_name = "F0..F1", value_parser = frames, requires = "amc")]
+    #[arg(long, value_name = "F0..F1", value_parser = frames, requires = "recording")]
     frames: Option<Range<usize>>,
+    /// The report as JSON instead of text.
+    #[arg(long, requires = "skeleton")]
+    json: bool,
 }
 
 impl Import {
     pub(super) fn run(&self) -> Result<(), Error> {
+        if self.bvh.is_empty() && self.smpl.is_empty() { self.import_takes() } else { self.import_skeletons() }
+    }
+
+    fn import_takes(&self) -> Result<(), Error> {
         let takes = self.takes()?;
         let mut writer = ClipWriter::create(&self.out, self.force)?;
         let mut told = String::new();

@@ -8,15 +8,18 @@ use serde::Serialize;
 use super::{print, print_json, table::table};
 use crate::Error;
 
-/// Lists clips: name, frames, seconds, the subsets of dm_control that contain the clip, and the possible start frames.
+/// Lists clips: name, frames, seconds, the possible start frames, and the subsets of dm_control that contain the clip;
+/// for a copy, what it was made from.
 ///
-/// Starts follow from the tracking task's defaults. The last frames are no starts, since no reference frames follow them.
+/// Starts follow from the tracking task's defaults. The last frames are no starts, since no reference frames follow
+/// them.
 #[derive(Args, Clone, Debug)]
 pub(super) struct List {
     /// The clips to list: FILE.h5, FILE.h5#SUBSET, FILE.h5#CLIP,CLIP or builtin:NAME.
     #[arg(value_name = "FILE", required = true)]
     sources: Vec<String>,
-    /// One JSON array: clip, frames, seconds, dt, model, subsets, starts ([first, end), or null when there are none).
+    /// One JSON array: clip, frames, seconds, dt, model, subsets, starts ([first, end), or null when there are none),
+    /// made_from (null, or for a clip made of others how, for instance "mirror CMU_007_01").
     #[arg(long)]
     json: bool,
 }
@@ -30,6 +33,7 @@ struct Listed<'a> {
     model: String,
     subsets: Vec<&'static str>,
     starts: Option<[usize; 2]>,
+    made_from: Option<&'a str>,
 }
 
 impl List {
@@ -54,6 +58,7 @@ impl<'a> Listed<'a> {
             model: entry.model.to_string(),
             subsets: subsets_with(&entry.name),
             starts: (!starts.is_empty()).then_some([starts.start, starts.end]),
+            made_from: entry.made_from.as_deref(),
         }
     }
 }
@@ -66,7 +71,8 @@ fn as_table(listed: &[Listed]) -> String {
             format!("{:.2}", clip.seconds),
             clip.starts.map_or_else(|| "none".into(), |[first, end]| format!("{first}..{end}")),
             clip.model.clone(),
-            clip.subsets.join(", "),
+            // A clip made of others has a name of its own, which is in no subset.
+            clip.made_from.map_or_else(|| clip.subsets.join(", "), |made_from| format!("made from: {made_from}")),
         ]
     };
     let rows: Vec<_> = listed.iter().map(row).collect();

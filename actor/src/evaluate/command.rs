@@ -75,6 +75,10 @@ pub struct Evaluate {
     /// Clips in place of the experiment's own: builtin:NAME, FILE.h5, FILE.h5#SUBSET or FILE.h5#CLIP,CLIP.
     #[arg(long, value_name = "SOURCE", num_args = 1..)]
     clips: Vec<String>,
+    /// Leaves out clips that were made from others by `clips mirror`, `speed` or `join`. Tasks that follow no clips are
+    /// evaluated as without it.
+    #[arg(long)]
+    originals: bool,
     /// The mean action and the latent's mean instead of samples.
     #[arg(long)]
     deterministic: bool,
@@ -172,6 +176,7 @@ impl Evaluate {
             give_up_after: self.give_up_after.map(|seconds| Duration::from_secs(seconds.into())),
             interval: Duration::from_secs_f64(self.every * 60.0),
             clips: self.clips.clone(),
+            originals: self.originals,
             seed: self.seed,
             nice: self.nice,
         })
@@ -195,7 +200,7 @@ impl Evaluate {
         // An untrained policy starts from the mean pose of the experiment's clips, also when it is evaluated on others.
         let own = if self.untrained { Some(Catalogue::open(&experiment.clips)?) } else { None };
         let experiment = experiment.with_clips(&self.clips);
-        let catalogue = Catalogue::open(&experiment.clips)?;
+        let catalogue = Catalogue::open(&experiment.clips)?.for_evaluation(&experiment, self.originals)?;
         let task = comic_tasks::build(&experiment, &catalogue)?;
         let options = RolloutSettings {
             starts: self.episodes.map_or(Starts::Every, |episodes| Starts::Random(episodes as usize)),

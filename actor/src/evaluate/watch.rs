@@ -44,6 +44,8 @@ pub(super) struct WatchSettings {
     pub(super) interval: Duration,
     /// Clips in place of the experiment's own.
     pub(super) clips: Vec<String>,
+    /// Whether clips that were made from others are left out.
+    pub(super) originals: bool,
     pub(super) seed: u64,
     /// Added to the process's nice value, so that an evaluation takes little time from actors and learner.
     pub(super) nice: i32,
@@ -154,12 +156,13 @@ struct Scene {
 }
 
 impl Scene {
-    fn new(experiment: Experiment, clips: &[String], assets: &HashMap<String, PathBuf>) -> Result<Self, Error> {
+    fn new(experiment: Experiment, settings: &WatchSettings, assets: &HashMap<String, PathBuf>) -> Result<Self, Error> {
+        let WatchSettings { clips, originals, .. } = settings;
         let shown = experiment.clone().with_clips(clips);
         // Clips of the command line are files of this machine. The learner may not name any.
         let own = !clips.is_empty();
         let locate = |source: &str| assets.get(source).cloned().or_else(|| own.then(|| PathBuf::from(source)));
-        let catalogue = Catalogue::open_with(&shown.clips, locate)?;
+        let catalogue = Catalogue::open_with(&shown.clips, locate)?.for_evaluation(&shown, *originals)?;
         let task = comic_tasks::build(&shown, &catalogue)?;
         Ok(Self { experiment, task })
     }
@@ -183,7 +186,7 @@ impl Evaluator<'_> {
         let Fetched { experiment, policy, low_level, assets } = fetched;
         let scene = match self.scene.take().filter(|scene| scene.experiment == experiment) {
             Some(scene) => scene,
-            None => Scene::new(experiment, &self.settings.clips, &assets)?,
+            None => Scene::new(experiment, self.settings, &assets)?,
         };
         let Scene { experiment, task } = self.scene.insert(scene);
         let options = RolloutSettings {

@@ -1,10 +1,10 @@
 //! The checks of the datasets of one clip.
 
 use super::defect::{
-    AIRBORNE, Defect, JOINT_EXCESS, JOINT_SPEED, Kind, LONGEST_FLIGHT, PENETRATION, ROOT_SPEED, ROOT_TURN, unreadable,
+    Defect, IMPOSSIBLE, JOINT_EXCESS, JOINT_SPEED, Kind, MOST_JUMPS, ROOT_SPEED, ROOT_TURN, unreadable,
 };
+use super::pose::Pose;
 use super::tally::Tally;
-use crate::body::Frames;
 use crate::file::{NORM_TOLERANCE, Stored};
 use crate::humanoid::{JOINT_RANGES, JOINTS};
 use crate::spatial::{norm, normalize, rotation_between, subtract};
@@ -60,43 +60,13 @@ impl Columns {
         }
     }
 
-    /// Adds penetration and floating. Returns minimum and maximum of the height of the body's lowest point, m.
-    pub(super) fn floor(&self, dt: f64, defects: &mut Vec<Defect>) -> Option<[f64; 2]> {
-        let mut bounds: Option<[f64; 2]> = None;
-        let (mut depth, mut deepest) = (Tally::default(), "");
-        let (mut floating, mut flight) = (Tally::default(), Vec::new());
-        let land = |flight: &mut Vec<(usize, f64)>, floating: &mut Tally| {
-            if flight.len() as f64 * dt > LONGEST_FLIGHT {
-                flight.iter().for_each(|(frame, height)| floating.add(*frame, *height));
-            }
-            flight.clear();
+    /// The body in each frame.
+    pub(super) fn poses(&self) -> Vec<Option<Pose>> {
+        let frames = self.position.iter().zip(&self.quaternion).zip(&self.joints);
+        let pose = |((position, quaternion), joints): ((&Option<_>, &Option<_>), &Option<_>)| {
+            Some(Pose::of(position.as_ref()?, quaternion.as_ref()?, joints.as_ref()?))
         };
-        for frame in 0..self.position.len() {
-            let (Some(position), Some(quaternion), Some(joints)) =
-                (&self.position[frame], &self.quaternion[frame], &self.joints[frame])
-            else {
-                land(&mut flight, &mut floating);
-                continue;
-            };
-            let (height, geom) = Frames::of(position, quaternion, joints).lowest();
-            bounds = Some(bounds.map_or([height; 2], |[low, high]| [low.min(height), high.max(height)]));
-            if height < -PENETRATION {
-                if -height > depth.worst {
-                    deepest = geom.name;
-                }
-                depth.add(frame, -height);
-            }
-            if height > AIRBORNE {
-                flight.push((frame, height));
-            } else {
-                land(&mut flight, &mut floating);
-            }
-        }
-        land(&mut flight, &mut floating);
-        defects.extend(depth.defect(Kind::Penetration, deepest, |worst| format!("{worst:.3} m deep in the floor")));
-        let detail = |worst| format!("up to {worst:.3} m above the floor for over {LONGEST_FLIGHT} s");
-        defects.extend(floating.defect(Kind::Floating, "root", detail));
-        bounds
+        frames.map(pose).collect()
     }
 
     /// Adds the jumps of root and joints. `dt` is the time step, s.
@@ -105,11 +75,18 @@ impl Columns {
         let turn = |a, b| norm(&rotation_between(normalize(a), normalize(b))) / dt;
         let moved = |worst: f64| format!("{worst:.1} m/s from one frame to the next");
         let turned = |worst: f64| format!("{worst:.1} rad/s from one frame to the next");
-        defects.extend(faster(&self.position, ROOT_SPEED, speed).defect(Kind::Jump, "root", moved));
-        defects.extend(faster(&self.quaternion, ROOT_TURN, turn).defect(Kind::Jump, "root", turned));
+        let impossible = |text: String| format!("{IMPOSSIBLE}: {text}");
+        let root = faster(&self.position, ROOT_SPEED, speed);
+        defects.extend(root.defect(Kind::Jump, "root", |worst| impossible(moved(worst))));
+        let root = faster(&self.quaternion, ROOT_TURN, turn);
+        defects.extend(root.defect(Kind::Jump, "root", |worst| impossible(turned(worst))));
         for (joint, name) in JOINTS.iter().enumerate() {
             let speed = |a: [f64; 56], b: [f64; 56]| (b[joint] - a[joint]).abs() / dt;
-            defects.extend(faster(&self.joints, JOINT_SPEED, speed).defect(Kind::Jump, name, turned));
+            let tally = faster(&self.joints, JOINT_SPEED, speed);
+            let many = tally.frames() > MOST_JUMPS;
+            defects.extend(
+                tally.defect(Kind::Jump, name, |worst| if many { impossible(turned(worst)) } else { turned(worst) }),
+            );
         }
     }
 }

@@ -10,7 +10,7 @@ use crate::body::joint;
 use crate::humanoid::JOINT_RANGES;
 
 /// Thumb angles of a resting hand, rad. Thumbs are noise in CMU's recordings.
-const THUMBS: [(usize, f64); 4] =
+pub(crate) const THUMBS: [(usize, f64); 4] =
     [(joint("lthumbrz"), 0.0), (joint("lthumbrx"), 0.3), (joint("rthumbrz"), 0.0), (joint("rthumbrx"), 0.3)];
 
 /// Angles of every recorded frame, rad, in the order of [`JOINTS`](crate::JOINTS).

@@ -9,7 +9,7 @@ use crate::humanoid::JOINT_RANGES;
 use crate::spatial::{IDENTITY, Vector, cross, dot, subtract};
 
 /// Weight of the distance between an angle and the recorded angle, relative to the distance of a point, m/rad.
-pub(super) const REGULARISATION: f64 = 0.2;
+pub(crate) const REGULARISATION: f64 = 0.2;
 /// If the smallest eigenvalue of the Hessian is not above this, the Gauss-Newton matrix replaces the Hessian.
 const CONVEX: f64 = 1e-3;
 const NEWTON_STEPS: usize = 200;
@@ -81,7 +81,7 @@ const ARMS: [Arm; 2] = [
 /// Fits both arms of one frame. `joints` is the clamped copy of `free` (both rad). If an angle of an arm in `free` is
 /// outside its range, `joints` gets the angles whose elbow and wrist are nearest to those of `free`, and the roll of
 /// the forearm whose hand is nearest.
-pub(super) fn fit(free: &[f64; 56], joints: &mut [f64; 56], regularisation: f64) {
+pub(crate) fn fit(free: &[f64; 56], joints: &mut [f64; 56], regularisation: f64) {
     for arm in &ARMS {
         let wanted = arm.joints.map(|joint| free[joint]);
         if arm.joints.iter().zip(wanted).all(|(joint, angle)| excess(angle, *joint) <= 0.0) {

@@ -81,7 +81,7 @@ impl Floor {
     pub const LEVEL: Self = Self::Constant { percent: 30.0 };
 
     /// Checks the percentile, and that no window is longer than 10,000 steps.
-    fn check(self) -> Option<Self> {
+    pub(crate) fn check(self) -> Option<Self> {
         let (percent, longest) = match self {
             Self::Sliding { percent, half, smooth } => (percent, half.max(smooth)),
             Self::Constant { percent } => (percent, 0),

@@ -18,10 +18,10 @@ const LIFT: usize = 3;
 const DRIFT: f64 = 0.08;
 
 /// The poses of a clip during its import, one per step: root position (m) and orientation, joint angles (rad).
-pub(super) struct Poses {
-    pub(super) position: Vec<Vector>,
-    pub(super) quaternion: Vec<Quaternion>,
-    pub(super) joints: Vec<[f64; 56]>,
+pub(crate) struct Poses {
+    pub(crate) position: Vec<Vector>,
+    pub(crate) quaternion: Vec<Quaternion>,
+    pub(crate) joints: Vec<[f64; 56]>,
 }
 
 /// The ankle's index in [`JOINTS`](crate::JOINTS), and the indices of the two bodies of a foot.
@@ -49,7 +49,7 @@ impl Poses {
     /// Puts the poses on the floor. Subtracts the height of the recording's floor, turns the ankles of feet that are
     /// below the floor, and lifts the body where a foot is still below. Returns the floor; if none is given, it is
     /// found.
-    pub(super) fn set_on_floor(&mut self, floor: Option<Floor>) -> Floor {
+    pub(crate) fn set_on_floor(&mut self, floor: Option<Floor>) -> Floor {
         let heights = self.lowest();
         let floor = floor.unwrap_or_else(|| find(&heights));
         for (position, base) in self.position.iter_mut().zip(baseline(&heights, floor)) {

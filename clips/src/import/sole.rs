@@ -7,7 +7,7 @@ use crate::spatial::{Quaternion, Vector, dot, norm, subtract};
 
 /// The direction of the body's sole from heel to ball, in the foot's frame. The sole is inclined in this frame: if the
 /// subject stands flat, the recorded ankle angle puts the body's toes into the floor.
-const SOLE: Vector = [0.0, -0.1886, -0.0343];
+pub(crate) const SOLE: Vector = [0.0, -0.1886, -0.0343];
 /// A foot stands if ankle and toes are slower than this, m/s. The larger limits apply if too few frames are below the
 /// smaller ones.
 const STANDING: [f64; 3] = [0.12, 0.25, 0.5];

@@ -7,7 +7,7 @@ use crate::spatial::rotation_between;
 /// Adds velocities to poses that are `dt` seconds apart. The motion has one frame fewer than there are poses: the last
 /// pose is used only for velocities. The first velocity is a forward difference. The angular velocity is in the root
 /// frame, as in MuJoCo.
-pub(super) fn motion(mut poses: Poses, dt: f64) -> Motion {
+pub(crate) fn motion(mut poses: Poses, dt: f64) -> Motion {
     let velocity = central(&differences(&poses.position, dt));
     let joints_velocity = central(&differences(&poses.joints, dt));
     let turns: Vec<[f64; 3]> =

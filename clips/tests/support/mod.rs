@@ -2,9 +2,14 @@
 #![allow(dead_code, reason = "no test uses all of it")]
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot continue fails")]
 
+pub(crate) mod bvh;
+pub(crate) mod humanoid;
+
 use std::path::{Path, PathBuf};
 
 use comic_clips::import::{Constants, Floor, Take};
+use comic_clips::retarget::Recorded;
+use comic_clips::spatial::{Quaternion, Vector, add, multiply, rotated};
 use comic_clips::{Catalogue, Error};
 use comic_experiment::ClipSource;
 
@@ -75,4 +80,20 @@ pub(crate) fn refused(source: ClipSource) -> String {
 /// Opens a file and loads one clip.
 pub(crate) fn load_one(file: &str, name: &str) -> Result<comic_clips::Clip, Error> {
     Catalogue::open(&[with_ids(file, &[name])])?.load(0)
+}
+
+/// The places of all joints of a recording in the world, in its unit.
+pub(crate) fn places(recorded: &Recorded, frame: usize) -> Vec<Vector> {
+    let pose = &recorded.frames[frame];
+    let mut placed: Vec<(Vector, Quaternion)> = Vec::new();
+    for (bone, rotation) in recorded.bones.iter().zip(&pose.rotations) {
+        placed.push(match bone.parent {
+            None => (pose.position, *rotation),
+            Some(parent) => {
+                let (place, outer) = placed[parent];
+                (add(place, rotated(outer, bone.offset)), multiply(outer, *rotation))
+            }
+        });
+    }
+    placed.into_iter().map(|(place, _)| place).collect()
 }

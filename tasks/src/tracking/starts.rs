@@ -78,7 +78,7 @@ mod tests {
     fn entry(start_step: usize, end_step: usize, weight: f64) -> Entry {
         let name = format!("{start_step}..{end_step}");
         let (steps, dt, model) = (120, 0.03, WalkerModel::Cmu2020);
-        Entry { name, steps, dt, model, start_step, end_step: Some(end_step), weight }
+        Entry { name, made_from: None, steps, dt, model, start_step, end_step: Some(end_step), weight }
     }
 
     fn four_clips() -> Vec<Entry> {
