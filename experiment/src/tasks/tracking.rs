@@ -25,7 +25,7 @@ pub struct Tracking {
     /// Start every episode at its clip's first frame instead of a random one.
     pub always_start_at_clip_start: bool,
     /// Share of the starts of training that are drawn by failures (D, after BeyondMimic's adaptive sampling): at the places
-    /// where the environment's own episodes failed, and up to 1.5 s before them. The other starts are all equally likely.
+    /// where the environment's own episodes failed, and up to 1.5 s before them. The others are drawn as without failures.
     /// Each environment counts its own episodes, so lockstep stays reproducible. Evaluations count for nothing.
     pub failure_starts: f64,
     /// Noise of the starts of training, as a factor (D): a start of training differs from its frame by normal numbers whose

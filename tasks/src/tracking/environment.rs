@@ -206,6 +206,10 @@ impl TrackingEnvironment {
 
 impl Environment for TrackingEnvironment {
     fn reset(&mut self) {
+        // Somebody else's time limit may have ended the episode. It has not failed.
+        if self.frame > self.start {
+            self.end_episode(false);
+        }
         let (clip, start) = match &self.failures {
             Some(failures) => failures.draw(&self.task.starts, &mut self.random),
             None => self.task.starts.draw(&mut self.random),

@@ -1,12 +1,13 @@
 //! Starts of training where the policy fails: each environment remembers where its own episodes failed, and starts more
 //! often shortly before such places.
 //!
-//! The idea is from "BeyondMimic" (arXiv 2508.08241, adaptive sampling). A clip is cut into bins. Each bin has an estimate
-//! of the probability that an episode that reaches it fails in it. A start in a bin counts by the failures of that bin and
-//! of the next ones, because a failure begins before the body falls. Every environment has a table of its own, so the starts
-//! depend on its own episodes alone: in lockstep the same seed gives the same starts, whatever actors there are.
+//! The idea is from "BeyondMimic" (arXiv 2508.08241, adaptive sampling). A clip is cut into bins. Each bin has an estimate of
+//! the failures per passage through it. A start in a bin counts by the failures of that bin and of the next ones, because a
+//! failure begins before the body falls. Every environment has a table of its own, so the starts depend on its own episodes
+//! alone: in lockstep the same seed gives the same starts, whatever actors there are.
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use comic_clips::Entry;
 use rand::Rng;
@@ -18,7 +19,7 @@ use crate::environment::ClipStarts;
 const BIN_SECONDS: f64 = 0.5;
 /// The estimate of a bin that no episode has reached. It is higher than most measured ones, so all bins are tried.
 const UNKNOWN: f32 = 0.5;
-/// How far an episode that passes a bin, or fails in it, moves the bin's estimate.
+/// How far one passage moves the estimate.
 const RATE: f32 = 0.125;
 /// What the estimates of a bin, of the next one and of the one after that count for a start. A clip's last bins have fewer
 /// bins ahead: the estimates are averaged with these weights.
@@ -27,6 +28,14 @@ const AHEAD: [f32; 3] = [1.0, 0.8, 0.64];
 /// The failures of one environment.
 #[derive(Clone, Debug)]
 pub(super) struct Failures {
+    bins: Arc<Bins>,
+    /// Of each bin: estimated failures per passage, 0 to 1.
+    estimates: Vec<f32>,
+}
+
+/// What all environments share.
+#[derive(Debug)]
+struct Bins {
     /// The share of starts that are drawn by failures. The others are drawn as without failures.
     share: f64,
     bins: Vec<Bin>,
@@ -34,61 +43,62 @@ pub(super) struct Failures {
     clips: Vec<Range<usize>>,
 }
 
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 struct Bin {
     clip: usize,
     /// Frames of the clip. An episode may start in all of them except the clip's last ones.
     frames: Range<usize>,
     starts: Range<usize>,
-    /// The clip's weight × the number of starts.
-    mass: f32,
-    /// Estimated probability of a failure in this bin.
-    failure: f32,
+    /// Probability of a start in this bin without failures.
+    probability: f64,
 }
 
 impl Failures {
-    /// No failures yet. `share` is 0 to 1; `dt` is the time between two frames, s.
-    pub(super) fn new(share: f64, dt: f64, entries: &[Entry], starts: &[ClipStarts]) -> Self {
+    /// No failures yet. `share` is 0 to 1; `dt` is the time between two frames, s. No episode reaches a clip's last `look_ahead`
+    /// frames.
+    pub(super) fn new(share: f64, dt: f64, look_ahead: usize, entries: &[Entry], starts: &[ClipStarts]) -> Self {
         let width = ((BIN_SECONDS / dt).round() as usize).max(1);
         let (mut bins, mut clips) = (Vec::new(), Vec::with_capacity(starts.len()));
-        for (entry, ClipStarts { clip, frames, .. }) in entries.iter().zip(starts) {
+        for (entry, ClipStarts { clip, frames, probability }) in entries.iter().zip(starts) {
             let first = bins.len();
-            let end = entry.frames().end.max(frames.end);
+            let end = entry.frames().end.saturating_sub(look_ahead).max(frames.end);
             bins.extend((frames.start..end).step_by(width).map(|from| {
                 let starts = from..(from + width).min(frames.end).max(from);
-                let mass = (entry.weight * starts.len() as f64) as f32;
-                Bin { clip: *clip, frames: from..(from + width).min(end), starts, mass, failure: UNKNOWN }
+                let probability = probability * starts.len() as f64 / frames.len().max(1) as f64;
+                Bin { clip: *clip, frames: from..(from + width).min(end), starts, probability }
             }));
             clips.push(first..bins.len());
         }
-        Self { share, bins, clips }
+        let estimates = vec![UNKNOWN; bins.len()];
+        Self { bins: Arc::new(Bins { share, bins, clips }), estimates }
     }
 
     /// An episode went through `frames` of a clip. If it failed, it failed in the last of them.
+    ///
+    /// Each passage moves an estimate p by RATE × (failures − p × the share of the bin that was passed). So p tends to the number
+    /// of failures divided by that of passages, also where episodes start within the bin.
     pub(super) fn record(&mut self, clip: usize, frames: Range<usize>, failed: bool) {
-        let bins = self.clips.get(clip).cloned().and_then(|bins| self.bins.get_mut(bins)).unwrap_or_default();
-        for bin in bins {
+        let places = self.bins.clips.get(clip).cloned().unwrap_or_default();
+        for (bin, estimate) in self.bins.bins.iter().zip(&mut self.estimates).take(places.end).skip(places.start) {
             let passed = frames.start.max(bin.frames.start)..frames.end.min(bin.frames.end);
             if passed.is_empty() {
                 continue;
             }
-            if failed && frames.end <= bin.frames.end {
-                bin.failure += RATE * (1.0 - bin.failure);
-            } else {
-                bin.failure -= RATE * bin.failure * passed.len() as f32 / bin.frames.len() as f32;
-            }
+            let failures = if failed && frames.end <= bin.frames.end { 1.0 } else { 0.0 };
+            let share = passed.len() as f32 / bin.frames.len() as f32;
+            *estimate = (*estimate + RATE * (failures - *estimate * share)).min(1.0);
         }
     }
 
     /// Draws a clip and one of its start frames.
     pub(super) fn draw(&self, starts: &Starts, random: &mut impl Rng) -> (usize, usize) {
-        if random.random::<f64>() >= self.share {
+        if random.random::<f64>() >= self.bins.share {
             return starts.draw(random);
         }
-        let total: f64 = self.weights().map(f64::from).sum();
+        let total: f64 = self.weights().map(|(_, weight)| weight).sum();
         let mut left = random.random::<f64>() * total;
-        let drawn = self.bins.iter().zip(self.weights()).find(|(_, weight)| {
-            left -= f64::from(*weight);
+        let drawn = self.weights().find(|(_, weight)| {
+            left -= weight;
             left < 0.0
         });
         match drawn {
@@ -98,14 +108,16 @@ impl Failures {
         }
     }
 
-    /// For each bin, in order: its weight among the starts that are drawn by failures.
-    fn weights(&self) -> impl Iterator<Item = f32> {
-        self.clips.iter().filter_map(|bins| self.bins.get(bins.clone())).flat_map(|bins| {
-            bins.iter().enumerate().map(move |(index, bin)| {
-                let ahead = bins.iter().skip(index).zip(AHEAD);
+    /// The bins, each with its weight among the starts that are drawn by failures.
+    fn weights(&self) -> impl Iterator<Item = (&Bin, f64)> {
+        let Bins { bins, clips, .. } = self.bins.as_ref();
+        clips.iter().flat_map(move |places| {
+            let estimates = self.estimates.get(places.clone()).unwrap_or_default();
+            bins.iter().skip(places.start).zip(0..estimates.len()).map(move |(bin, index)| {
+                let ahead = estimates.iter().skip(index).zip(AHEAD);
                 let (sum, counts) =
-                    ahead.fold((0.0, 0.0), |(sum, all), (bin, counts)| (sum + counts * bin.failure, all + counts));
-                bin.mass * sum / counts
+                    ahead.fold((0.0, 0.0), |(sum, all), (estimate, counts)| (sum + counts * estimate, all + counts));
+                (bin, bin.probability * f64::from(sum / counts))
             })
         })
     }
@@ -121,17 +133,20 @@ mod tests {
     use super::*;
 
     const DT: f64 = 0.03;
+    /// Of the paper's reference steps.
+    const LOOK_AHEAD: usize = 5;
     /// 0.5 s.
     const WIDTH: usize = 17;
 
     fn entry(start_step: usize, end_step: usize, weight: f64) -> Entry {
         let (steps, model) = (200, WalkerModel::Cmu2020);
-        Entry { name: "clip".into(), steps, dt: DT, model, start_step, end_step: Some(end_step), weight }
+        let (name, end_step) = ("clip".into(), Some(end_step));
+        Entry { name, made_from: None, steps, dt: DT, model, start_step, end_step, weight }
     }
 
     fn tables(share: f64, entries: &[Entry]) -> (Starts, Failures) {
-        let starts = Starts::new(entries, 5, 10, false).unwrap();
-        let failures = Failures::new(share, DT, entries, starts.clips());
+        let starts = Starts::new(entries, LOOK_AHEAD, 10, false).unwrap();
+        let failures = Failures::new(share, DT, LOOK_AHEAD, entries, starts.clips());
         (starts, failures)
     }
 
@@ -165,8 +180,8 @@ mod tests {
         let (starts, mut failures) = tables(0.5, &entries);
         for _ in 0..100 {
             failures.record(0, 0..100, true);
-            failures.record(0, 100..200, false);
-            failures.record(1, 0..200, false);
+            failures.record(0, 100..195, false);
+            failures.record(1, 0..195, false);
         }
         // Frame 99 is in the bin 85..102. Starts in it and in the two bins before it count.
         let (clips, inside) = shares(&starts, &failures, 20_000, 51..102);
@@ -181,31 +196,44 @@ mod tests {
         let entries = [entry(0, 200, 1.0), entry(0, 200, 1.0)];
         let (starts, mut failures) = tables(1.0, &entries);
         for _ in 0..200 {
-            failures.record(0, 0..200, false);
+            failures.record(0, 0..195, false);
             failures.record(1, 0..5, true);
-            failures.record(1, 5..200, false);
+            failures.record(1, 5..195, false);
         }
         let (clips, _) = shares(&starts, &failures, 10_000, 0..1);
         assert!(clips[0] < 0.01, "{clips:?}");
     }
 
     #[test]
-    fn a_part_of_a_bin_counts_for_as_much_as_was_passed_of_it() {
+    fn an_estimate_tends_to_the_failures_per_passage_wherever_episodes_start() {
         let (_, mut failures) = tables(1.0, &[entry(0, 200, 1.0)]);
-        failures.record(0, 0..WIDTH, false);
-        failures.record(0, WIDTH..WIDTH + 1, false);
-        let passed = |bin: usize| UNKNOWN - failures.bins[bin].failure;
-        assert!((passed(0) / passed(1) - WIDTH as f32).abs() < 1e-3);
+        // Of five episodes one fails in the first bin, and each of the others passes half of it, on average.
+        let mut sum = 0.0;
+        for round in 0..4000 {
+            let start = if round % 2 == 0 { 4 } else { 13 };
+            let end = if round % 5 == 0 { start + 1 } else { WIDTH };
+            failures.record(0, start..end, round % 5 == 0);
+            sum += failures.estimates[0] / 4000.0;
+        }
+        let passages = 0.2 / WIDTH as f32 + 0.8 * 0.5 * (13.0 + 4.0) / WIDTH as f32;
+        assert!((sum - 0.2 / passages).abs() < 0.05, "{sum}, {}", 0.2 / passages);
     }
 
     #[test]
     fn when_no_episode_fails_any_more_all_starts_are_drawn_as_without_failures() {
-        let (starts, mut failures) = tables(1.0, &[entry(0, 200, 1.0), entry(0, 200, 3.0)]);
-        for bin in &mut failures.bins {
-            bin.failure = 0.0;
+        // Every length has another last bin. 87 frames are those of a real walk.
+        for length in [80, 85, 86, 87, 88, 89, 90, 200] {
+            let (starts, mut failures) = tables(1.0, &[entry(0, length, 1.0), entry(0, 200, 3.0)]);
+            for _ in 0..2000 {
+                failures.record(0, 0..(length + 1).min(200) - LOOK_AHEAD, false);
+                failures.record(1, 0..195, false);
+            }
+            assert!(failures.estimates.iter().all(|estimate| *estimate < 1e-3), "{length}: {:?}", failures.estimates);
+            let (clips, inside) = shares(&starts, &failures, 20_000, 0..30);
+            assert!((clips[1] - starts.clips()[1].probability).abs() < 0.02, "{length}: {clips:?}");
+            let uniform = starts.clips()[0].probability * 30.0 / starts.clips()[0].frames.len() as f64;
+            assert!((inside - uniform).abs() < 0.02, "{length}: {inside}, {uniform}");
         }
-        let (clips, _) = shares(&starts, &failures, 20_000, 0..1);
-        assert!((clips[1] - 0.75).abs() < 0.02, "{clips:?}");
     }
 
     proptest! {
@@ -221,8 +249,8 @@ mod tests {
             for (clip, start, end, failed) in episodes {
                 failures.record(clip, start..end, failed);
             }
-            prop_assert!(failures.bins.iter().all(|bin| (0.0..=1.0).contains(&bin.failure)));
-            let covered: usize = failures.bins.iter().map(|bin| bin.starts.len()).sum();
+            prop_assert!(failures.estimates.iter().all(|estimate| (0.0..=1.0).contains(estimate)));
+            let covered: usize = failures.bins.bins.iter().map(|bin| bin.starts.len()).sum();
             prop_assert_eq!(covered, starts.clips().iter().map(|clip| clip.frames.len()).sum::<usize>());
             let mut random = Pcg64::seed_from_u64(seed);
             for _ in 0..50 {

@@ -66,7 +66,7 @@ impl TrackingTask {
             .ok_or(Error::NoStarts { min_steps })?;
 
         let share = config.failure_starts;
-        let failures = (share > 0.0).then(|| Failures::new(share, first.dt, entries, starts.clips()));
+        let failures = (share > 0.0).then(|| Failures::new(share, first.dt, look_ahead, entries, starts.clips()));
 
         let model = humanoid::build(kind)?;
         let walker = Walker::new(kind, &model)?;
