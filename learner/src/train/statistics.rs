@@ -282,6 +282,20 @@ mod tests {
     }
 
     #[test]
+    fn the_moments_of_batches_of_different_clips_are_those_of_all_rows() {
+        // A long batch of a clip with small numbers, a short one of a clip with large ones.
+        let rows: [&[f32]; 2] = [&[1.0, 2.0, 3.0, 2.0, 1.5, 2.5], &[100.0, 140.0]];
+        let mut statistics = Statistics::new(1);
+        for rows in rows {
+            statistics.absorb(&Tensor::from_slice(rows).reshape([-1, 1]));
+        }
+        let all = Tensor::from_slice(&rows.concat());
+        let (mean, std) = statistics.mean_and_std();
+        assert!((mean.double_value(&[0]) - all.mean(Kind::Double).double_value(&[])).abs() < 1e-5);
+        assert!((std.double_value(&[0]) - all.to_kind(Kind::Double).std(false).double_value(&[])).abs() < 1e-5);
+    }
+
+    #[test]
     fn a_checkpoint_restores_them() {
         let spec = spec();
         let mut statistics = ObservationStatistics::new(&spec);
