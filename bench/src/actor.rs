@@ -5,6 +5,7 @@
 //! environment ([`tape`]) keeps.
 
 mod acting;
+mod clips;
 mod memory;
 mod physics;
 mod tape;
@@ -31,7 +32,9 @@ const ENVIRONMENTS: usize = 16;
 /// `actor.threads`: steps/s of two threads, against one. `actor.reset`: ms. `actor.wire`: ms of one core
 /// for sending the unrolls of one update from a worker into a batch, against one second. `actor.vision`: ms of an image.
 /// `actor.memory`: resident MiB after 10,000 resets, against those after 1,000. `actor.memory.reset`: ms of one of the
-/// last thousand resets, against one of the first.
+/// last thousand resets, against one of the first. `clips.step`, `clips.memory` and `clips.load`, for each number of `--clips`:
+/// µs of a control step, resident MiB of a process, and ms until its task can be stepped; copies of the built-in recordings.
+/// `against_first` compares with the first number of clips.
 #[derive(Args, Clone, Debug)]
 pub struct Bench {
     /// Seconds for each figure
@@ -46,7 +49,9 @@ pub struct Bench {
     /// Busy processes of equal priority beside `actor.contended` [default: one for each core]
     #[arg(long, value_name = "N")]
     beside: Option<usize>,
-    /// Figures to measure [default: all but vision and memory]
+    #[command(flatten)]
+    clips: clips::Options,
+    /// Figures to measure [default: all but vision, memory and clips]
     #[arg(value_enum)]
     figures: Vec<Name>,
 }
@@ -63,6 +68,7 @@ enum Name {
     Wire,
     Vision,
     Memory,
+    Clips,
 }
 
 /// What is measured: the paper's networks on one task.
@@ -89,14 +95,17 @@ impl Bench {
         let budget =
             Duration::try_from_secs_f64(self.seconds).with_context(|| format!("--seconds {}", self.seconds))?;
         let paper = comic_experiment::resolve(&format!("tracking-{}", self.low_level), &[])?;
+        if let Some(file) = &self.clips.load_clips {
+            return clips::load(&paper, file);
+        }
         let experiment = Experiment { task: self.task, ..paper };
         let catalogue = Catalogue::open(&experiment.clips)?;
         let task = comic_tasks::build(&experiment, &catalogue)?;
         let beside = self.beside.map_or_else(crate::busy::cores, Ok)?;
         let subject = Subject { experiment, task, budget, beside };
-        // Images need OpenGL, which not every machine has. Memory takes minutes.
+        // Images need OpenGL, which not every machine has. Memory and clips take minutes.
         let wanted = |name: &&Name| match self.figures.as_slice() {
-            [] => !matches!(name, Name::Vision | Name::Memory),
+            [] => !matches!(name, Name::Vision | Name::Memory | Name::Clips),
             figures => figures.contains(name),
         };
         for name in Name::value_variants().iter().filter(wanted) {
@@ -110,6 +119,11 @@ impl Bench {
                 Name::Wire => vec![wire::wire(&subject)?],
                 Name::Vision => vec![vision::vision(&subject)?],
                 Name::Memory => memory::memory(&subject)?.into(),
+                Name::Clips => {
+                    // Clips are tracked, whatever the task of the other figures is.
+                    clips::clips(&subject, &self.clips)?;
+                    Vec::new()
+                }
             };
             for figure in figures {
                 figure.named_after(self.low_level).print()?;

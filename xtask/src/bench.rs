@@ -32,6 +32,8 @@ enum Side {
     Ranks,
     /// The replay's table, against bare copies
     Replay,
+    /// Tracking of 2 to 836 clips: a step, memory, loading
+    Clips,
     /// Images of the humanoid's camera
     Vision,
     /// Unrolls into batches, from 32 connections and from 1000
@@ -81,6 +83,7 @@ pub(crate) fn run(options: &Options) -> Result<()> {
             let mut others = other_low_levels().filter(|_| arguments.is_empty());
             others.try_for_each(|name| actor(&["policy", "--low-level", name].map(String::from)))
         }
+        Side::Clips => actor(&[&["clips".to_owned()], &arguments[..]].concat()),
         Side::Vision => actor(&[&["vision".to_owned()], &arguments[..]].concat()),
         Side::Learner => {
             learner(options.threads, arguments)?;

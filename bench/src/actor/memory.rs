@@ -39,8 +39,8 @@ pub(super) fn memory(subject: &Subject) -> Result<[Figure; 2]> {
     Ok([memory, Figure::new("actor.memory.reset", "ms", Medians { value: last, floor: first }, note)])
 }
 
-/// Resident memory, MiB.
-fn resident() -> Result<f64> {
+/// Resident memory of this process, MiB.
+pub(super) fn resident() -> Result<f64> {
     const PATH: &str = "/proc/self/status";
     let status = fs::read_to_string(PATH).with_context(|| format!("cannot read {PATH}"))?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
