@@ -78,6 +78,9 @@ enum Command {
         /// 95 % bootstrap interval. They should differ in their seeds only
         #[arg(long)]
         seeds: bool,
+        /// Draw the evaluations of one run, clip by clip, as a heat map in place of curves
+        #[arg(long, conflicts_with_all = ["quantities", "seeds"])]
+        clips: bool,
         /// The picture
         #[arg(long, default_value = "curves.svg")]
         out: PathBuf,
@@ -107,7 +110,8 @@ fn main() -> ExitCode {
         Command::Train(options) => train::run(options),
         Command::Sweep(options) => sweep::run(options),
         Command::Bench(options) => bench::run(&options),
-        Command::Plot { metrics, quantities, seeds, out } => plot::run(&metrics, &quantities, seeds, &out),
+        Command::Plot { metrics, clips: true, out, .. } => plot::clips(&metrics, &out),
+        Command::Plot { metrics, quantities, seeds, out, .. } => plot::run(&metrics, &quantities, seeds, &out),
         Command::Film(options) => film::run(&options),
         Command::LowLevel(options) => low_level::run(options),
         Command::Wheel => wheel::build().map(|wheel| println!("{}", wheel.display())),

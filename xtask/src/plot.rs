@@ -10,7 +10,7 @@ mod pool;
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use plotters::prelude::*;
 
 use crate::evaluations::{self, ClipEvaluation};
@@ -124,6 +124,16 @@ pub(crate) fn run(metrics: &[String], quantities: &[Quantity], seeds: bool, out:
     } else {
         draw_runs(&sources, quantities, out)?;
     }
+    eprintln!("drew {}", out.display());
+    Ok(())
+}
+
+/// `cargo xtask plot --clips`: a heat map of the clips of one run.
+pub(crate) fn clips(metrics: &[String], out: &Path) -> Result<()> {
+    let [run] = metrics else { bail!("--clips draws one run, not {}", metrics.len()) };
+    let evaluations = Source::parse(run).evaluations();
+    let evaluations = evaluations.ok_or_else(|| anyhow!("{run}: give the run's metrics.jsonl"))?;
+    ensure!(draw_clips(&evaluations, out)?, "{}: has no evaluation of two clips or more", evaluations.display());
     eprintln!("drew {}", out.display());
     Ok(())
 }
