@@ -1,6 +1,12 @@
 //! A clip in memory.
 
+use std::ops::RangeInclusive;
+
 use crate::humanoid::WalkerModel;
+
+/// Allowed number of frames: at most 50 minutes at 0.03 s. The longest clip of CMU has 6,371 frames. The limit bounds
+/// the memory that a hostile `num_steps` can claim to 340 MB.
+pub(crate) const STEPS: RangeInclusive<u64> = 1..=100_000;
 
 /// One whole clip: T frames, `dt` seconds apart.
 #[derive(Clone, Debug, PartialEq)]

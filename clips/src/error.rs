@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use crate::file::STEPS;
+use crate::clip::STEPS;
 use crate::humanoid::WalkerModel;
 
 /// Every error of this crate. Each message names the file and the item, and says what to do.

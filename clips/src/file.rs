@@ -1,7 +1,6 @@
 //! An HDF5 file in the layout of dm_control's mocap files. Each clip is read on its own.
 
 use std::{
-    ops::RangeInclusive,
     panic::{AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
     sync::Arc,
@@ -9,13 +8,10 @@ use std::{
 
 use hdf5_reader::{FileStorage, Hdf5File, OpenOptions, Storage, error::Error as Hdf5Error, group::Group};
 
-use crate::clip::{Clip, Features, Motion};
+use crate::clip::{Clip, Features, Motion, STEPS};
 use crate::error::Error;
 use crate::humanoid::WalkerModel;
 
-/// Allowed number of frames: at most 50 minutes at 0.03 s. The longest clip of CMU has 6,371 frames. The limit bounds
-/// the memory that a hostile `num_steps` can claim to 340 MB.
-pub(crate) const STEPS: RangeInclusive<u64> = 1..=100_000;
 /// Longest allowed time step, s. dm_control's files have 0.03 and 0.05.
 const LONGEST_TIMESTEP: f64 = 1.0;
 /// Greatest difference between the norm of a quaternion and 1.

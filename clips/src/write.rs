@@ -9,9 +9,9 @@ use hdf5_pure::{
 };
 use tempfile::NamedTempFile;
 
-use crate::clip::{Clip, Features, Motion};
+use crate::clip::{Clip, Features, Motion, STEPS};
 use crate::error::Error;
-use crate::file::{MADE_FROM, STEPS, check_origin};
+use crate::file::{MADE_FROM, check_origin};
 
 /// Bytes of datasets that are kept in memory before they are written.
 const STAGED: usize = 64 << 20;
