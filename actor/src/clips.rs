@@ -40,7 +40,7 @@ enum Command {
     /// Finds every defect of a file's clips: penetration, floating, joint limits, jumps, NaN.
     Check(check::Check),
     /// Makes clips from motion capture: ASF and AMC, BVH, or SMPL files.
-    Import(import::Import),
+    Import(Box<import::Import>),
     /// Writes mirrored clips: left and right exchanged.
     Mirror(mirror::Mirror),
     /// Writes faster or slower clips.
