@@ -1,8 +1,8 @@
 //! Makes more clips of existing ones, for the CMU humanoid V2020.
 //!
-//! - [`mirror`] exchanges left and right;
-//! - [`speed`] makes a clip faster or slower;
-//! - [`join`] takes the legs of one clip and the arms of another.
+//! - [`mirror()`] exchanges left and right;
+//! - [`speed()`] makes a clip faster or slower;
+//! - [`join()`] takes the legs of one clip and the arms of another.
 //!
 //! A new clip has [`Clip::made_from`], a short text in the words of the command line. Parentheses are around a clip
 //! that was made from others itself: `mirror (speed 0.8 CMU_007_01)`. Evaluations can leave such copies out.

@@ -112,15 +112,15 @@ fn turn([q0, q1]: [Quaternion; 2], [w0, w1]: [Vector; 2], share: f64, dt: f64) -
     (normalize(multiply(q0, about_vector(axis, angle))), velocity_of(vector, slope))
 }
 
-/// The angular velocity, in the frame that turns, of a rotation vector with this slope: J slope, with J = 1 − ½ [v] + ⅙
-/// [v]² (the right Jacobian of SO(3) to second order; [v] is the cross product with the vector). A frame turns by far
-/// less than 1 rad.
+/// The angular velocity, in the frame that turns, of a rotation vector with this slope: J slope, with J = 1 − ½ V + ⅙ V²
+/// (the right Jacobian of SO(3) to second order; V is the cross product with the vector). A frame turns by far less than
+/// 1 rad.
 fn velocity_of(vector: Vector, slope: Vector) -> Vector {
     let once = cross(vector, slope);
     add(subtract(slope, scale(0.5, once)), scale(1.0 / 6.0, cross(vector, once)))
 }
 
-/// The inverse of [`velocity_of`]: 1 + ½ [v] + 1/12 [v]².
+/// The inverse of [`velocity_of`]: 1 + ½ V + 1/12 V².
 fn slope_of(vector: Vector, velocity: Vector) -> Vector {
     let once = cross(vector, velocity);
     add(add(velocity, scale(0.5, once)), scale(1.0 / 12.0, cross(vector, once)))
