@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use comic_clips::{Catalogue, pose_to_action};
 use comic_experiment::{ClipSource, TRACKING_MAX_REWARD, TRACKING_OBSERVATIONS, TaskSpec, TerminationError, Tracking};
-use comic_tasks::{Environment, Error, Outcome, Simulated, Task, TrackingEnvironment, TrackingTask};
+use comic_tasks::{Environment, Episode, Error, Outcome, Simulated, Task, TrackingEnvironment, TrackingTask};
 
 fn catalogue(names: &[&str]) -> Catalogue {
     let sources: Vec<ClipSource> = names.iter().map(|name| ClipSource::whole(format!("builtin:{name}"))).collect();
@@ -383,6 +383,22 @@ fn with_starts_by_failures_the_seed_alone_still_decides_the_episodes() {
 }
 
 #[test]
+fn an_episode_that_its_caller_ends_counts_as_one_that_did_not_fail() {
+    let task = task_of(&Tracking { failure_starts: 1.0, ..lenient() }, &["walk", "squat"]);
+    // No episode has an end of its own within so few steps.
+    let starts = |steps: usize| -> Vec<Episode> {
+        let mut environment = task.tracking_environment(1);
+        let mut next = || {
+            (0..steps).map(|step| environment.step(&wild(step))).for_each(|_| ());
+            environment.reset();
+            environment.episode()
+        };
+        (0..40).map(|_| next()).collect()
+    };
+    assert_ne!(starts(0), starts(9));
+}
+
+#[test]
 fn evaluations_do_not_count_as_failures() {
     let config = Tracking { failure_starts: 1.0, ..Tracking::default() };
     let task = task_of(&config, &["walk", "squat"]);
@@ -412,8 +428,7 @@ fn without_starts_by_failures_nothing_of_an_episode_changes_the_next_start() {
 
 #[test]
 fn an_episode_never_leaves_its_clip() {
-    let config = Tracking { failure_starts: 0.5, ..lenient() };
-    let clips = ["run", "walk"];
+    let (config, clips) = (Tracking { failure_starts: 0.5, ..lenient() }, ["run", "walk"]);
     let (task, catalogue) = (task_of(&config, &clips), catalogue(&clips));
     let look_ahead = config.reference_steps.iter().max().unwrap();
     let mut environment = task.tracking_environment(4);

@@ -81,7 +81,7 @@ pub struct TrackingEnvironment {
     /// Whether the episode lasted to the clip's end, or to the time limit.
     lasted: bool,
     diverged: bool,
-    /// Where episodes of training failed, if starts are drawn by it.
+    /// Where episodes of training failed, if starts are drawn by failures.
     failures: Option<Failures>,
     /// The episode is one of training, and is not over.
     training: bool,
@@ -93,7 +93,7 @@ impl TrackingEnvironment {
     fn new(task: Arc<TrackingTask>, seed: u64) -> Self {
         let data = task.models.data();
         let random = Pcg64::seed_from_u64(seed);
-        let failures = task.failures();
+        let failures = task.failures.clone();
         let mut environment = Self {
             task,
             data,
@@ -169,7 +169,7 @@ impl TrackingEnvironment {
         (self.lasted, self.diverged, self.training) = (false, false, false);
     }
 
-    /// The episode is over, or a caller steps after its end, which counts for nothing.
+    /// Counts an episode of training that is over. Later steps and evaluations count for nothing.
     fn end_episode(&mut self, failed: bool) {
         let first = self.reference().first;
         if let (Some(failures), true) = (&mut self.failures, std::mem::take(&mut self.training)) {
@@ -206,7 +206,7 @@ impl TrackingEnvironment {
 
 impl Environment for TrackingEnvironment {
     fn reset(&mut self) {
-        // Somebody else's time limit may have ended the episode. It has not failed.
+        // A caller's own time limit may have ended the episode. Then it has not failed.
         if self.frame > self.start {
             self.end_episode(false);
         }
@@ -348,7 +348,7 @@ impl Simulated for TrackingEnvironment {
 
     fn reseed(&mut self, seed: u64) {
         self.random = Pcg64::seed_from_u64(seed);
-        self.failures = self.task.failures();
+        self.failures = self.task.failures.clone();
     }
 
     fn model(&self) -> Arc<MjModel> {

@@ -23,7 +23,7 @@ pub struct TrackingTask {
     pub(super) references: Vec<Reference>,
     pub(super) starts: Starts,
     /// Of an environment that has not failed yet; `None` if failures do not count.
-    failures: Option<Failures>,
+    pub(super) failures: Option<Failures>,
     pub(super) observations: Vec<Observation>,
     /// The largest reference step.
     pub(super) look_ahead: usize,
@@ -90,13 +90,6 @@ impl TrackingTask {
             look_ahead,
             spec,
         })
-    }
-}
-
-impl TrackingTask {
-    /// The table of an environment's failures, without any.
-    pub(super) fn failures(&self) -> Option<Failures> {
-        self.failures.clone()
     }
 }
 
