@@ -74,6 +74,8 @@ pub struct Ledger {
     pub(crate) next_actor: u64,
     /// Distance between the indices of two new actors.
     stride: u64,
+    /// The first index that this rank gave out in this learner epoch.
+    pub(crate) first_new: u64,
     /// See [`LedgerSnapshot`](crate::LedgerSnapshot).
     pub(crate) sparse: bool,
     pub(crate) clock: u64,
@@ -107,6 +109,7 @@ impl Ledger {
             actors: HashMap::new(),
             next_actor: 0,
             stride: 1,
+            first_new: 0,
             sparse: false,
             clock: 0,
             capacity: capacity.max(1),
@@ -139,6 +142,7 @@ impl Ledger {
         while !is_own(self.next_actor) {
             self.next_actor += 1;
         }
+        self.first_new = self.next_actor;
         if rank > 0 {
             self.sums = Accounting::default();
             self.tasks = Tasks::default();
@@ -159,12 +163,12 @@ impl Ledger {
             entry.heard = self.clock;
             return Ok(Joined { actor: *actor, next_sequence: entry.next_sequence });
         }
-        // Every index below `next_actor` was assigned in this run, unless several ranks counted apart. So an index without an
-        // entry was closed. An index of another incarnation was assigned again after a restart from a checkpoint without
-        // this actor; then the actor gets a new account. An actor with an index that is not assigned yet gets a new
-        // account, too, and so does one without an entry if several ranks counted apart.
-        let closed = |actor: &u64| !self.sparse && *actor < self.next_actor && !self.entries.contains_key(actor);
-        if let Some(actor) = claimed.filter(closed) {
+        // Every index below `next_actor` was assigned in this run, unless several ranks counted apart: then this is known of those
+        // that this rank has given out itself. So such an index without an entry was closed. An index of another incarnation was
+        // assigned again after a restart from a checkpoint without this actor; then the actor gets a new account. An actor with an
+        // index that is not assigned yet gets a new account, too.
+        let known = |actor: &u64| *actor < self.next_actor && (!self.sparse || self.gave_out(*actor));
+        if let Some(actor) = claimed.filter(|actor| known(actor) && !self.entries.contains_key(actor)) {
             return Err(JoinError::Closed { actor, incarnation });
         }
         if self.entries.len() >= self.capacity {
@@ -175,6 +179,11 @@ impl Ledger {
         self.entries.insert(actor, Entry { incarnation, next_sequence: 0, heard: self.clock });
         self.actors.insert(incarnation, actor);
         Ok(Joined { actor, next_sequence: 0 })
+    }
+
+    /// Whether this rank gave an actor this index in this learner epoch.
+    fn gave_out(&self, actor: u64) -> bool {
+        (self.first_new..self.next_actor).contains(&actor) && (actor - self.first_new).is_multiple_of(self.stride)
     }
 
     /// Accounts for all numbers below `sequence`, which were acknowledged to the actor. Numbers that the account does

@@ -159,6 +159,7 @@ impl Ledger {
             ledger.others.insert(task.clone(), accounting);
         }
         ledger.next_actor = snapshot.next_actor;
+        ledger.first_new = snapshot.next_actor;
         ledger.sparse = snapshot.sparse;
         ledger.sums = sums;
         Ok(ledger)

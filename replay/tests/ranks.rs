@@ -6,7 +6,7 @@ mod common;
 
 use std::collections::HashSet;
 
-use comic_replay::{Account, Accounting, Batcher, Dropped, Ledger, LedgerSnapshot, home};
+use comic_replay::{Account, Accounting, Batcher, Dropped, JoinError, Ledger, LedgerSnapshot, home};
 use proptest::prelude::*;
 
 /// A ledger in which these actors have sent so many unrolls. All were trained on, but for `in_flight` of them.
@@ -100,6 +100,16 @@ fn a_process_with_an_account_at_two_ranks_keeps_the_one_that_it_uses() {
     assert_eq!(sequences, [0, 9]);
     assert_eq!(whole.accounting.produced, 16, "what the closed account counted stays counted");
     Ledger::restore(&whole).unwrap();
+}
+
+#[test]
+fn an_account_that_one_of_several_ranks_closed_is_not_opened_again() {
+    let mut own = Ledger::with_capacity(2).part_of(1, 2);
+    let first = own.join(70, None).unwrap();
+    for incarnation in 71..73 {
+        own.join(incarnation, None).unwrap();
+    }
+    assert_eq!(own.join(70, Some(first.actor)), Err(JoinError::Closed { actor: first.actor, incarnation: 70 }));
 }
 
 #[test]
