@@ -14,6 +14,8 @@ use crate::Error;
 pub(super) const CALL: Duration = Duration::from_secs(10);
 /// How often one learner may send an actor to another, until one takes it.
 const MOST_HOPS: usize = 2;
+/// Bytes of the host and port of another learner: a host's name has at most 253.
+const LEARNER_LIMIT: usize = 260;
 /// Room for the experiment with the names of some thousand clips. Pieces of parameters and assets are far smaller.
 const MESSAGE_LIMIT: usize = 16 << 20;
 
@@ -149,6 +151,9 @@ impl Connector {
             if link.reply.learner.is_empty() {
                 self.home = Some(address);
                 return Ok(self.joined(link));
+            }
+            if link.reply.learner.len() > LEARNER_LIMIT {
+                return Err(Failure::Lost(format!("the learner at {address} names another one that no host can have")));
             }
             self.home = Some(url_of_sibling(&self.address, &link.reply.learner));
         }

@@ -93,7 +93,7 @@ impl Join {
     pub(super) fn answer(&self, request: &JoinRequest, peer: Option<&Peer>) -> Result<JoinReply, Status> {
         let owner = peer.and_then(|peer| peer.owner);
         let checked = self.check(request, owner);
-        if let (Ok(()), Some(learner)) = (&checked, self.elsewhere(request)) {
+        if let (Ok(()), Some(learner)) = (&checked, self.elsewhere(request, owner)) {
             self.prometheus.joins.of("elsewhere").inc();
             return Ok(JoinReply { learner, ..JoinReply::default() });
         }
@@ -109,12 +109,12 @@ impl Join {
     }
 
     /// Where the actor has to go, if it belongs to another rank.
-    fn elsewhere(&self, request: &JoinRequest) -> Option<String> {
+    fn elsewhere(&self, request: &JoinRequest, owner: Option<Owner>) -> Option<String> {
         // At the end of a run every rank says so, and another one may have ended.
         let placement = self.placement.as_ref().filter(|_| !self.shutdown.run_is_over())?;
-        let incarnation = format!("{:016x}", request.incarnation);
-        let name = if request.name.is_empty() { &incarnation } else { &request.name };
-        placement.elsewhere(name, request.actor, Instant::now()).map(str::to_owned)
+        let JoinRequest { name, incarnation, actor, .. } = request;
+        let name = if name.is_empty() { format!("{incarnation:016x}") } else { name.clone() };
+        placement.elsewhere((owner, name), *actor, Instant::now()).map(str::to_owned)
     }
 
     /// Checks what does not depend on other actors.

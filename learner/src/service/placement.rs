@@ -6,12 +6,20 @@ use std::time::{Duration, Instant};
 use comic_replay::home;
 use parking_lot::Mutex;
 
+use super::peer::Owner;
+
 /// How long a rank may not know yet of an actor that was sent to it.
 const ON_THE_WAY: Duration = Duration::from_secs(5);
 /// How long a rank may have no actor before that is said, and said again.
 const ALONE: Duration = Duration::from_secs(60);
-/// Most names that are remembered, as many as actors in the roster. When there are more, all are forgotten.
+/// Most names that are remembered in each of two generations, as many as actors in the roster. When there are more, the older generation
+/// is forgotten.
 const CAPACITY: usize = 65_536;
+/// Most actors that count as on their way.
+const MOST_ON_THE_WAY: usize = 65_536;
+
+/// An actor's name, or for one without a name its incarnation, and who gave it: nobody decides where the actors of others go.
+pub(super) type Owned = (Option<Owner>, String);
 
 /// Sends every actor to its rank. An actor that has an index belongs to the rank that the index says, for ever. A new one goes where the
 /// fewest are, or to the rank of the last process of its name, which then knows that it replaces it.
@@ -27,10 +35,11 @@ pub struct Placement {
 struct State {
     /// Actors of each rank, as it last said.
     actors: Vec<u64>,
-    /// Actors that were sent to a rank lately.
+    /// Actors that were sent to a rank lately, and how many they are for each rank.
     sent: VecDeque<(Instant, usize)>,
-    /// The rank of each name.
-    names: HashMap<String, usize>,
+    on_the_way: Vec<u64>,
+    /// The rank of each name; the younger generation first.
+    names: [HashMap<Owned, usize>; 2],
     /// Since when a rank has no actor, or since the last warning of it.
     waits_since: Option<Instant>,
 }
@@ -38,7 +47,8 @@ struct State {
 impl Placement {
     /// For the rank `rank`, when actors reach the ranks at these addresses.
     pub fn new(rank: usize, addresses: Vec<String>) -> Self {
-        let state = State { actors: vec![0; addresses.len()], ..State::default() };
+        let none = vec![0; addresses.len()];
+        let state = State { actors: none.clone(), on_the_way: none, ..State::default() };
         Self { rank, addresses, state: Mutex::new(state) }
     }
 
@@ -57,9 +67,9 @@ impl Placement {
         }
     }
 
-    /// Where an actor has to go; `None` if it belongs here. `name` is what stays the same when it asks again: its name, or for one without
-    /// a name its incarnation. Only rank 0 sends new actors elsewhere.
-    pub fn elsewhere(&self, name: &str, index: Option<u64>, now: Instant) -> Option<&str> {
+    /// Where an actor has to go; `None` if it belongs here. `name` stays the same when it asks again. Only rank 0 sends new actors
+    /// elsewhere.
+    pub(super) fn elsewhere(&self, name: Owned, index: Option<u64>, now: Instant) -> Option<&str> {
         let rank = match index {
             Some(index) => {
                 let rank = home(index, self.addresses.len());
@@ -74,28 +84,29 @@ impl Placement {
 }
 
 impl State {
-    fn place(&mut self, name: &str, now: Instant) -> usize {
-        if let Some(rank) = self.names.get(name) {
+    fn place(&mut self, name: Owned, now: Instant) -> usize {
+        if let Some(rank) = self.names.iter().find_map(|names| names.get(&name)) {
             return *rank;
         }
-        while self.sent.front().is_some_and(|(when, _)| now.duration_since(*when) >= ON_THE_WAY) {
-            self.sent.pop_front();
+        while let Some((_, rank)) = self.sent.pop_front_if(|(when, _)| now.duration_since(*when) >= ON_THE_WAY) {
+            self.on_the_way[rank] -= 1;
         }
-        let on_the_way = |rank: usize| self.sent.iter().filter(|(_, sent)| *sent == rank).count() as u64;
-        let loads = self.actors.iter().enumerate().map(|(rank, actors)| (actors + on_the_way(rank), rank));
-        let rank = loads.min().map_or(0, |(_, rank)| rank);
-        if self.sent.len() < CAPACITY {
+        let loads = self.actors.iter().zip(&self.on_the_way).map(|(here, sent)| here + sent);
+        let rank = loads.zip(0..).min().map_or(0, |(_, rank)| rank);
+        if self.sent.len() < MOST_ON_THE_WAY {
             self.sent.push_back((now, rank));
+            self.on_the_way[rank] += 1;
         }
         self.remember(name, rank);
         rank
     }
 
-    fn remember(&mut self, name: &str, rank: usize) {
-        if self.names.len() >= CAPACITY {
-            self.names.clear();
+    fn remember(&mut self, name: Owned, rank: usize) {
+        let [younger, older] = &mut self.names;
+        if younger.len() >= CAPACITY {
+            *older = std::mem::take(younger);
         }
-        self.names.insert(name.to_owned(), rank);
+        younger.insert(name, rank);
     }
 }
 
@@ -107,21 +118,25 @@ mod tests {
         Placement::new(rank, ["a:1", "b:2", "c:3"].map(String::from).to_vec())
     }
 
+    fn of(name: &str) -> Owned {
+        (None, name.to_owned())
+    }
+
     #[test]
     fn new_actors_go_where_the_fewest_are() {
         let (placement, now) = (placement(0), Instant::now());
         let names = ["1", "2", "3", "4", "5", "6"];
-        let placed: Vec<_> = names.map(|name| placement.elsewhere(name, None, now)).to_vec();
+        let placed: Vec<_> = names.map(|name| placement.elsewhere(of(name), None, now)).to_vec();
         assert_eq!(placed, [None, Some("b:2"), Some("c:3"), None, Some("b:2"), Some("c:3")]);
         placement.count(&[9, 2, 8], now);
         let later = now + ON_THE_WAY;
-        assert_eq!(placement.elsewhere("7", None, later), Some("b:2"));
+        assert_eq!(placement.elsewhere(of("7"), None, later), Some("b:2"));
     }
 
     #[test]
     fn an_actor_with_an_index_belongs_to_one_rank_whoever_is_asked() {
         for rank in 0..3 {
-            let found = placement(rank).elsewhere("", Some(7), Instant::now()).map(str::to_owned);
+            let found = placement(rank).elsewhere(of(""), Some(7), Instant::now()).map(str::to_owned);
             assert_eq!(found.as_deref(), (rank != 1).then_some("b:2"));
         }
     }
@@ -129,18 +144,27 @@ mod tests {
     #[test]
     fn a_process_goes_where_the_last_one_of_its_name_was() {
         let (placement, now) = (placement(0), Instant::now());
-        assert_eq!(placement.elsewhere("one", None, now), None);
-        assert_eq!(placement.elsewhere("two", None, now), Some("b:2"));
+        assert_eq!(placement.elsewhere(of("one"), None, now), None);
+        assert_eq!(placement.elsewhere(of("two"), None, now), Some("b:2"));
         placement.count(&[0, 50, 0], now);
-        assert_eq!(placement.elsewhere("two", None, now), Some("b:2"));
+        assert_eq!(placement.elsewhere(of("two"), None, now), Some("b:2"));
         // Also if rank 0 was started anew, and has only heard of the process that is replaced.
         let placement = self::placement(0);
-        placement.elsewhere("three", Some(5), now);
-        assert_eq!(placement.elsewhere("three", None, now), Some("c:3"));
+        placement.elsewhere(of("three"), Some(5), now);
+        assert_eq!(placement.elsewhere(of("three"), None, now), Some("c:3"));
+    }
+
+    #[test]
+    fn an_owner_cannot_decide_where_the_actors_of_another_one_go() {
+        let (placement, now) = (placement(0), Instant::now());
+        let [mine, theirs] = [1, 2].map(|owner| (Some([owner; 32]), "one".to_owned()));
+        assert_eq!(placement.elsewhere(mine.clone(), Some(2), now), Some("c:3"));
+        placement.elsewhere(theirs, Some(1), now);
+        assert_eq!(placement.elsewhere(mine, None, now), Some("c:3"));
     }
 
     #[test]
     fn another_rank_than_the_first_keeps_the_new_actors_that_come_to_it() {
-        assert_eq!(placement(2).elsewhere("", None, Instant::now()), None);
+        assert_eq!(placement(2).elsewhere(of(""), None, Instant::now()), None);
     }
 }
