@@ -34,7 +34,8 @@ fn promtool(arguments: &[&str]) -> Result<()> {
 
 #[test]
 fn promtool_accepts_the_configuration_and_its_rules() -> Result<()> {
-    promtool(&["check", "config", "--lint=all", "--lint-fatal", "deploy/prometheus/prometheus.yml"])
+    let check = ["check", "config", "--lint=all", "--lint-fatal"];
+    promtool(&[&check[..], &["deploy/prometheus/prometheus.yml", "deploy/prometheus/data-parallel.yml"]].concat())
 }
 
 #[test]

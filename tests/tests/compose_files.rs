@@ -228,10 +228,30 @@ fn monitoring_mounts_files_of_the_repository_and_cannot_change_them() -> Result<
 
 #[test]
 fn prometheus_keeps_a_bounded_volume() -> Result<()> {
-    let command = command("compose.yaml", "prometheus")?;
-    for bound in ["--storage.tsdb.retention.time=30d", "--storage.tsdb.retention.size=1GB"] {
-        ensure!(command.iter().any(|option| option == bound), "{command:?} lacks {bound}");
+    for file in ["compose.yaml", "compose.data-parallel.yaml"] {
+        let command = command(file, "prometheus")?;
+        for bound in ["--storage.tsdb.retention.time=30d", "--storage.tsdb.retention.size=1GB"] {
+            ensure!(command.iter().any(|option| option == bound), "{file}: {command:?} lacks {bound}");
+        }
     }
+    Ok(())
+}
+
+#[test]
+fn prometheus_asks_each_of_two_learners_as_it_asks_one() -> Result<()> {
+    let config = |name: &str| -> Result<Value> { Ok(serde_yaml_ng::from_str(&text(&format!("prometheus/{name}"))?)?) };
+    let (mut two, mut one) = (config("data-parallel.yml")?, config("prometheus.yml")?);
+    let targets = |config: &mut Value| std::mem::take(&mut config["scrape_configs"][0]["static_configs"][0]["targets"]);
+    let (of_two, _) = (targets(&mut two), targets(&mut one));
+    ensure!(two == one, "{two:?} and {one:?}");
+    let services = ["learner", "learner-1"];
+    for service in services {
+        let options = command("compose.data-parallel.yaml", service)?;
+        ensure!(options.windows(2).any(|pair| pair == ["--metrics-port", "9090"]), "{options:?}");
+    }
+    ensure!(words(&of_two).eq(services.map(|service| format!("{service}:9090"))), "{of_two:?}");
+    let command = command("compose.data-parallel.yaml", "prometheus")?;
+    ensure!(command[0] == "--config.file=/etc/prometheus/data-parallel.yml", "{command:?}");
     Ok(())
 }
 
