@@ -19,6 +19,7 @@ impl Error {
             | Self::Experiment(_)
             | Self::Clips(_)
             | Self::Access(_)
+            | Self::World(world::Error::Sizes { .. })
             | Self::Networks(comic_networks::Error::Experiment(_)) => 2,
             Self::Within { source, .. } => source.exit_code(),
             Self::World(

@@ -2,7 +2,7 @@
 
 use std::fmt;
 use std::io::ErrorKind;
-use std::net::{SocketAddr, TcpListener, TcpStream, ToSocketAddrs as _};
+use std::net::{IpAddr, Ipv6Addr, SocketAddr, TcpListener, TcpStream, ToSocketAddrs as _};
 use std::str::FromStr;
 use std::time::{Duration, Instant};
 
@@ -36,8 +36,8 @@ pub struct WorldArguments {
     pub advertise: Option<Rendezvous>,
 }
 
-/// Characters that no host has.
-const FORBIDDEN: [char; 5] = ['/', '@', '?', ' ', '\t'];
+/// Characters that no host has, but for an IPv6 address in brackets.
+const FORBIDDEN: [char; 8] = ['/', '@', '?', ' ', '\t', ':', '[', ']'];
 
 /// A host and a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -50,11 +50,13 @@ impl FromStr for Rendezvous {
     type Err = String;
 
     fn from_str(text: &str) -> std::result::Result<Self, String> {
-        let parts = text.rsplit_once(':').map(|(host, port)| (host.trim_matches(['[', ']']), port.parse()));
-        match parts {
-            Some((host, Ok(port))) if port > 0 && !host.is_empty() && !host.contains(FORBIDDEN) => {
-                Ok(Self { host: host.to_owned(), port })
-            }
+        let parts = text.rsplit_once(':').map(|(host, port)| (host, port.parse()));
+        let host_of = |text: &str| match text.strip_prefix('[').and_then(|text| text.strip_suffix(']')) {
+            Some(host) => host.parse::<Ipv6Addr>().is_ok().then(|| host.to_owned()),
+            None => (!text.is_empty() && !text.contains(FORBIDDEN)).then(|| text.to_owned()),
+        };
+        match parts.map(|(host, port)| (host_of(host), port)) {
+            Some((Some(host), Ok(port))) if port > 0 => Ok(Self { host, port }),
             _ => Err("this is not HOST:PORT, for instance learner-0:7071".into()),
         }
     }
@@ -115,16 +117,22 @@ impl Meeting {
             return Ok(Self { world: World::alone(), addresses: Vec::new() });
         };
         tracing::info!(rank, size, %rendezvous, "waiting for the other ranks");
+        let begun = Instant::now();
         let (address, listener) = rendezvous.reach(rank)?;
         if listener.is_some() {
             // Some systems give a machine's own name a loopback address, which the other machines cannot reach.
             tracing::info!(%address, "the other ranks can meet this one here");
         }
         let own = match advertise {
+            Some(advertised) if advertised.is_unspecified() => {
+                let remedy = format!("--advertise {advertised} is no address that actors can reach: name this machine");
+                return Err(Error::Configuration(remedy));
+            }
             Some(advertised) => advertised.clone(),
             None => Rendezvous::of(advertised(serving, address)?),
         };
-        let world = World::meet(rank, size, address, listener)?;
+        let patience = MEETING.saturating_sub(begun.elapsed()).max(ATTEMPT);
+        let world = World::meet(rank, size, address, listener, patience)?;
         let addresses = world.exchange(own.to_string())?;
         tracing::info!(rank, size, ?addresses, "all ranks are here");
         Ok(Self { world, addresses })
@@ -134,6 +142,10 @@ impl Meeting {
 impl Rendezvous {
     fn of(address: SocketAddr) -> Self {
         Self { host: address.ip().to_string(), port: address.port() }
+    }
+
+    fn is_unspecified(&self) -> bool {
+        self.host.parse::<IpAddr>().is_ok_and(|address| address.is_unspecified())
     }
 
     /// The address, at which rank 0 then listens, and rank 0's socket. Others wait until it listens. A name may be that of a former pod
@@ -229,6 +241,9 @@ mod tests {
         assert_eq!(advertised(outside, at("192.0.2.8:7071")).unwrap(), outside);
         let refused = advertised(here, at("192.0.2.8:7071")).unwrap_err();
         assert!(refused.exit_code() == 2 && refused.to_string().contains("--advertise"), "{refused}");
+        for (text, unspecified) in [("0.0.0.0:1", true), ("[::]:1", true), ("192.0.2.7:1", false), ("a:1", false)] {
+            assert_eq!(text.parse::<Rendezvous>().unwrap().is_unspecified(), unspecified, "{text}");
+        }
     }
 
     #[test]
@@ -236,9 +251,19 @@ mod tests {
         for text in ["learner-0:7071", "127.0.0.1:1", "[::1]:7071"] {
             assert_eq!(text.parse::<Rendezvous>().unwrap().to_string(), text);
         }
-        for text in
-            ["", "learner-0", ":7071", "learner-0:70710", "learner-0:", "learner-0:0", "http://a:1", "a@b:1", "a b:1"]
-        {
+        for text in [
+            "",
+            "learner-0",
+            ":7071",
+            "learner-0:70710",
+            "learner-0:",
+            "learner-0:0",
+            "http://a:1",
+            "a@b:1",
+            "a b:1",
+            "a:b:1",
+            "[a]:1",
+        ] {
             assert!(text.parse::<Rendezvous>().is_err(), "{text}");
         }
     }

@@ -105,6 +105,7 @@ async fn serve_and_train(options: &Arc<Options>, experiment: Experiment) -> Resu
     served.map_err(|_| Error::Panicked("the server"))??;
     tracing::info!(accounting = ?batcher.accounting(), "{}", match ending {
         Ending::Budget => "the budget is used up",
+        Ending::Stopped if options.world.world_size > 1 => "stopped; start all ranks again to continue",
         Ending::Stopped => "stopped; start again with the same --run to continue",
     });
     Ok(ending)
@@ -259,7 +260,10 @@ impl Listeners {
         }
         // An error is not important: stdout may be closed.
         let _ = writeln!(std::io::stdout(), "{line}");
-        tracing::info!(%address, epoch, rank = options.world.rank, run = %options.run.display(), "serving");
+        let rank = options.world.rank;
+        // Only rank 0 has the run.
+        let run = (rank == 0).then(|| options.run.display()).map(tracing::field::display);
+        tracing::info!(%address, epoch, rank, run, "serving");
         Ok(())
     }
 }

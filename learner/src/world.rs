@@ -6,12 +6,14 @@
 //! divided by the number of steps of all ranks. The shares of all ranks, and so their gradients, add up to the whole. In a gradient
 //! step this passes between ranks:
 //!
-//! - The numbers of valid steps are summed, because means divide by them.
-//! - The advantages are gathered. V-MPO's best half, its softmax and its temperature are of the whole batch, so each rank computes
-//!   them from all advantages, and then takes the weights of its own steps.
-//! - The mean returns are summed, for the variance that the report explains.
+//! - Three numbers of each step are gathered: its advantage, its return, and its task, which also says whether it is valid. Means
+//!   divide by the number of valid steps. V-MPO's best half, its softmax and its temperature are of the whole batch, so each rank
+//!   computes them from all advantages, and then takes the weights of its own steps. The returns are for the variance that the
+//!   report explains.
 //! - The gradients are summed, with the losses for the report, before their norm is limited and Adam steps. Each rank takes the
 //!   same step from the same sum, so parameters stay equal, bit for bit.
+//!
+//! These are two operations, because each costs the time to reach the slowest rank.
 //!
 //! Besides, the sums behind the normaliser's statistics are summed. Before each batch the ranks say what they have
 //! ([`World::exchange`]), and all decide the same. Rank 0 gets the others' metrics and accounts, and sends its checkpoint at the start.
@@ -34,7 +36,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tch::{Device, Tensor};
 
-/// How long ranks wait for each other at the start and at the end. A cluster may start them minutes apart, and one may read many clips.
+/// How long ranks wait until all have met, and then for each other at the start and at the end. A cluster may start them minutes apart,
+/// and one may read many clips.
 pub const MEETING: Duration = Duration::from_secs(600);
 /// How long they wait for each other in between, for a rank that is connected and silent. It is longer than an update takes.
 pub const SILENCE: Duration = Duration::from_secs(120);
@@ -68,6 +71,16 @@ pub enum Error {
         rendezvous: String,
         /// Why the last attempt failed.
         source: std::io::Error,
+    },
+    /// Rank 0 was started with another world size.
+    #[error("rank 0 has --world-size {of_first}, and rank {rank} {size}: give all ranks the same")]
+    Sizes {
+        /// This rank.
+        rank: usize,
+        /// Its world size.
+        size: usize,
+        /// That of rank 0.
+        of_first: i32,
     },
     /// A rank ended, or does not answer.
     #[error(
@@ -122,16 +135,27 @@ impl World {
     /// Meets the other ranks at the address where rank 0 listens, on this `listener`. Blocks until all are there.
     ///
     /// # Errors
-    /// [`Error::Meeting`] after ten minutes.
-    pub fn meet(rank: usize, size: usize, address: SocketAddr, listener: Option<TcpListener>) -> Result<Self> {
+    /// [`Error::Meeting`] after this `patience`; [`Error::Sizes`].
+    pub fn meet(
+        rank: usize,
+        size: usize,
+        address: SocketAddr,
+        listener: Option<TcpListener>,
+        patience: Duration,
+    ) -> Result<Self> {
         if size <= 1 {
             return Ok(Self::alone());
         }
         let failed = |reason: String| Error::Meeting { rank, size, address, reason };
         let own = address_towards(address).map_err(|error| failed(error.to_string()))?;
-        let meeting = c10d::Meeting { rank, size, address, listener, own, patience: MEETING };
-        let group = c10d::Group::meet(meeting).map_err(failed)?;
-        Ok(Self { rank, size, group: Some(Arc::new(Mutex::new(group))) })
+        let meeting = c10d::Meeting { rank, size, address, listener, own, patience };
+        let group = c10d::Group::meet(meeting).map_err(|reason| match reason {
+            c10d::NotMet::OtherSize(of_first) => Error::Sizes { rank, size, of_first },
+            c10d::NotMet::Failed(reason) => failed(reason),
+        })?;
+        let world = Self { rank, size, group: Some(Arc::new(Mutex::new(group))) };
+        world.wait_for(MEETING);
+        Ok(world)
     }
 
     /// This rank.
@@ -149,6 +173,11 @@ impl World {
         self.rank == 0
     }
 
+    /// How often this rank has spoken with the others: each time costs the time to reach the slowest of them.
+    pub fn operations(&self) -> u64 {
+        self.group.as_ref().map_or(0, |group| group.lock().operations())
+    }
+
     /// From now on an operation waits so long for the other ranks. At first it is [`MEETING`].
     pub fn wait_for(&self, patience: Duration) {
         if let Some(group) = &self.group {
@@ -156,43 +185,33 @@ impl World {
         }
     }
 
-    /// The sum of a tensor over all ranks, without gradient. It has the same shape on all of them.
+    /// Replaces each tensor by its sum over all ranks, without gradient. They have the same shapes on all ranks, one device, and one
+    /// element type.
     ///
     /// # Errors
     /// [`Error::Lost`].
-    pub fn sum(&self, tensor: &Tensor) -> Result<Tensor> {
-        let Some(group) = &self.group else { return Ok(tensor.detach()) };
-        // The operation writes over its operand.
-        let sum = tensor.detach().to_device(Device::Cpu).copy();
-        group.lock().sum(&sum).map_err(|reason| self.lost(reason))?;
-        Ok(sum.to_device(tensor.device()))
-    }
-
-    /// Replaces each tensor by its sum over all ranks. All are on one device, and have one element type.
-    ///
-    /// # Errors
-    /// [`Error::Lost`].
-    pub fn sum_all<'a>(&self, tensors: impl IntoIterator<Item = &'a mut Tensor>) -> Result<()> {
-        if self.group.is_none() {
-            return Ok(());
-        }
+    pub fn sum<'a>(&self, tensors: impl IntoIterator<Item = &'a mut Tensor>) -> Result<()> {
+        let Some(group) = &self.group else { return Ok(()) };
         // One operation, because each costs the time to reach the slowest rank.
         let tensors: Vec<&mut Tensor> = tensors.into_iter().collect();
         let flat: Vec<Tensor> = tensors.iter().map(|tensor| tensor.detach().reshape([-1])).collect();
         let lengths: Vec<i64> = flat.iter().map(|tensor| tensor.size()[0]).collect();
-        let sums = self.sum(&Tensor::f_cat(&flat, 0)?)?.f_split_with_sizes(lengths.as_slice(), 0)?;
+        let flat = Tensor::f_cat(&flat, 0)?;
+        let sum = flat.to_device(Device::Cpu);
+        group.lock().sum(&sum).map_err(|reason| self.lost(reason))?;
+        let sums = sum.to_device(flat.device()).f_split_with_sizes(lengths.as_slice(), 0)?;
         for (tensor, sum) in tensors.into_iter().zip(sums) {
             *tensor = sum.f_view(tensor.size().as_slice())?;
         }
         Ok(())
     }
 
-    /// The tensors of all ranks in the order of the ranks, joined along dimension 0. They have the same shape, and no gradient.
+    /// The tensors of all ranks in the order of the ranks, joined along dimension 0. They have the same shape. No gradient flows back.
     ///
     /// # Errors
     /// [`Error::Lost`].
     pub fn gather(&self, tensor: &Tensor) -> Result<Tensor> {
-        let Some(group) = &self.group else { return Ok(tensor.shallow_clone()) };
+        let Some(group) = &self.group else { return Ok(tensor.detach()) };
         let own = tensor.detach().to_device(Device::Cpu).contiguous();
         let mut size = own.size();
         if let Some(first) = size.first_mut() {

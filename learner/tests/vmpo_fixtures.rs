@@ -60,7 +60,7 @@ fn losses_and_gradients_equal_rlax() {
             groups: &groups,
             world: &World::alone(),
         };
-        let improvement = policy_improvement(&evidence, &multipliers, &limits).unwrap();
+        let improvement = policy_improvement(&evidence, &multipliers, &limits);
         fixture.compare("policy_loss", &improvement.policy);
         // η ln(mean of exp(A / η)), and its derivative, which is the difference of this and of the mean of A / η.
         let largest = advantage.abs().max().double_value(&[]);

@@ -64,7 +64,7 @@ impl Case {
             groups: &[self.valid.ones_like().to_kind(Kind::Bool)],
             world: &World::alone(),
         };
-        policy_improvement(&evidence, &self.multipliers, limits).unwrap()
+        policy_improvement(&evidence, &self.multipliers, limits)
     }
 
     fn gradient(&self, loss: &Tensor, input: &Tensor) -> Vec<f32> {
@@ -227,7 +227,7 @@ fn each_group_has_its_own_e_step_and_its_losses_are_weighted_by_its_steps() {
             world: &World::alone(),
         };
         let multipliers = Multipliers::new(temperatures, &[2.0, 3.0], Device::Cpu);
-        let losses = policy_improvement(&evidence, &multipliers, &LIMITS).unwrap();
+        let losses = policy_improvement(&evidence, &multipliers, &LIMITS);
         let eta = Tensor::run_backward(&[&losses.temperature], &[multipliers.parameter()], true, false).remove(0);
         (number(&losses.policy), number(&losses.temperature), values(&eta))
     };

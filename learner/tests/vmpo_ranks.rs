@@ -6,6 +6,7 @@ mod vmpo_support;
 
 use std::net::{SocketAddr, TcpListener};
 use std::thread;
+use std::time::Duration;
 
 use comic_experiment::{Experiment, Prior, TaskSpec};
 use comic_learner::algorithm::Algorithm as _;
@@ -16,6 +17,10 @@ use comic_learner::world::{self, World};
 use tch::{Kind, Tensor};
 use vmpo_support::{Numbers, Unrolls, difference, every_low_level, experiment, joint_spec, learner_of, spec, state};
 
+const PATIENCE: Duration = Duration::from_secs(60);
+/// How the names of Adam's first moments begin.
+const FIRST_MOMENT: &str = "adam.first.";
+
 /// Runs every rank of a world in a thread of its own, and returns what each computes.
 fn in_world<R: Send + 'static>(size: usize, rank: impl Fn(World) -> R + Clone + Send + 'static) -> Vec<R> {
     let listener = TcpListener::bind((std::net::Ipv4Addr::LOCALHOST, 0)).unwrap();
@@ -23,7 +28,7 @@ fn in_world<R: Send + 'static>(size: usize, rank: impl Fn(World) -> R + Clone + 
     let mut listener = Some(listener);
     let meet = |index: usize| {
         let (listener, rank) = (listener.take(), rank.clone());
-        thread::spawn(move || rank(World::meet(index, size, address, listener).unwrap()))
+        thread::spawn(move || rank(World::meet(index, size, address, listener, PATIENCE).unwrap()))
     };
     let ranks: Vec<_> = (0..size).map(meet).collect();
     ranks.into_iter().map(|rank| rank.join().unwrap()).collect()
@@ -94,14 +99,47 @@ fn everything(mut experiment: Experiment) -> Experiment {
     experiment
 }
 
+/// Every low level, every term of the loss, and joint training with one η for all tasks.
+fn every_kind() -> Vec<(&'static str, TaskSpec, Experiment)> {
+    let low_levels = every_low_level().into_iter().map(|experiment| ("a low level", spec(), experiment));
+    let mut joint = everything(experiment());
+    // Joint training has no recurrent value function.
+    joint.network.value_lstm.clear();
+    joint.vmpo.value_burn_in = 0;
+    joint.vmpo.temperature_per_task = false;
+    low_levels.chain([("every term", spec(), everything(experiment())), ("joint", joint_spec(), joint)]).collect()
+}
+
+#[test]
+fn the_gradient_of_two_learners_with_64_unrolls_is_that_of_one_with_128() {
+    for (kind, spec, experiment) in every_kind() {
+        let batch = [Unrolls::recorded(&experiment, &spec, 1, 128)];
+        let (alone, _) = trained(&spec, &experiment, &World::alone(), &batch);
+        let ranks = in_world(2, {
+            let (spec, experiment) = (spec.clone(), experiment.clone());
+            move |world| trained(&spec, &experiment, &world, &batch).0
+        });
+        let mut compared = 0;
+        for ((name, expected), (_, found)) in state(&alone).iter().zip(state(&ranks[1])) {
+            // After one step Adam's first moment is the gradient, times a number.
+            if name.starts_with(FIRST_MOMENT) {
+                let square = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>();
+                let apart = square(&mut expected.iter().zip(&found).map(|(expected, found)| expected - found));
+                let size = square(&mut expected.iter().copied());
+                assert!(apart.sqrt() <= 1e-5 * size.sqrt(), "{kind}: {name}: {apart:e} of {size:e}");
+                compared += usize::from(size > 0.0);
+            }
+        }
+        assert!(compared > 10, "{kind}: {compared} tensors have a gradient");
+    }
+}
+
 #[test]
 fn a_gradient_step_of_two_ranks_is_that_of_one_learner() {
-    for experiment in every_low_level() {
-        let (state, losses) = compare(&spec(), &experiment, 2, 1);
-        assert!(state < 1e-5 && losses < 1e-5, "{}: {state:e}, {losses:e}", experiment.network.low_level);
+    for (kind, spec, experiment) in every_kind() {
+        let (state, losses) = compare(&spec, &experiment, 2, 1);
+        assert!(state < 1e-5 && losses < 1e-5, "{kind}: {}: {state:e}, {losses:e}", experiment.network.low_level);
     }
-    let (state, losses) = compare(&spec(), &everything(experiment()), 2, 1);
-    assert!(state < 1e-5 && losses < 1e-5, "{state:e}, {losses:e}");
 }
 
 #[test]
@@ -120,9 +158,21 @@ fn each_task_has_its_own_best_half_of_all_ranks() {
 #[test]
 fn thirty_updates_of_two_and_of_three_ranks_are_those_of_one_learner() {
     for size in [2, 3] {
-        let (state, losses) = compare(&spec(), &everything(experiment()), size, 30);
-        assert!(state < 1e-5 && losses < 1e-5, "{size} ranks: {state:e}, {losses:e}");
+        for (kind, spec, experiment) in every_kind() {
+            let (state, losses) = compare(&spec, &experiment, size, 30);
+            assert!(state < 1e-5 && losses < 1e-5, "{size} ranks: {kind}: {state:e}, {losses:e}");
+        }
     }
+}
+
+#[test]
+fn a_gradient_step_speaks_with_the_other_ranks_twice() {
+    let batches = batches(&experiment(), &spec(), 3);
+    let operations = in_world(2, move |world| {
+        trained(&spec(), &experiment(), &world, &batches);
+        world.operations()
+    });
+    assert_eq!(operations, [6, 6]);
 }
 
 #[test]
@@ -180,23 +230,36 @@ fn what_ranks_say_and_send_arrives_in_their_order() {
     let ranks = in_world(3, |world| {
         let said = world.exchange((world.rank(), "x".repeat(world.rank() * 1000))).unwrap();
         let sent = world.broadcast(vec![7 + world.rank() as u8; 5000]).unwrap();
-        let sum = world.sum(&Tensor::from_slice(&[1i64 << world.rank(), -1])).unwrap();
+        let mut sums = [Tensor::from_slice(&[1i64 << world.rank(), -1]), Tensor::from(2i64)];
+        world.sum(&mut sums).unwrap();
         let own = Tensor::from_slice(&[world.rank() as f32; 2]).reshape([2, 1]);
         let all = world.gather(&own).unwrap();
         assert_eq!(world.own_part(&all), own);
         (
             said,
             sent,
-            Vec::<i64>::try_from(sum).unwrap(),
+            sums.map(|sum| (sum.size(), Vec::<i64>::try_from(sum.reshape([-1])).unwrap())),
             Vec::<f32>::try_from(all.to_kind(Kind::Float).reshape([-1])).unwrap(),
         )
     });
-    for (said, sent, sum, all) in ranks {
+    for (said, sent, sums, all) in ranks {
         assert_eq!(
             said.iter().map(|(rank, text)| (*rank, text.len())).collect::<Vec<_>>(),
             [(0, 0), (1, 1000), (2, 2000)]
         );
         assert!(sent.iter().all(|byte| *byte == 7), "not that of rank 0");
-        assert_eq!((sum, all), (vec![7, -3], vec![0.0, 0.0, 1.0, 1.0, 2.0, 2.0]));
+        assert_eq!(sums, [(vec![2], vec![7, -3]), (vec![], vec![6])]);
+        assert_eq!(all, [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]);
     }
+}
+
+#[test]
+fn ranks_with_other_world_sizes_are_told_so_at_once() {
+    let listener = TcpListener::bind((std::net::Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address = listener.local_addr().unwrap();
+    // It waits for a second rank that does not come.
+    let first = thread::spawn(move || World::meet(0, 2, address, Some(listener), Duration::from_secs(5)).map(|_| ()));
+    let refused = World::meet(1, 3, address, None, PATIENCE).map(|_| ()).unwrap_err();
+    assert!(matches!(refused, world::Error::Sizes { size: 3, of_first: 2, .. }), "{refused}");
+    assert!(matches!(first.join().unwrap(), Err(world::Error::Meeting { rank: 0, .. })));
 }

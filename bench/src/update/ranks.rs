@@ -6,7 +6,7 @@ use std::process::{Child, Command};
 use anyhow::{Context as _, Result, ensure};
 use clap::Args;
 use comic_learner::device::Backend;
-use comic_learner::world::World;
+use comic_learner::world::{MEETING, World};
 use serde_json::json;
 
 use super::{Networks, WARM_UP};
@@ -45,12 +45,12 @@ impl Ranks {
     pub fn run(&self) -> Result<()> {
         ensure!(self.ranks > 1, "--ranks {}: there must be several", self.ranks);
         if let (Some(rank), Some(rendezvous)) = (self.rank, self.rendezvous) {
-            return self.measure(World::meet(rank, self.ranks, rendezvous, None)?);
+            return self.measure(World::meet(rank, self.ranks, rendezvous, None, MEETING)?);
         }
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).context("no free port")?;
         let address = listener.local_addr()?;
         let mut others = (1..self.ranks).map(|rank| self.start(rank, address)).collect::<Result<Vec<_>>>()?;
-        let measured = World::meet(0, self.ranks, address, Some(listener)).map_err(Into::into);
+        let measured = World::meet(0, self.ranks, address, Some(listener), MEETING).map_err(Into::into);
         let measured = measured.and_then(|world| self.measure(world));
         for other in &mut others {
             other.wait()?;

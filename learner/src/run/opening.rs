@@ -10,8 +10,9 @@ use crate::checkpoint::Snapshot;
 use crate::error::{Error, Result};
 use crate::world::World;
 
-/// Most bytes of a part of a checkpoint.
+/// Most bytes of a checkpoint, and most parts.
 const LONGEST: usize = 16 << 30;
+const MOST_PARTS: usize = 64;
 
 /// A learner epoch that has begun.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
@@ -70,8 +71,11 @@ pub(super) fn share_checkpoint(
     let Some((path, sizes)) = said.into_iter().next().flatten() else { return Ok(None) };
     let mut own = newest.map(|(_, snapshot)| snapshot.parts).unwrap_or_default();
     let mut shared = Snapshot::default();
-    if let Some((name, size)) = sizes.iter().find(|(_, size)| *size > LONGEST) {
-        return Err(Error::Checkpoint(format!("{name} of rank 0's checkpoint has {size} bytes, more than {LONGEST}")));
+    let whole = sizes.iter().fold(0usize, |sum, (_, size)| sum.saturating_add(*size));
+    if whole > LONGEST || sizes.len() > MOST_PARTS {
+        let parts = sizes.len();
+        let allowed = format!("{LONGEST} bytes in {MOST_PARTS} parts are allowed");
+        return Err(Error::Checkpoint(format!("rank 0's checkpoint has {whole} bytes in {parts} parts; {allowed}")));
     }
     for (name, size) in sizes {
         let part = own.remove(&name).unwrap_or_else(|| vec![0; size]);

@@ -47,7 +47,7 @@ impl ObservationStatistics {
     pub fn absorb(&mut self, batch: &Batch, world: &World) -> Result<()> {
         let mut added = self.emptied();
         added.count(batch);
-        world.sum_all(added.sums())?;
+        world.sum(added.sums())?;
         for (sum, added) in self.sums().zip(added.sums()) {
             *sum += &*added;
         }

@@ -5,14 +5,14 @@ use tch::{Kind, Tensor};
 
 use crate::algorithm::masked_mean::ValidSteps;
 use crate::vmpo::multipliers::Multipliers;
-use crate::world::{Result, World};
+use crate::world::World;
 
-/// The inputs of the losses: one number a step, every tensor of the same shape.
+/// The inputs of the losses: one number a step. Those of all ranks are in the order of the ranks; the others have the same shape.
 #[derive(Debug)]
 pub struct Evidence<'a> {
     /// ln π(a|s), of the unclipped action, under the current parameters.
     pub log_prob: &'a Tensor,
-    /// A, without gradient.
+    /// A of the steps of all ranks; no gradient flows back into it.
     pub advantage: &'a Tensor,
     /// KL_μ to the behaviour policy, summed over dimensions.
     pub kl_mean: &'a Tensor,
@@ -24,7 +24,7 @@ pub struct Evidence<'a> {
     pub kl: Option<&'a Tensor>,
     /// The steps that are transitions; another step has no influence, whatever its numbers are.
     pub valid: &'a ValidSteps,
-    /// The steps that each E-step ranks, booleans: one group for each η, and no step is in two groups.
+    /// Which steps of all ranks each E-step ranks, booleans: one group for each η, and no step is in two groups.
     pub groups: &'a [Tensor],
     /// The ranks whose steps all this is about.
     pub world: &'a World,
@@ -99,12 +99,9 @@ impl Improvement {
 ///
 /// Each group has its own D̃ and η. L_π and L_η are the means over the groups, weighted by each group's fraction of the
 /// valid steps (D). So a step counts the same whatever its group, and a group without a step has no influence.
-///
-/// # Errors
-/// When another rank is lost.
-pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits: &KlLimits) -> Result<Improvement> {
+pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits: &KlLimits) -> Improvement {
     let valid = evidence.valid;
-    let (mut policy, temperature) = expectation_steps(evidence, multipliers, limits)?;
+    let (mut policy, temperature) = expectation_steps(evidence, multipliers, limits);
     if let Some(kl) = evidence.kl {
         policy = &policy + valid.mean(&(evidence.log_prob + kl)) * limits.control_variate;
     }
@@ -121,22 +118,22 @@ pub fn policy_improvement(evidence: &Evidence, multipliers: &Multipliers, limits
         (Some(kl), Some(multiplier)) => gaussian + constraint(kl, &multiplier, limits.epsilon_discrete),
         _ => gaussian,
     };
-    Ok(Improvement {
+    Improvement {
         policy,
         temperature,
         alpha,
         kl_mean: kl_mean.detach(),
         kl_std: kl_std.detach(),
         kl_weights: kl_weights.map(|kl| kl.detach()),
-    })
+    }
 }
 
-fn expectation_steps(evidence: &Evidence, multipliers: &Multipliers, limits: &KlLimits) -> Result<(Tensor, Tensor)> {
+fn expectation_steps(evidence: &Evidence, multipliers: &Multipliers, limits: &KlLimits) -> (Tensor, Tensor) {
     let (world, valid) = (evidence.world, evidence.valid);
-    let advantage = world.gather(evidence.advantage)?.detach();
+    let advantage = evidence.advantage.detach();
     let (mut policies, mut temperatures) = (Vec::new(), Vec::new());
     for (group, eta) in evidence.groups.iter().zip(multipliers.temperatures().unbind(0)) {
-        let mask = world.gather(&valid.mask().logical_and(group))?;
+        let mask = valid.all().logical_and(group);
         let fraction = mask.sum(Kind::Float) / valid.count();
         let step = expectation_step(&advantage, &mask, &eta, limits);
         let [weights, selected] = [&step.weights, &step.selected].map(|all| world.own_part(all));
@@ -146,7 +143,7 @@ fn expectation_steps(evidence: &Evidence, multipliers: &Multipliers, limits: &Kl
         temperatures.push(step.temperature * fraction / world.size() as f64);
     }
     let sum = |terms: &[Tensor]| Tensor::stack(terms, 0).sum(Kind::Float);
-    Ok((sum(&policies), sum(&temperatures)))
+    (sum(&policies), sum(&temperatures))
 }
 
 /// The E-step of one group, over the steps of all ranks.

@@ -140,7 +140,13 @@ impl VmpoLearner {
         let targets = returns(reward, discount, valid, &values, vmpo.discount, vmpo.lambda);
         let (targets, values) = (rows(&targets), rows(&values.narrow(1, 0, length)));
         let valid_share = valid.mean(Kind::Float);
-        let valid = ValidSteps::new(&self.learnt_from(valid).reshape([-1]), &self.world)?;
+        let learnt = self.learnt_from(valid).reshape([-1]).gt(0.5);
+        let summed = |terms: &Tensor| terms.detach().sum_dim_intlist(-1i64, false, Kind::Float);
+        let own = [summed(&(&targets - &values)), summed(&targets), self.group_of_rows(minibatch, &learnt)];
+        // One operation, because each costs the time to reach the slowest rank.
+        let of_all = self.world.gather(&Tensor::stack(&own, 1))?;
+        let [advantage, returns, group] = [0, 1, 2].map(|column| of_all.select(1, column));
+        let valid = ValidSteps::of_ranks(learnt, group.ge(0.0));
         let errors = (&values - &targets).square().sum_dim_intlist(-1i64, false, Kind::Float) * 0.5;
         let latent_kl = match (&acting.latent_posterior, &acting.latent_prior, &network.latent.prior) {
             (None, _, _) => errors.zeros_like(),
@@ -154,35 +160,34 @@ impl VmpoLearner {
             [Field::Mean, Field::Std, Field::LogWeights].map(|field| rows(&minibatch[field]));
         Ok(Pass {
             behaviour: ActionDistribution::from_rows(&mean, &std, &log_weights),
-            groups: self.groups(minibatch, &valid),
+            group,
             value_loss: valid.mean(&errors),
             latent_kl: valid.mean(&latent_kl),
             acting,
-            values,
-            targets,
+            advantage,
+            returns,
             valid,
             valid_share,
         })
     }
 
-    /// The steps of each task, if each task has an E-step of its own; otherwise all steps.
-    fn groups(&self, minibatch: &MinibatchTensors, valid: &ValidSteps) -> Vec<Tensor> {
-        match minibatch.routing().tasks() {
+    /// The E-step that ranks each of this rank's steps: the number of its task, if each task has one of its own, and else 0. −1 for a
+    /// step that is not `learnt` from.
+    fn group_of_rows(&self, minibatch: &MinibatchTensors, learnt: &Tensor) -> Tensor {
+        let group = match minibatch.routing().tasks() {
             Some(tasks) if self.experiment.vmpo.temperature_per_task => {
                 let length = minibatch.shape().unroll.length as i64;
-                let of_rows = tasks.unsqueeze(1).expand([-1, length], false).reshape([-1]);
-                (0..self.spec.tasks.len() as i64).map(|task| of_rows.eq(task)).collect()
+                tasks.unsqueeze(1).expand([-1, length], false).reshape([-1]).to_kind(Kind::Float)
             }
-            _ => vec![valid.mask().ones_like()],
-        }
+            _ => learnt.zeros_like().to_kind(Kind::Float),
+        };
+        group.where_scalarother(learnt, -1.0)
     }
 
-    /// η of each row: that of its task. The groups are those of [`groups`](Self::groups).
-    fn temperature_of_rows(&self, groups: &[Tensor]) -> Tensor {
-        let temperatures = self.multipliers.temperatures().detach();
-        let of_group =
-            |(index, group): (usize, &Tensor)| group.to_kind(Kind::Float) * temperatures.select(0, index as i64);
-        groups.iter().enumerate().map(of_group).sum()
+    /// η of each of this rank's rows. A row that is not learnt from has one, too, so that it can be divided by.
+    fn temperature_of_rows(&self, group: &Tensor) -> Tensor {
+        let index = self.world.own_part(group).clamp_min(0.0).to_kind(Kind::Int64);
+        self.multipliers.temperatures().detach().index_select(0, &index)
     }
 
     /// `valid` without the rows that only warm up a recurrent value function.
@@ -214,30 +219,31 @@ impl Algorithm for VmpoLearner {
     fn step(&mut self, minibatch: &MinibatchTensors) -> Result<Losses, Error> {
         minibatch.check(&self.spec, &self.experiment)?;
         let pass = self.forward(minibatch)?;
-        let advantage = (&pass.targets - pass.values.detach()).sum_dim_intlist(-1i64, false, Kind::Float);
         let policy = &pass.acting.action;
         let kl_weights = policy.kl_weights(&pass.behaviour);
         let Experiment { network, vmpo, .. } = &self.experiment;
         let kl = if vmpo.control_variate == 0.0 { None } else { policy.kl_from(&pass.behaviour) };
+        let temperatures = self.multipliers.temperatures().size()[0];
+        let groups: Vec<Tensor> = (0..temperatures).map(|index| pass.group.eq(index)).collect();
         let evidence = Evidence {
             kl: kl.as_ref(),
             log_prob: &policy.log_prob(&rows(&minibatch[Field::Action])),
-            advantage: &advantage,
+            advantage: &pass.advantage,
             kl_mean: &policy.kl_mean(&pass.behaviour),
             kl_std: &policy.kl_std(&pass.behaviour),
             kl_weights: kl_weights.as_ref(),
             valid: &pass.valid,
-            groups: &pass.groups,
+            groups: &groups,
             world: &self.world,
         };
-        let improvement = policy_improvement(&evidence, &self.multipliers, &KlLimits::from(vmpo))?;
+        let improvement = policy_improvement(&evidence, &self.multipliers, &KlLimits::from(vmpo));
         let mut total =
             improvement.total() + &pass.value_loss * vmpo.value_weight + &pass.latent_kl * network.latent.beta;
         if vmpo.action_gradient != 0.0 {
             let derivative = rows(&minibatch[Field::ActionGradient]);
             let gain = (derivative * policy.mean()).sum_dim_intlist(-1i64, false, Kind::Float);
             // Divided by η, as the advantages are: L_π is about the reward divided by η.
-            let gain = gain / self.temperature_of_rows(&pass.groups);
+            let gain = gain / self.temperature_of_rows(&pass.group);
             total = &total - pass.valid.mean(&gain) * vmpo.action_gradient;
         }
         if vmpo.entropy != 0.0 {
@@ -248,8 +254,8 @@ impl Algorithm for VmpoLearner {
         let networks = self.adam.parameters(self.networks_group);
         let inputs: Vec<&Tensor> = networks.iter().chain([self.multipliers.parameter()]).collect();
         let mut gradients = gradients_of(&total, &inputs)?;
-        let mut losses = report::shares(&pass, &total, &improvement, &self.world)?;
-        self.world.sum_all(gradients.iter_mut().chain([&mut losses]))?;
+        let mut losses = report::shares(&pass, &total, &improvement, &self.world);
+        self.world.sum(gradients.iter_mut().chain([&mut losses]))?;
         let multipliers = gradients.split_off(networks.len());
         let descent = self.descend(&report::total(&losses), gradients, multipliers)?;
         Ok(report::report(&losses, &descent, &self.multipliers))

@@ -7,21 +7,21 @@ use crate::algorithm::loss_report::Losses;
 use crate::algorithm::masked_mean::ValidSteps;
 use crate::vmpo::improvement::Improvement;
 use crate::vmpo::multipliers::Multipliers;
-use crate::world::{Result, World};
+use crate::world::World;
 
-/// One forward pass over a minibatch; N = B·T rows.
+/// One forward pass over a minibatch; N = B·T rows of this rank, M of all ranks.
 pub(super) struct Pass {
     pub(super) acting: Acting,
     /// As stored, over N rows.
     pub(super) behaviour: ActionDistribution,
-    /// V(s_t), `[N, R]`, with gradient.
-    pub(super) values: Tensor,
-    /// G_t, `[N, R]`.
-    pub(super) targets: Tensor,
-    /// The steps that are learnt from, `[N]`.
+    /// The steps that are learnt from, `[N]` and `[M]`.
     pub(super) valid: ValidSteps,
-    /// The steps that each E-step ranks, `[N]` booleans; together all of them.
-    pub(super) groups: Vec<Tensor>,
+    /// G − V summed over the reward terms, `[M]`, without gradient.
+    pub(super) advantage: Tensor,
+    /// G summed over the reward terms, `[M]`.
+    pub(super) returns: Tensor,
+    /// The E-step that ranks each step, `[M]`; −1 where a step is not learnt from.
+    pub(super) group: Tensor,
     /// Fraction of the rows that are transitions.
     pub(super) valid_share: Tensor,
     /// ½ mean (V − G)², summed over the reward terms.
@@ -39,13 +39,12 @@ pub(super) struct Descent {
 }
 
 /// This rank's shares of the numbers of a report. Those of all ranks add up to the whole.
-///
-/// # Errors
-/// When another rank is lost.
-pub(super) fn shares(pass: &Pass, total: &Tensor, improvement: &Improvement, world: &World) -> Result<Tensor> {
+pub(super) fn shares(pass: &Pass, total: &Tensor, improvement: &Improvement, world: &World) -> Tensor {
     let zero = pass.value_loss.zeros_like();
     let std = pass.acting.action.std().mean_dim(-1i64, false, Kind::Float);
-    let [unexplained, variance] = variances(pass, world)?;
+    // Every rank has computed the whole of them.
+    let [unexplained, variance] =
+        [&pass.advantage, &pass.returns].map(|of_all| variance(&pass.valid, of_all) / world.size() as f64);
     let shares: [&Tensor; SHARES] = [
         total,
         &improvement.policy,
@@ -61,7 +60,7 @@ pub(super) fn shares(pass: &Pass, total: &Tensor, improvement: &Improvement, wor
         &unexplained,
         &variance,
     ];
-    Ok(Tensor::stack(&shares.map(|share| share.detach().reshape([])), 0))
+    Tensor::stack(&shares.map(|share| share.detach().reshape([])), 0)
 }
 
 /// Numbers in [`shares`].
@@ -117,11 +116,7 @@ pub(super) fn report(sums: &Tensor, descent: &Descent, multipliers: &Multipliers
     })
 }
 
-/// The shares of Var(G − V) and Var(G) over the valid steps, of the return summed over its terms.
-fn variances(pass: &Pass, world: &World) -> Result<[Tensor; 2]> {
-    let totals = [&pass.targets - &pass.values, pass.targets.shallow_clone()]
-        .map(|terms| terms.detach().sum_dim_intlist(-1i64, false, Kind::Float));
-    let means = world.sum(&Tensor::stack(&totals.each_ref().map(|total| pass.valid.mean(total)), 0))?;
-    let variance = |index: usize| pass.valid.mean(&(&totals[index] - means.select(0, index as i64)).square());
-    Ok([variance(0), variance(1)])
+/// The variance over the valid steps of all ranks.
+fn variance(valid: &ValidSteps, of_all: &Tensor) -> Tensor {
+    valid.mean_of_all(&(of_all - valid.mean_of_all(of_all)).square())
 }

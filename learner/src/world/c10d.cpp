@@ -38,9 +38,10 @@ bool attempt(char* message, size_t room, Call call) {
 }  // namespace
 
 // Meets the other ranks at `host` and `port`. Rank 0 listens there, on the socket `listener`, which this takes over; other ranks give a
-// negative number. `address` is an address of this machine, on which its connections to the other ranks begin and end.
+// negative number. `address` is an address of this machine, on which its connections to the other ranks begin and end. If rank 0 has
+// another size, that is in `size_of_first`, and there is no group: ranks would wait for one that never comes.
 extern "C" Group* comic_world_meet(const char* host, uint16_t port, int listener, const char* address, int rank,
-                                   int size, int64_t patience_ms, char* message, size_t room) {
+                                   int size, int64_t patience_ms, int* size_of_first, char* message, size_t room) {
   Group* group = nullptr;
   attempt(message, room, [&] {
     // gloo reports its connections on the standard output, where the learner's own line belongs. No other C++ writes there.
@@ -50,10 +51,14 @@ extern "C" Group* comic_world_meet(const char* host, uint16_t port, int listener
     c10d::TCPStoreOptions meet;
     meet.port = port;
     meet.isServer = rank == 0;
-    meet.numWorkers = size;
+    // gloo waits for all ranks below.
+    meet.waitWorkers = false;
     meet.timeout = patience;
     if (listener >= 0) meet.masterListenFd = listener;
-    const auto store = c10::make_intrusive<c10d::TCPStore>(host, meet);
+    const c10::intrusive_ptr<c10d::Store> store = c10::make_intrusive<c10d::TCPStore>(host, meet);
+    if (rank == 0) store->set("size", std::to_string(size));
+    *size_of_first = std::stoi(store->get_to_str("size"));
+    if (*size_of_first != size) return;
     const auto options = Group::Options::create(patience);
     options->devices.push_back(Group::createDeviceForHostname(address));
     options->threads = 1;

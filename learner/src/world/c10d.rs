@@ -19,6 +19,7 @@ unsafe extern "C" {
         rank: i32,
         size: i32,
         patience: i64,
+        size_of_first: *mut i32,
         message: *mut c_char,
         room: usize,
     ) -> *mut c_void;
@@ -49,22 +50,41 @@ pub(super) struct Meeting {
     pub(super) patience: Duration,
 }
 
+/// Why ranks did not meet.
+pub(super) enum NotMet {
+    /// Rank 0 has this world size.
+    OtherSize(i32),
+    /// What c10d says.
+    Failed(String),
+}
+
+impl From<String> for NotMet {
+    fn from(reason: String) -> Self {
+        Self::Failed(reason)
+    }
+}
+
 /// The connections to all other ranks.
 #[derive(Debug)]
-pub(super) struct Group(NonNull<c_void>);
+pub(super) struct Group {
+    group: NonNull<c_void>,
+    /// Operations so far.
+    operations: u64,
+}
 
 // SAFETY: the process group belongs to no thread. Its functions need `&mut self`, so they are called one after the other.
 unsafe impl Send for Group {}
 
 impl Group {
     /// # Errors
-    /// What c10d says.
-    pub(super) fn meet(meeting: Meeting) -> Result<Self, String> {
+    /// Another size of rank 0; what c10d says.
+    pub(super) fn meet(meeting: Meeting) -> Result<Self, NotMet> {
         let text = |address: IpAddr| CString::new(address.to_string()).map_err(|error| error.to_string());
         let (host, own) = (text(meeting.address.ip())?, text(meeting.own)?);
         let [rank, size] = [meeting.rank, meeting.size].map(i32::try_from);
         let (rank, size) = (rank.map_err(|error| error.to_string())?, size.map_err(|error| error.to_string())?);
         let listener = meeting.listener.map_or(-1, IntoRawFd::into_raw_fd);
+        let mut size_of_first = size;
         let mut reason = Reason::default();
         // SAFETY: the texts end with 0 and live until the function returns. c10d owns the socket from now on. Every C++ exception is
         // caught.
@@ -77,17 +97,35 @@ impl Group {
                 rank,
                 size,
                 milliseconds(meeting.patience),
+                &raw mut size_of_first,
                 reason.room(),
                 REASON,
             )
         };
-        NonNull::new(group).map(Self).ok_or_else(|| reason.text())
+        NonNull::new(group).map(|group| Self { group, operations: 0 }).ok_or_else(|| match size_of_first == size {
+            true => NotMet::Failed(reason.text()),
+            false => NotMet::OtherSize(size_of_first),
+        })
     }
 
     /// From now on an operation waits so long for the other ranks.
     pub(super) fn wait_for(&mut self, patience: Duration) {
         // SAFETY: the group lives. The function only stores a number.
-        unsafe { comic_world_wait_for(self.0.as_ptr(), milliseconds(patience)) }
+        unsafe { comic_world_wait_for(self.group.as_ptr(), milliseconds(patience)) }
+    }
+
+    /// How many operations there were.
+    pub(super) fn operations(&self) -> u64 {
+        self.operations
+    }
+
+    /// Counts an operation with these tensors. gloo goes through memory in order.
+    fn begin(&mut self, tensors: &[&Tensor]) -> Result<(), String> {
+        self.operations += 1;
+        match tensors.iter().find(|tensor| !tensor.is_contiguous() || tensor.device() != Device::Cpu) {
+            Some(tensor) => Err(format!("{tensor:?} is not contiguous on the CPU")),
+            None => Ok(()),
+        }
     }
 
     /// The sum over all ranks, in place.
@@ -95,10 +133,10 @@ impl Group {
     /// # Errors
     /// What c10d says.
     pub(super) fn sum(&mut self, tensor: &Tensor) -> Result<(), String> {
-        check(&[tensor])?;
+        self.begin(&[tensor])?;
         let mut reason = Reason::default();
         // SAFETY: the group lives, and the tensor is one of the CPU that lives until the function returns. Every C++ exception is caught.
-        let done = unsafe { comic_world_sum(self.0.as_ptr(), pointer(tensor), reason.room(), REASON) };
+        let done = unsafe { comic_world_sum(self.group.as_ptr(), pointer(tensor), reason.room(), REASON) };
         reason.unless(done)
     }
 
@@ -107,10 +145,11 @@ impl Group {
     /// # Errors
     /// What c10d says.
     pub(super) fn gather(&mut self, tensor: &Tensor, all: &Tensor) -> Result<(), String> {
-        check(&[tensor, all])?;
+        self.begin(&[tensor, all])?;
         let mut reason = Reason::default();
         // SAFETY: as in `sum`. c10d checks the sizes.
-        let done = unsafe { comic_world_gather(self.0.as_ptr(), pointer(tensor), pointer(all), reason.room(), REASON) };
+        let done =
+            unsafe { comic_world_gather(self.group.as_ptr(), pointer(tensor), pointer(all), reason.room(), REASON) };
         reason.unless(done)
     }
 
@@ -119,10 +158,10 @@ impl Group {
     /// # Errors
     /// What c10d says.
     pub(super) fn broadcast(&mut self, tensor: &Tensor) -> Result<(), String> {
-        check(&[tensor])?;
+        self.begin(&[tensor])?;
         let mut reason = Reason::default();
         // SAFETY: as in `sum`.
-        let done = unsafe { comic_world_broadcast(self.0.as_ptr(), pointer(tensor), reason.room(), REASON) };
+        let done = unsafe { comic_world_broadcast(self.group.as_ptr(), pointer(tensor), reason.room(), REASON) };
         reason.unless(done)
     }
 }
@@ -130,15 +169,7 @@ impl Group {
 impl Drop for Group {
     fn drop(&mut self) {
         // SAFETY: the group is the one that was made, and is not used any more.
-        unsafe { comic_world_leave(self.0.as_ptr()) }
-    }
-}
-
-/// gloo goes through memory in order.
-fn check(tensors: &[&Tensor]) -> Result<(), String> {
-    match tensors.iter().find(|tensor| !tensor.is_contiguous() || tensor.device() != Device::Cpu) {
-        Some(tensor) => Err(format!("{tensor:?} is not contiguous on the CPU")),
-        None => Ok(()),
+        unsafe { comic_world_leave(self.group.as_ptr()) }
     }
 }
 
