@@ -2,7 +2,9 @@
 //! learner, once. Afterwards every unroll is looked for in the accounting, and the curve is compared with that of a quiet run.
 
 mod accounts;
+mod learner;
 mod logs;
+mod numbers;
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -53,10 +55,16 @@ struct Options {
     /// Directory of the run [default: runs/PRESET-1, -2, …]
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
-    /// Directory of a finished run, for instance a quiet one: its curve is compared with that of this run
+    /// Directory of a finished run with the same budget, for instance a quiet one: the curve of this run must be like its curve
     #[arg(long, value_name = "DIR")]
     compare: Option<PathBuf>,
+    /// Most reward per step, as a mean over the last third, by which the two curves may differ
+    #[arg(long, value_name = "REWARD", default_value_t = 0.05, value_parser = tolerance, requires = "compare")]
+    tolerance: f64,
 }
+
+/// Checkpoints that are kept: all of them, in any run that ends.
+const KEPT: usize = 1 << 20;
 
 /// Most percent a minute: each actor once a second.
 const HIGHEST_RATE: f64 = 6000.0;
@@ -66,10 +74,16 @@ fn percent(text: &str) -> Result<f64, String> {
     number.ok_or_else(|| format!("a number from 0 to {HIGHEST_RATE}"))
 }
 
+fn tolerance(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok().filter(|number| (0.0..=1.0).contains(number));
+    number.ok_or_else(|| "a number from 0 to 1".into())
+}
+
 /// Trains, kills, and prints the figures.
 ///
 /// # Errors
-/// When the run fails, when an unroll is missing from the accounting, and when the run ended before the learner was killed.
+/// When the run fails, when an unroll is missing from the accounting, when the run ended before the learner was killed, and when
+/// its curve is not like the other one.
 pub(super) fn run(arguments: &[String]) -> Result<()> {
     let options = Options::parse_from(arguments);
     let job = options.job()?;
@@ -89,11 +103,12 @@ pub(super) fn run(arguments: &[String]) -> Result<()> {
     }
     let unrolls = Unrolls::of(&job)?;
     options.print(&job, &preemption, &unrolls)?;
+    let difference = options.compare.as_ref().map(|other| compare(job.path(), other));
     unrolls.check(preemption.learner_killed.is_some())?;
     if !options.quiet && !options.keep_learner && preemption.learner_killed.is_none() {
         bail!("the run ended before the learner was killed: give it more time");
     }
-    Ok(())
+    difference.map_or(Ok(()), |difference| judge(difference?, options.tolerance))
 }
 
 impl Options {
@@ -102,8 +117,10 @@ impl Options {
             Some(steps) => format!("budget.environment_steps={steps}"),
             None => format!("budget.minutes={:?}", self.minutes),
         };
-        // Without minutes only the steps count. What the user sets comes last, and has precedence.
-        let ours = ["actor.threads=1", "actor.environments=4", "budget.minutes=0", &budget].map(String::from);
+        // Without minutes only the steps count. The checkpoint from which the learner is resumed is read at the end. What the user
+        // sets comes last, and has precedence.
+        let kept = format!("learner.checkpoints_kept={KEPT}");
+        let ours = ["actor.threads=1", "actor.environments=4", "budget.minutes=0", &budget, &kept].map(String::from);
         let job = Job::new(train::Options {
             preset: self.preset.clone(),
             clips: Vec::new(),
@@ -149,23 +166,35 @@ impl Options {
             println!("{restart}");
         }
         unrolls.print();
-        self.compare.as_ref().map_or(Ok(()), |other| print_curve(job, other))
+        Ok(())
     }
 }
 
-/// Prints how far this run's curve is from that of another one, and draws both.
-fn print_curve(job: &Job, other: &Path) -> Result<()> {
-    let sources = [job.metrics(), other.join("metrics.jsonl")].map(plot::Source::of);
+/// Prints how far this run's curve is from that of another one, and draws both. Returns the difference of their means over the
+/// last third.
+fn compare(run: &Path, other: &Path) -> Result<f64> {
+    let sources = [run, other].map(|run| plot::Source::of(run.join("metrics.jsonl")));
     let quantity = plot::Quantity::RewardPerStep;
     let difference = plot::difference(&sources[0], &sources[1], quantity)?;
-    let picture = job.path().join("compared.svg");
+    let picture = run.join("compared.svg");
     plot::draw_runs(&sources, &[quantity], &picture)?;
+    let value = difference.ours - difference.theirs;
     let curve = json!({
-        "figure": "preemption.curve", "value": difference.ours - difference.theirs, "unit": "reward per step / most",
+        "figure": "preemption.curve", "value": value, "unit": "reward per step / most",
         "ours": difference.ours, "theirs": difference.theirs, "largest": difference.largest,
         "largest_at": difference.largest_at, "environment_steps": difference.until, "picture": picture,
     });
     println!("{curve}");
+    Ok(value)
+}
+
+/// Fails if the curves are further apart than that. The runs have the same budget, or they would have been refused.
+fn judge(difference: f64, tolerance: f64) -> Result<()> {
+    ensure!(
+        difference.abs() <= tolerance,
+        "the reward per step over the last third differs by {difference:.3} from that of the other run, and at most {tolerance} is \
+         allowed"
+    );
     Ok(())
 }
 
@@ -216,6 +245,52 @@ mod tests {
         }
         assert!(Options::try_parse_from(["--quiet", "--rate", "5"]).is_err());
         assert_eq!(options(&["--rate", "0"]).rate, 0.0);
+    }
+
+    #[test]
+    fn every_checkpoint_is_kept_unless_the_user_wants_fewer() {
+        let run = tempfile::tempdir().unwrap();
+        let run = run.path().join("run").display().to_string();
+        let kept = |arguments: &[&str]| {
+            let job = options(&[arguments, &["--run", &run]].concat()).job().unwrap();
+            job.experiment().learner.checkpoints_kept
+        };
+        assert_eq!(kept(&[]), KEPT);
+        assert_eq!(kept(&["--set", "learner.checkpoints_kept=3"]), 3);
+    }
+
+    #[test]
+    fn a_tolerance_is_a_share_of_the_reward_and_needs_a_run_to_compare_with() {
+        for wrong in ["--tolerance=-0.1", "--tolerance=nan", "--tolerance=1.1"] {
+            assert!(Options::try_parse_from(["--compare", "runs/quiet", wrong]).is_err(), "{wrong}");
+        }
+        assert!(Options::try_parse_from(["--tolerance", "0.1"]).is_err());
+        assert_eq!(options(&["--compare", "runs/quiet", "--tolerance", "0.1"]).tolerance, 0.1);
+        assert_eq!(options(&["--compare", "runs/quiet"]).tolerance, 0.05);
+    }
+
+    #[test]
+    fn a_curve_that_ends_away_from_the_other_one_fails() {
+        let runs = tempfile::tempdir().unwrap();
+        // In the first two thirds each curve is somewhere else. Over the last third both are flat.
+        let write = |name: &str, start: f64, end: f64| {
+            let run = runs.path().join(name);
+            std::fs::create_dir_all(&run).unwrap();
+            let line = |number: u32| {
+                let reward = if number < 100 { start } else { end };
+                json!({ "environment_steps": number * 1000, "reward_per_step": reward }).to_string()
+            };
+            std::fs::write(run.join("metrics.jsonl"), (0..300).map(line).collect::<Vec<_>>().join("\n")).unwrap();
+            run
+        };
+        let quiet = write("quiet", 0.1, 0.6);
+        for (end, passes) in [(0.6, true), (0.56, true), (0.64, true), (0.54, false), (0.66, false)] {
+            let difference = compare(&write("preempted", 0.3, end), &quiet).unwrap();
+            assert!((difference - (end - 0.6)).abs() < 1e-9, "{difference}");
+            assert_eq!(judge(difference, 0.05).is_ok(), passes, "{end}");
+        }
+        // No number is no small difference.
+        assert!(judge(f64::NAN, 0.05).is_err());
     }
 
     #[test]

@@ -2,11 +2,13 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 use serde::Deserialize;
 use serde_json::json;
 
+use super::learner::Learner;
 use super::logs::{self, Process};
 use crate::metrics::{self, Accounting};
 use crate::train::Job;
@@ -18,6 +20,8 @@ pub(super) struct Unrolls {
     lines: usize,
     /// What contradicts the accounting.
     faults: Vec<String>,
+    /// How often the learner was started.
+    starts: usize,
     /// The accounting of the last checkpoint.
     last: Accounting,
     /// Unrolls that the learner counted as produced when it ended: some arrive after the last checkpoint.
@@ -26,17 +30,20 @@ pub(super) struct Unrolls {
     processes: usize,
     /// Unrolls that the actors made.
     made: u64,
-    /// Not in the last checkpoint, but acknowledged to an actor that was not killed: the run was over.
+    /// Not in the last checkpoint, but acknowledged by a learner that knows the actor process: the run was over.
     late: u64,
-    /// Not in the last checkpoint, but acknowledged to an actor that was killed. If the learner was killed, too, and the actor
-    /// before it had joined again, nobody could tell the new learner about them.
+    /// Not in the last checkpoint, but acknowledged by the learner that was killed, to an actor process that was killed before
+    /// it had joined again. Nobody could tell the new learner about them.
     forgotten: u64,
     /// Neither in the last checkpoint nor acknowledged: only the actor knew about them when it ended.
     unheard: u64,
+    /// Lost at restart by what the logs say: the unrolls in flight in the checkpoint from which the learner was resumed, and
+    /// those that the killed learner acknowledged after it and that the new one counted.
+    explained: u64,
 }
 
 /// `accounting.json` of a checkpoint.
-#[derive(Deserialize)]
+#[derive(Default, Deserialize)]
 struct Ledger {
     accounting: Accounting,
     accounts: Vec<Account>,
@@ -50,75 +57,144 @@ struct Account {
     next_sequence: u64,
 }
 
+impl Ledger {
+    fn read(checkpoint: &Path) -> Result<Self> {
+        let path = checkpoint.join("accounting.json");
+        let text = fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        serde_json::from_slice(&text).with_context(|| path.display().to_string())
+    }
+
+    /// The numbers of unrolls that are accounted for, by incarnation.
+    fn counted(&self) -> BTreeMap<u64, u64> {
+        self.accounts.iter().map(|account| (account.incarnation, account.next_sequence)).collect()
+    }
+}
+
+fn lost_at_restart(accounting: &Accounting) -> u64 {
+    accounting.dropped.get("lost_at_restart").copied().unwrap_or_default()
+}
+
 impl Unrolls {
     /// Reads what a finished run has left.
     ///
     /// # Errors
     /// A file that is missing or cannot be read.
     pub(super) fn of(job: &Job) -> Result<Self> {
-        let accountings = metrics::read(&job.metrics())?.into_iter().map(|line| line.accounting).collect::<Vec<_>>();
-        let path = job.newest_checkpoint().context("the run has no checkpoint")?.join("accounting.json");
-        let text = fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
-        let ledger = serde_json::from_slice(&text).with_context(|| path.display().to_string())?;
-        let log = fs::read_to_string(job.learner_log()).context("cannot read the learner's log")?;
-        let at_end = produced_at_end(&log).context("the learner's log has no accounting of its end")?;
+        let lines = metrics::read(&job.metrics())?;
+        let last = Ledger::read(&job.newest_checkpoint().context("the run has no checkpoint")?)?;
+        let learner = Learner::of(&fs::read_to_string(job.learner_log()).context("cannot read the learner's log")?)?;
+        // A learner that was killed before its first checkpoint has begun anew, with no account.
+        let resumed = learner.resumed.as_deref().map(Ledger::read).transpose();
+        let resumed = resumed.context("the learner was resumed from this checkpoint, so it has to be kept")?;
         let mut processes = Vec::new();
         for log in job.actor_logs() {
-            processes.extend(logs::processes(&log)?);
+            processes.extend(logs::processes(&log, &learner)?);
         }
-        Ok(Self::count(&accountings, ledger, at_end, &processes))
+        let mut unrolls = Self {
+            lines: lines.len(),
+            starts: learner.starts,
+            at_end: learner.at_end,
+            processes: processes.len(),
+            ..Self::default()
+        };
+        for (number, line) in (1..).zip(lines) {
+            unrolls.expect_balance(&format!("line {number} of metrics.jsonl"), line.accounting.as_ref());
+        }
+        unrolls.count(last, resumed.unwrap_or_default(), &learner, &processes);
+        Ok(unrolls)
     }
 
-    /// Compares the accounting of each line of metrics and that of the last checkpoint with the actors' processes.
-    fn count(lines: &[Option<Accounting>], ledger: Ledger, at_end: u64, processes: &[Process]) -> Self {
-        let Ledger { accounting: last, accounts } = ledger;
-        let mut unrolls = Self { lines: lines.len(), at_end, processes: processes.len(), last, ..Self::default() };
-        for (number, accounting) in (1..).zip(lines) {
-            match accounting {
-                Some(accounting) if accounting.balances() => {}
-                other => unrolls.faults.push(format!("line {number} of metrics.jsonl does not balance: {other:?}")),
-            }
+    fn expect_balance(&mut self, what: &str, accounting: Option<&Accounting>) {
+        if !accounting.is_some_and(Accounting::balances) {
+            self.faults.push(format!("{what} does not balance: {accounting:?}"));
         }
-        let (last, sum) = (&unrolls.last, accounts.iter().map(|account| account.next_sequence).sum::<u64>());
-        let faults = [
-            (!last.balances()).then(|| format!("the last checkpoint does not balance: {last:?}")),
-            (sum != last.produced).then(|| format!("the accounts have {sum} unrolls in all, and the sum is {last:?}")),
-        ];
-        unrolls.faults.extend(faults.into_iter().flatten());
-        let mut accounts: BTreeMap<u64, u64> =
-            accounts.into_iter().map(|account| (account.incarnation, account.next_sequence)).collect();
+    }
+
+    /// Compares the last checkpoint and the one from which the learner was resumed with the actors' processes.
+    fn count(&mut self, last: Ledger, resumed: Ledger, learner: &Learner, processes: &[Process]) {
+        self.expect_balance("the last checkpoint", Some(&last.accounting));
+        let sum = last.accounts.iter().map(|account| account.next_sequence).sum::<u64>();
+        if sum != last.accounting.produced {
+            self.faults.push(format!("the accounts have {sum} unrolls in all, and the sum is {:?}", last.accounting));
+        }
+        match lost_at_restart(&resumed.accounting) {
+            0 => {}
+            lost => self.faults.push(format!("{lost} unrolls were lost at restart before the learner was killed")),
+        }
+        // The new learner has no copy of them.
+        self.explained = resumed.accounting.in_flight;
+        let (mut accounts, former) = (last.counted(), resumed.counted());
         for process in processes {
             let counted = accounts.remove(&process.incarnation).unwrap_or_default();
-            unrolls.add(process, counted);
+            let before = former.get(&process.incarnation).copied().unwrap_or_default();
+            self.contradictions(process, before, counted);
+            self.add(process, before, counted, learner.joined.contains(&process.incarnation));
         }
         for (incarnation, counted) in accounts.into_iter().filter(|(_, counted)| *counted > 0) {
-            unrolls.faults.push(format!("{counted} unrolls are of the actor {incarnation:016x}, which has no log"));
+            self.faults.push(format!("{counted} unrolls are of the actor {incarnation:016x}, which has no log"));
         }
-        unrolls
+        self.last = last.accounting;
     }
 
-    /// Adds the unrolls of a process of which the learner has counted so many.
-    fn add(&mut self, process: &Process, counted: u64) {
-        let Process { incarnation, made, acknowledged, exited } = *process;
+    /// Names what cannot be true of a process of which the learner had counted `before` unrolls when it was resumed, and
+    /// `counted` in the last checkpoint.
+    fn contradictions(&mut self, process: &Process, before: u64, counted: u64) {
+        let Process { incarnation, environments, made, ref acknowledged, covered, exited, left, .. } = *process;
+        let mut fault = |text: String| self.faults.push(format!("actor {incarnation:016x} {text}"));
         if counted > made {
-            self.faults.push(format!("actor {incarnation:016x} made {made} unrolls, and {counted} are counted"));
+            fault(format!("made {made} unrolls, and {counted} are counted"));
         }
+        // An actor sends its unrolls in order, also again after a restart, and the learner answers in that order.
+        for gap in acknowledged.gaps() {
+            fault(format!("has later acknowledgements, and none of the unrolls {} to {}", gap.start, gap.end - 1));
+        }
+        let unanswered = made.saturating_sub(acknowledged.end());
+        if unanswered > environments {
+            fault(format!(
+                "ended with {unanswered} unrolls without acknowledgement, and has {environments} environments"
+            ));
+        }
+        if exited && unanswered != left {
+            fault(format!("ended with {unanswered} unrolls without acknowledgement, and says that there were {left}"));
+        }
+        if before < covered {
+            fault(format!(
+                "had {covered} acknowledged unrolls before the checkpoint was made from which the learner was resumed, which has \
+                 {before}"
+            ));
+        }
+        if counted < before {
+            fault(format!(
+                "had {before} unrolls when the learner was resumed, and has {counted} in the last checkpoint"
+            ));
+        }
+    }
+
+    /// Adds the unrolls of a process. `joined` says whether the learner's last process knows it.
+    fn add(&mut self, process: &Process, before: u64, counted: u64, joined: bool) {
+        let Process { made, ref acknowledged, by_former, exited, .. } = *process;
+        let acknowledged = acknowledged.end();
         self.made += made;
-        let uncounted = acknowledged.saturating_sub(counted);
-        *if exited { &mut self.late } else { &mut self.forgotten } += uncounted;
+        // These were not sent again, so the new learner has counted them without having them.
+        self.explained += by_former.min(counted).saturating_sub(before);
+        let forgettable = if joined || exited { 0 } else { by_former };
+        self.forgotten += forgettable.saturating_sub(counted);
+        self.late += acknowledged.saturating_sub(counted.max(forgettable));
         self.unheard += made.saturating_sub(acknowledged.max(counted));
     }
 
     /// Prints a figure for what the accounting says, one for what was lost, and one for what it cannot know.
     pub(super) fn print(&self) {
-        let Self { lines, last, at_end, processes, made, late, forgotten, unheard, .. } = self;
-        let lost = last.dropped.get("lost_at_restart").copied().unwrap_or_default();
+        let Self { lines, last, at_end, processes, made, late, forgotten, unheard, explained, .. } = self;
         let figures = [
             json!({
                 "figure": "preemption.produced", "value": last.produced, "unit": "unrolls", "trained": last.trained,
                 "dropped": last.dropped, "in_flight": last.in_flight, "lines_of_metrics": lines, "at_end": at_end,
             }),
-            json!({ "figure": "preemption.lost_at_restart", "value": lost, "unit": "unrolls" }),
+            json!({
+                "figure": "preemption.lost_at_restart", "value": lost_at_restart(last), "unit": "unrolls",
+                "explained": explained,
+            }),
             json!({
                 "figure": "preemption.made", "value": made, "unit": "unrolls", "processes": processes,
                 "produced": last.produced, "late": late, "forgotten": forgotten, "unheard": unheard,
@@ -132,14 +208,22 @@ impl Unrolls {
     /// # Errors
     /// What contradicts the accounting.
     pub(super) fn check(&self, learner_killed: bool) -> Result<()> {
+        let Self { starts, at_end, last, late, explained, .. } = self;
         let mut faults = self.faults.clone();
-        // A learner that lived through the run has an account of every actor.
-        let acknowledged = self.late + if learner_killed { 0 } else { self.forgotten };
-        let arrived = self.at_end.saturating_sub(self.last.produced);
-        if acknowledged > arrived {
+        if *starts != 1 + usize::from(learner_killed) {
+            faults.push(format!("the learner was started {starts} times"));
+        }
+        let arrived = at_end.saturating_sub(last.produced);
+        if *late > arrived {
             faults.push(format!(
-                "{acknowledged} unrolls were acknowledged and are not in the last checkpoint, and only {arrived} came after it"
+                "{late} unrolls were acknowledged and are not in the last checkpoint, and only {arrived} came after it"
             ));
+        }
+        // The learner counts every number that it never sees as lost at restart, whatever the reason.
+        let lost = lost_at_restart(last);
+        if lost != *explained {
+            faults
+                .push(format!("{lost} unrolls are counted as lost at restart, and by the logs there are {explained}"));
         }
         if !faults.is_empty() {
             bail!("the accounting does not name every unroll:\n  {}", faults.join("\n  "));
@@ -148,75 +232,5 @@ impl Unrolls {
     }
 }
 
-/// The unrolls that the learner counted when it ended, from its log.
-fn produced_at_end(log: &str) -> Option<u64> {
-    let (_, rest) = log.rsplit_once("the budget is used up accounting=Accounting { produced: ")?;
-    rest.split(',').next()?.parse().ok()
-}
-
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// `produced` unrolls, of which ten are in flight and the others trained on.
-    fn accounting(produced: u64) -> Accounting {
-        Accounting { produced, trained: produced - 10, in_flight: 10, ..Accounting::default() }
-    }
-
-    fn ledger(accounts: &[(u64, u64)]) -> Ledger {
-        let of = |&(incarnation, next_sequence): &(u64, u64)| Account { incarnation, next_sequence };
-        let produced = accounts.iter().map(|(_, next)| next).sum();
-        Ledger { accounting: accounting(produced), accounts: accounts.iter().map(of).collect() }
-    }
-
-    const KILLED: Process = Process { incarnation: 1, made: 50, acknowledged: 46, exited: false };
-    const EXITED: Process = Process { incarnation: 2, made: 70, acknowledged: 69, exited: true };
-
-    fn faults(unrolls: &Unrolls, learner_killed: bool) -> String {
-        unrolls.check(learner_killed).err().map_or_else(String::new, |error| error.to_string())
-    }
-
-    #[test]
-    fn every_unroll_that_was_made_is_counted_once() {
-        // The learner has counted 47 unrolls of the killed one, whose last acknowledgement was lost, and 67 of the other.
-        let found = Unrolls::count(&[Some(accounting(60))], ledger(&[(1, 47), (2, 67)]), 116, &[KILLED, EXITED]);
-        assert_eq!((found.made, found.late, found.forgotten, found.unheard), (120, 2, 0, 4));
-        assert_eq!(found.made, found.last.produced + found.late + found.forgotten + found.unheard);
-        assert_eq!(faults(&found, false), "");
-    }
-
-    #[test]
-    fn an_acknowledged_unroll_that_no_learner_has_counted_is_a_fault() {
-        let found = Unrolls::count(&[], ledger(&[(1, 47), (2, 67)]), 115, &[KILLED, EXITED]);
-        assert!(faults(&found, true).contains("2 unrolls were acknowledged"), "{found:?}");
-    }
-
-    #[test]
-    fn what_a_killed_learner_acknowledged_to_a_killed_actor_is_forgotten_and_only_then() {
-        let found = Unrolls::count(&[], ledger(&[(1, 40), (2, 69)]), 109, &[KILLED, EXITED]);
-        assert_eq!((found.forgotten, found.unheard), (6, 5));
-        assert_eq!(faults(&found, true), "");
-        assert!(faults(&found, false).contains("6 unrolls were acknowledged"), "{found:?}");
-    }
-
-    #[test]
-    fn accounts_that_contradict_themselves_or_the_actors_are_faults() {
-        let unbalanced = Accounting { produced: 61, ..accounting(60) };
-        let found = Unrolls::count(&[Some(unbalanced), None], ledger(&[(1, 47), (2, 67)]), 116, &[KILLED, EXITED]);
-        assert!(faults(&found, false).contains("line 1 of metrics.jsonl"), "{found:?}");
-        assert!(faults(&found, false).contains("line 2 of metrics.jsonl"), "{found:?}");
-        let found = Unrolls::count(&[], ledger(&[(1, 51), (3, 9)]), 60, &[KILLED]);
-        assert!(faults(&found, false).contains("made 50 unrolls, and 51 are counted"), "{found:?}");
-        assert!(faults(&found, false).contains("0000000000000003, which has no log"), "{found:?}");
-        let wrong_sum = Ledger { accounting: accounting(60), ..ledger(&[(1, 47)]) };
-        assert!(faults(&Unrolls::count(&[], wrong_sum, 60, &[KILLED]), false).contains("47 unrolls in all"));
-    }
-
-    #[test]
-    fn the_learners_last_line_says_what_it_counted() {
-        let log = "2026-01-01T00:00:00Z  INFO comic_learner::run: the budget is used up accounting=Accounting { produced: 520, \
-                   trained: 256 }\n";
-        assert_eq!(produced_at_end(log), Some(520));
-        assert_eq!(produced_at_end("stopped"), None);
-    }
-}
+mod tests;
