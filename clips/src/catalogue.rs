@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 
 use crate::builtin;
 use crate::clip::Clip;
-use crate::cut::cut;
+use crate::cut::{cut, remove_other_cuts};
 use crate::entry::Entry;
 use crate::error::Error;
 use crate::file::{ClipFile, Header};
@@ -142,7 +142,8 @@ impl Catalogue {
     }
 
     /// The files of the clips with their hashes, each file once. Built-in clips have no file. If at most half of the clips of a file
-    /// are in use and there is a directory for `cuts`, a file with these clips alone is made there and takes its place.
+    /// are in use and there is a directory for `cuts`, a file with these clips alone is made there and takes its place. Then the files
+    /// that earlier calls made there are removed, so nobody may still fetch them.
     ///
     /// # Errors
     /// [`Error::Unreadable`]; with `cuts` also [`Error::Unwritable`].
@@ -161,6 +162,9 @@ impl Catalogue {
                 }
                 _ => whole,
             });
+        }
+        if let Some(directory) = cuts {
+            remove_other_cuts(directory, &assets.iter().map(|asset| asset.path.as_path()).collect::<Vec<_>>());
         }
         Ok(assets)
     }

@@ -2,17 +2,18 @@
 
 #![allow(clippy::unwrap_used, reason = "a test stops at the first surprise")]
 
+use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
 use comic_clips::edit::speed;
-use comic_clips::{Catalogue, ClipWriter};
+use comic_clips::{Asset, Catalogue, ClipWriter};
 use comic_experiment::ClipSource;
 
-/// A file of eight clips: four names for each of two built-in clips.
-fn whole(path: &Path) {
-    let mut writer = ClipWriter::create(path, false).unwrap();
-    for (name, letters) in [("builtin:CMU_007_01", "abcd"), ("builtin:walk", "efgh")] {
-        let clip = Catalogue::open(&[ClipSource::whole(name)]).unwrap().load(0).unwrap();
+/// A file with copies of built-in clips, each named by a letter.
+fn write(path: &Path, copies: &[(&str, &str)]) {
+    let mut writer = ClipWriter::create(path, true).unwrap();
+    for (name, letters) in copies {
+        let clip = Catalogue::open(&[ClipSource::whole(*name)]).unwrap().load(0).unwrap();
         for letter in letters.chars() {
             let mut clip = clip.clone();
             clip.name = letter.to_string();
@@ -22,8 +23,36 @@ fn whole(path: &Path) {
     writer.finish().unwrap();
 }
 
+/// A file of eight clips: four names for each of two built-in clips.
+fn whole(path: &Path) {
+    write(path, &[("builtin:CMU_007_01", "abcd"), ("builtin:walk", "efgh")]);
+}
+
 fn some(source: &str, ids: &[&str]) -> ClipSource {
     ClipSource { ids: ids.iter().map(ToString::to_string).collect(), ..ClipSource::whole(source) }
+}
+
+/// Fails unless an actor with this asset has the clips of the learner's catalogue, and no others.
+fn assert_same_clips(what: &str, asset: &Asset, sources: &[ClipSource], catalogue: &Catalogue) {
+    let part = Catalogue::open_with(sources, |_| Some(asset.path.clone())).unwrap();
+    assert_eq!(part.entries(), catalogue.entries(), "{what}");
+    for index in 0..catalogue.entries().len() {
+        assert!(part.load(index).unwrap() == catalogue.load(index).unwrap(), "{what}: clip {index}");
+    }
+    let all = Catalogue::open(&[ClipSource::whole(asset.path.to_str().unwrap())]).unwrap();
+    assert_eq!(all.entries().len(), catalogue.entries().len(), "{what}");
+}
+
+/// The names in a directory, sorted.
+fn names(directory: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(directory).unwrap();
+    let mut names: Vec<_> = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort_unstable();
+    names
+}
+
+fn name(asset: &Asset) -> String {
+    asset.path.file_name().unwrap().to_str().unwrap().into()
 }
 
 #[test]
@@ -41,13 +70,101 @@ fn an_actor_finds_the_same_clips_in_the_part_as_in_the_whole() {
     assert_eq!(assets[0].source, source);
     assert!(assets[0].path.starts_with(&cuts));
     assert!(assets[0].size < std::fs::metadata(&path).unwrap().len() / 2, "{assets:?}");
-    let part = Catalogue::open_with(&sources, |_| Some(assets[0].path.clone())).unwrap();
-    assert_eq!(part.entries(), catalogue.entries());
-    for index in 0..catalogue.entries().len() {
-        assert_eq!(part.load(index).unwrap(), catalogue.load(index).unwrap());
+    assert_same_clips("the part", &assets[0], &sources, &catalogue);
+}
+
+/// Actors that have the file need no other one.
+#[test]
+fn the_next_start_of_the_learner_uses_the_file_and_writes_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("all.h5");
+    whole(&path);
+    let catalogue = Catalogue::open(&[some(path.to_str().unwrap(), &["a", "f"])]).unwrap();
+    let cuts = directory.path().join("assets");
+    let start = || {
+        let assets = catalogue.assets(Some(&cuts)).unwrap();
+        let file = std::fs::metadata(&assets[0].path).unwrap();
+        (assets, names(&cuts), file.ino(), file.modified().unwrap())
+    };
+    assert_eq!(start(), start());
+}
+
+#[test]
+fn a_damaged_part_is_replaced() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("all.h5");
+    whole(&path);
+    let sources = [some(path.to_str().unwrap(), &["a", "f"])];
+    let catalogue = Catalogue::open(&sources).unwrap();
+    let cuts = directory.path().join("assets");
+    let part = catalogue.assets(Some(&cuts)).unwrap().remove(0).path;
+    let good = std::fs::read(&part).unwrap();
+    let damages: [(&str, &dyn Fn()); 6] = [
+        ("empty", &|| std::fs::write(&part, "").unwrap()),
+        ("the first half", &|| std::fs::write(&part, &good[..good.len() / 2]).unwrap()),
+        ("a zero block", &|| {
+            let mut bytes = good.clone();
+            let middle = bytes.len() / 2;
+            bytes[middle..middle + 4096].fill(0);
+            std::fs::write(&part, bytes).unwrap();
+        }),
+        ("other frames", &|| write(&part, &[("builtin:walk", "a"), ("builtin:CMU_007_01", "f")])),
+        ("a clip too many", &|| write(&part, &[("builtin:CMU_007_01", "a"), ("builtin:walk", "fg")])),
+        ("a clip too few", &|| write(&part, &[("builtin:CMU_007_01", "a")])),
+    ];
+    for (what, damage) in damages {
+        damage();
+        let assets = catalogue.assets(Some(&cuts)).unwrap();
+        assert_same_clips(what, &assets[0], &sources, &catalogue);
     }
-    // The next epoch of the learner finds the file, so actors that have it need no other one.
-    assert_eq!(catalogue.assets(Some(&cuts)).unwrap(), assets);
+}
+
+#[test]
+fn parts_of_other_selections_and_releases_are_removed() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("all.h5");
+    whole(&path);
+    let cuts = directory.path().join("assets");
+    let cut =
+        |ids: &[&str]| Catalogue::open(&[some(path.to_str().unwrap(), ids)]).unwrap().assets(Some(&cuts)).unwrap();
+    cut(&["a", "f"]);
+    // Releases make names of the same form.
+    std::fs::write(cuts.join("0123456789abcdef0123456789abcdef.h5"), "of another release").unwrap();
+    let assets = cut(&["a", "g"]);
+    assert_eq!(names(&cuts), [name(&assets[0])]);
+}
+
+#[test]
+fn files_that_are_no_parts_stay() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("all.h5");
+    whole(&path);
+    let cuts = directory.path().join("assets");
+    std::fs::create_dir(&cuts).unwrap();
+    let digits = "0123456789abcdef".repeat(2);
+    let foreign = ["0123.h5", "walks.h5", &digits, &format!("{digits}.txt"), &format!("{}.h5", digits.to_uppercase())];
+    foreign.iter().for_each(|name| std::fs::write(cuts.join(name), "foreign").unwrap());
+    // Of a part's name, but no file.
+    std::fs::create_dir(cuts.join(format!("{digits}.h5"))).unwrap();
+    let before = names(&cuts);
+    let catalogue = Catalogue::open(&[some(path.to_str().unwrap(), &["a"])]).unwrap();
+    let part = name(&catalogue.assets(Some(&cuts)).unwrap()[0]);
+    let after: Vec<_> = names(&cuts).into_iter().filter(|name| *name != part).collect();
+    assert_eq!(after, before);
+}
+
+#[test]
+fn the_parts_of_all_sources_stay() {
+    let directory = tempfile::tempdir().unwrap();
+    let [first, second] = ["all.h5", "more.h5"].map(|name| directory.path().join(name));
+    whole(&first);
+    write(&second, &[("builtin:walk", "xyz")]);
+    let sources = [some(first.to_str().unwrap(), &["a"]), some(second.to_str().unwrap(), &["x"])];
+    let cuts = directory.path().join("assets");
+    let assets = Catalogue::open(&sources).unwrap().assets(Some(&cuts)).unwrap();
+    let mut expected: Vec<_> = assets.iter().map(name).collect();
+    expected.sort_unstable();
+    assert_eq!(names(&cuts), expected);
 }
 
 #[test]
