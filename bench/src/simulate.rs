@@ -4,7 +4,8 @@
 //! - [`settings`] is what is simulated, and [`simulation`] the events. It follows the rules of the real parts:
 //!   [`batcher`] those of `replay`, [`publisher`] those of the learner's publication, and `simulation` those of the actor's
 //!   rounds, outbox and mailbox and of the learner's streams of unrolls.
-//! - [`link`] is a link that transfers share, and [`agenda`] the queue of events. [`observed`] counts what happens, and [`report`] prints it.
+//! - [`link`] is a link that transfers share, and [`agenda`] the queue of events. [`observed`] counts what happens, times in a
+//!   [`distribution`], and [`report`] prints it.
 //!
 //! Not simulated: the processor time of the service, restarts and stalls of actors, lost packets and the latency of a network,
 //! and the start of a process until it connects.
@@ -20,6 +21,7 @@ use simulation::Simulation;
 
 mod agenda;
 mod batcher;
+mod distribution;
 mod link;
 mod observed;
 mod publisher;
@@ -34,8 +36,9 @@ mod tests;
 /// A discrete-event simulation, decided by its seed. Defaults are the paper's sizes with times of docs/benchmarks.md; 100 ms
 /// for an update is an assumption. Options that take a list simulate every combination.
 ///
-/// `simulate.steps`: environment steps trained on a second, and what actors, learners and links alone would allow. `busy`:
-/// the time of updates, all-reduce included. `age`: versions by which unrolls are late when they are trained on. `dropped`: stale
+/// `simulate.steps`: environment steps trained on a second, and what actors, learners and links alone would allow;
+/// `few_versions` where fewer than ten versions were measured, so that figures may be those of the start. `busy`:
+/// the time of updates, exchanges included. `age`: versions by which unrolls are late when they are trained on. `dropped`: stale
 /// unrolls, by where that was found. `waiting`: the time in which actors do not step, and how long they wait for
 /// acknowledgements and versions. `publication`: from a version's publication until every actor has it or a newer one; how
 /// late versions are when an actor has read them; readers that were cut off and began again. `start`: until every actor acts.
@@ -88,14 +91,22 @@ pub struct Simulate {
     /// Bytes of a version of the policy's parameters
     #[arg(long, value_name = "BYTES", default_value_t = 16_600_000.0, value_parser = positive)]
     parameter_bytes: f64,
-    /// Bytes of the gradients that learners add in each update, on a network that nothing else uses, as fast as --link-gbps
+    /// Bytes of the gradients that learners add in each update, on a network that nothing else uses
     #[arg(long, value_name = "BYTES", default_value_t = 30_500_000.0, value_parser = positive)]
     gradient_bytes: f64,
+    /// Speed at which learners add gradients, Gbit/s, if --link-gbps is not lower. The default is gloo's, between its 1 and 2
+    /// GB/s (docs/data-parallel.md)
+    #[arg(long, value_name = "GBPS", default_value_t = 12.0, value_parser = positive)]
+    all_reduce_gbps: f64,
+    /// Time of an update's exchanges between learners without the bytes of gradients, ms. The two of a gradient step took
+    /// about 6 ms on two cores that the learners shared; half of it, with cores of their own, is an assumption
+    #[arg(long, value_name = "MS", default_value_t = 3.0, value_parser = zero_or_more)]
+    exchange_ms: f64,
     /// Bytes of the assets that an actor fetches at its start; 0 where it has them
     #[arg(long, value_name = "BYTES", default_value_t = 15_000_000.0, value_parser = zero_or_more)]
     asset_bytes: f64,
     /// Actors connect within this time, s
-    #[arg(long, value_name = "SECONDS", default_value_t = 10.0, value_parser = zero_or_more)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 10.0, value_parser = time_or_none)]
     start_s: f64,
     /// Greatest relative difference of a round's time, of an update's, and of a connection's share of its link
     #[arg(long, default_value_t = 0.1, value_parser = spread)]
@@ -103,11 +114,15 @@ pub struct Simulate {
     /// Actors do not wait for the version that an acknowledgement names, as those of `swarm`
     #[arg(long)]
     any_version: bool,
-    /// Seconds that are measured, after every actor acts and a fifth of this time
-    #[arg(long, default_value_t = 300.0, value_parser = positive)]
+    /// Seconds that are measured at least, after every actor acts and a quarter of this time
+    #[arg(long, default_value_t = 300.0, value_parser = time)]
     seconds: f64,
-    /// Simulated seconds after which the last actor is not waited for any more, at the start and for a version
-    #[arg(long, value_name = "SECONDS", default_value_t = 3600.0, value_parser = positive)]
+    /// Versions that are measured at least, after a quarter as many, however long they take
+    #[arg(long, value_name = "NUMBER", default_value_t = 20, value_parser = clap::value_parser!(u64).range(0..=100))]
+    versions: u64,
+    /// Simulated seconds after which the last actor is not waited for any more, at the start and for a version, nor the
+    /// publication of a version
+    #[arg(long, value_name = "SECONDS", default_value_t = 3600.0, value_parser = time)]
     give_up_s: f64,
     /// Decides every random number
     #[arg(long, default_value_t = 0)]
@@ -150,11 +165,14 @@ impl Simulate {
             unroll_bytes: self.unroll_bytes,
             parameter_bytes: self.parameter_bytes,
             gradient_bytes: self.gradient_bytes,
+            all_reduce_gbps: self.all_reduce_gbps,
+            exchange_ms: self.exchange_ms,
             asset_bytes: self.asset_bytes,
             start_s: self.start_s,
             spread: self.spread,
             any_version: self.any_version,
             seconds: self.seconds,
+            versions: self.versions,
             give_up_s: self.give_up_s,
             seed: self.seed,
         }];
@@ -205,6 +223,17 @@ fn positive(text: &str) -> Result<f64, String> {
 
 fn zero_or_more(text: &str) -> Result<f64, String> {
     number(text, 0.0, 1e12)
+}
+
+/// The clock of a longer simulation would not move by a short round.
+const LONGEST_S: f64 = 1e6;
+
+fn time(text: &str) -> Result<f64, String> {
+    number(text, 1e-3, LONGEST_S)
+}
+
+fn time_or_none(text: &str) -> Result<f64, String> {
+    number(text, 0.0, LONGEST_S)
 }
 
 /// A shorter step would not move the clock of a long simulation.

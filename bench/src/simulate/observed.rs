@@ -1,9 +1,11 @@
 //! What happens in a simulation.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::ops::AddAssign;
 
 use serde::Serialize;
+
+use super::distribution::Distribution;
 
 /// Unrolls that were dropped as stale, by where they were.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -22,8 +24,6 @@ struct Version {
     at: f64,
     /// Actors that have it or a newer one.
     holders: usize,
-    /// When the last of them had it.
-    complete: Option<f64>,
     measured: bool,
 }
 
@@ -38,8 +38,14 @@ pub(super) struct Observed {
     acting_actors: Vec<bool>,
     not_acting: usize,
     start: Option<f64>,
-    /// All since the start; the first is version 1.
-    versions: Vec<Version>,
+    /// The newest version; the first is 1.
+    newest: u64,
+    /// The versions that an actor does not have yet, nor a newer one. The last is the newest.
+    spreading: VecDeque<Version>,
+    /// Versions that were published.
+    pub(super) versions: u64,
+    /// Seconds from the publication of each of them until every actor had it or a newer one, also after the end.
+    publications: Distribution,
     pub(super) unrolls: u64,
     pub(super) dropped: Dropped,
     /// Unrolls by age in versions when they were trained on.
@@ -48,16 +54,16 @@ pub(super) struct Observed {
     pub(super) learning: f64,
     /// Seconds of rounds, of all workers together.
     pub(super) acting: f64,
-    pub(super) waits_for_acknowledgements: Vec<f64>,
-    pub(super) waits_for_versions: Vec<f64>,
+    pub(super) waits_for_acknowledgements: Distribution,
+    pub(super) waits_for_versions: Distribution,
     /// Seconds from the publication of a version until an actor had it, and how many newer versions there were then.
-    pub(super) reads: Vec<f64>,
-    pub(super) late: Vec<f64>,
+    pub(super) reads: Distribution,
+    pub(super) late: Distribution,
     /// Versions that actors had begun to read and lost.
     pub(super) cut_off: u64,
     /// In and out.
     pub(super) bytes: [f64; 2],
-    /// Most unrolls that waited in one learner, since the start.
+    /// Most unrolls that waited in one learner and its windows, since the start.
     pub(super) most_waiting: usize,
     /// Most versions in the memory of one learner, since the start.
     pub(super) most_held: usize,
@@ -97,31 +103,38 @@ impl Observed {
 
     /// Whether an actor has not yet got a version that was published while measuring.
     pub(super) fn awaits_a_version(&self) -> bool {
-        self.versions.iter().rev().find(|version| version.measured).is_some_and(|version| version.complete.is_none())
+        self.spreading.iter().any(|version| version.measured)
     }
 
     /// Seconds from the publication of each version until every actor had it or a newer one; `None` if the simulation
     /// ended before that.
-    pub(super) fn publications(&self) -> Vec<Option<f64>> {
-        let measured = self.versions.iter().filter(|version| version.measured);
-        measured.map(|version| Some(version.complete? - version.at)).collect()
+    pub(super) fn publications(&self) -> Option<&Distribution> {
+        (!self.awaits_a_version()).then_some(&self.publications)
     }
 
     pub(super) fn published(&mut self, now: f64) {
-        self.versions.push(Version { at: now, holders: 0, complete: None, measured: self.measuring });
+        self.newest += 1;
+        self.versions += u64::from(self.measuring);
+        self.spreading.push_back(Version { at: now, holders: 0, measured: self.measuring });
     }
 
     /// An actor has read this version, after the version `before`.
     pub(super) fn received(&mut self, now: f64, before: u64, version: u64) {
-        for passed in &mut self.versions[before as usize..version as usize] {
+        // Every actor has at least this one.
+        let complete = self.newest - self.spreading.len() as u64;
+        let mut published = now;
+        for passed in self.spreading.range_mut((before - complete) as usize..(version - complete) as usize) {
             passed.holders += 1;
-            if passed.holders == self.actors {
-                passed.complete = Some(now);
-            }
+            published = passed.at;
         }
-        if let Some(read) = self.versions.get(version as usize - 1).filter(|_| self.measuring) {
-            self.reads.push(now - read.at);
-            self.late.push((self.versions.len() as u64 - version) as f64);
+        if self.measuring {
+            self.reads.add(now - published);
+            self.late.add((self.newest - version) as f64);
+        }
+        while let Some(version) = self.spreading.pop_front_if(|version| version.holders == self.actors) {
+            if version.measured {
+                self.publications.add(now - version.at);
+            }
         }
     }
 
@@ -135,7 +148,7 @@ impl Observed {
                 self.start = Some(now);
             }
         } else if self.measuring {
-            self.waits_for_versions.push(waited);
+            self.waits_for_versions.add(waited);
         }
     }
 
@@ -148,7 +161,7 @@ impl Observed {
     /// The learner has answered for a whole round.
     pub(super) fn acknowledged(&mut self, waited: f64) {
         if self.measuring {
-            self.waits_for_acknowledgements.push(waited);
+            self.waits_for_acknowledgements.add(waited);
         }
     }
 

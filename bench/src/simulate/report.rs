@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::{Value, json};
 
+use super::distribution::{self, Distribution};
 use super::observed::{Dropped, Observed};
 use super::settings::Settings;
 
@@ -14,6 +15,8 @@ const CPU_PER_GIGABYTE: [f64; 2] = [0.39, 0.30];
 const CONNECTION: f64 = 71_000.0;
 /// Bytes of messages that a learner has read and that wait (`--max-ingest-bytes`).
 const ROOM: f64 = 268_435_456.0;
+/// Versions that a simulation must have measured: with fewer its figures may be those of the start.
+const ENOUGH_VERSIONS: u64 = 10;
 /// Versions beside those that are held: the one that is made, and the parameters that it is made from.
 const MAKING: usize = 2;
 
@@ -30,16 +33,14 @@ pub(super) fn figures(settings: &Settings, observed: &Observed) -> Vec<Value> {
     };
     let bounds = json!({
         "actors_bound": settings.actor_bound(), "learners_bound": settings.learner_bound(),
-        "links_bound": settings.link_bound(),
+        "links_bound": settings.link_bound(), "measured_s": seconds, "few_versions": observed.versions < ENOUGH_VERSIONS,
     });
-    let age = |percent| aged(ages, percent);
+    let age = |percent| distribution::quantile(ages, percent).map(|age| age as f64);
     let Dropped { arriving, waiting, in_a_batch } = *dropped;
     let offered = (unrolls + dropped.all()) as f64;
     let share = |count: u64| if offered > 0.0 { count as f64 / offered } else { 0.0 };
     let busy = acting / (settings.workers() as f64 * seconds);
-    let publications = observed.publications();
-    let complete: Option<Vec<f64>> = publications.iter().copied().collect();
-    let complete = complete.unwrap_or_default();
+    let publication = |percent| observed.publications()?.quantile(percent);
     let [bytes_in, bytes_out] = bytes.map(|bytes| bytes / seconds);
     let cores = [bytes_in, bytes_out].iter().zip(CPU_PER_GIGABYTE).map(|(bytes, cpu)| bytes / 1e9 * cpu).sum();
     let memory = Memory::new(settings, observed);
@@ -49,7 +50,7 @@ pub(super) fn figures(settings: &Settings, observed: &Observed) -> Vec<Value> {
             "busy",
             Some(learning / seconds),
             "share of the learners' time",
-            json!({ "all_reduce_s": settings.all_reduce() }),
+            json!({ "exchanges_s": settings.exchanges() }),
         ),
         line("age", age(50), "versions", json!({ "mean": mean(ages), "p99": age(99), "max": age(100) })),
         line(
@@ -69,10 +70,10 @@ pub(super) fn figures(settings: &Settings, observed: &Observed) -> Vec<Value> {
         ),
         line(
             "publication",
-            quantile(&complete, 50),
+            publication(50),
             "s until the last actor has a version",
             json!({
-                "max": quantile(&complete, 100), "versions": publications.len(), "cut_off": observed.cut_off,
+                "max": publication(100), "versions": observed.versions, "cut_off": observed.cut_off,
                 "lag_seconds": quantiles(&observed.reads), "lag_versions": quantiles(&observed.late),
             }),
         ),
@@ -93,6 +94,8 @@ fn of_links(settings: &Settings, bytes: f64) -> Value {
 struct Memory {
     batches: f64,
     messages: f64,
+    /// Unrolls for which messages have no room: they wait in the windows of their connections.
+    windows: f64,
     parameters: f64,
     connections: f64,
 }
@@ -100,23 +103,28 @@ struct Memory {
 impl Memory {
     fn new(settings: &Settings, observed: &Observed) -> Self {
         let Settings { actors, learners, batch, ahead, unroll_bytes, parameter_bytes, .. } = *settings;
+        let waiting = observed.most_waiting as f64 * unroll_bytes;
         Self {
             batches: ((ahead + 1) * batch / learners) as f64 * unroll_bytes,
-            messages: (observed.most_waiting as f64 * unroll_bytes).min(ROOM),
+            messages: waiting.min(ROOM),
+            windows: (waiting - ROOM).max(0.0),
             parameters: (observed.most_held + MAKING) as f64 * parameter_bytes,
             connections: actors.div_ceil(learners) as f64 * CONNECTION,
         }
     }
 
     fn sum(self) -> f64 {
-        self.batches + self.messages + self.parameters + self.connections
+        self.batches + self.messages + self.windows + self.parameters + self.connections
     }
 
     fn parts(self) -> Value {
-        let Self { batches, messages, parameters, connections } = self;
-        let [batches, messages, parameters, connections] =
-            [batches, messages, parameters, connections].map(|bytes| bytes / MEGABYTE);
-        json!({ "batches": batches, "messages": messages, "parameters": parameters, "connections": connections })
+        let Self { batches, messages, windows, parameters, connections } = self;
+        let [batches, messages, windows, parameters, connections] =
+            [batches, messages, windows, parameters, connections].map(|bytes| bytes / MEGABYTE);
+        json!({
+            "batches": batches, "messages": messages, "windows": windows, "parameters": parameters,
+            "connections": connections,
+        })
     }
 }
 
@@ -126,36 +134,6 @@ fn mean(ages: &BTreeMap<u64, u64>) -> Option<f64> {
     (all > 0).then(|| sum as f64 / all as f64)
 }
 
-/// The age that `percent` of the unrolls do not exceed.
-fn aged(ages: &BTreeMap<u64, u64>, percent: u64) -> Option<f64> {
-    let all: u64 = ages.values().sum();
-    let mut left = (all * percent).div_ceil(100).max(1);
-    let found = ages.iter().find(|(_, count)| {
-        let reached = **count >= left;
-        left = left.saturating_sub(**count);
-        reached
-    });
-    found.map(|(age, _)| *age as f64)
-}
-
-fn quantiles(values: &[f64]) -> Value {
-    json!({ "p50": quantile(values, 50), "p99": quantile(values, 99), "max": quantile(values, 100) })
-}
-
-fn quantile(values: &[f64], percent: usize) -> Option<f64> {
-    let mut values = values.to_vec();
-    values.sort_by(f64::total_cmp);
-    values.get(values.len().saturating_sub(1) * percent / 100).copied()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_age_at_a_percentage_is_that_of_a_sorted_list() {
-        let ages = [(0, 60), (2, 39), (7, 1)].into();
-        assert_eq!([50, 60, 61, 99, 100].map(|percent| aged(&ages, percent)), [0.0, 0.0, 2.0, 2.0, 7.0].map(Some));
-        assert_eq!(aged(&[].into(), 50), None);
-    }
+fn quantiles(values: &Distribution) -> Value {
+    json!({ "p50": values.quantile(50), "p99": values.quantile(99), "max": values.quantile(100) })
 }

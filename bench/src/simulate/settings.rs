@@ -27,11 +27,14 @@ pub(super) struct Settings {
     pub(super) unroll_bytes: f64,
     pub(super) parameter_bytes: f64,
     pub(super) gradient_bytes: f64,
+    pub(super) all_reduce_gbps: f64,
+    pub(super) exchange_ms: f64,
     pub(super) asset_bytes: f64,
     pub(super) start_s: f64,
     pub(super) spread: f64,
     pub(super) any_version: bool,
     pub(super) seconds: f64,
+    pub(super) versions: u64,
     pub(super) give_up_s: f64,
     pub(super) seed: u64,
 }
@@ -63,15 +66,20 @@ impl Settings {
         (self.environments * self.length) as f64 * self.step_us / 1e6
     }
 
-    /// Seconds of an update without its all-reduce. A learner has its part of the batch, and its time is in proportion.
+    /// Seconds of an update without its exchanges. A learner has its part of the batch, and its time is in proportion.
     pub(super) fn compute(&self) -> f64 {
         self.update_ms / 1e3 / self.learners as f64
     }
 
-    /// Seconds in which the learners add their gradients around a ring that has the link to itself.
-    pub(super) fn all_reduce(&self) -> f64 {
+    /// Seconds of an update in which the learners exchange what they need of each other: a fixed part, and gradients that go
+    /// around a ring. The ring has the link to itself; the backend may be slower than the link.
+    pub(super) fn exchanges(&self) -> f64 {
+        if self.learners == 1 {
+            return 0.0;
+        }
         let learners = self.learners as f64;
-        2.0 * (learners - 1.0) / learners * self.gradient_bytes / self.bytes_per_second()
+        let bytes_per_second = self.link_gbps.min(self.all_reduce_gbps) * GIGABIT;
+        self.exchange_ms / 1e3 + 2.0 * (learners - 1.0) / learners * self.gradient_bytes / bytes_per_second
     }
 
     /// Bytes a second of a learner's link, in each direction.
@@ -91,7 +99,7 @@ impl Settings {
 
     /// Environment steps a second that the learners can learn from if they never wait.
     pub(super) fn learner_bound(&self) -> f64 {
-        (self.batch * self.length) as f64 / (self.compute() + self.all_reduce())
+        (self.batch * self.length) as f64 / (self.compute() + self.exchanges())
     }
 
     /// Environment steps a second whose unrolls the links can carry.

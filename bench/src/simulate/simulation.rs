@@ -14,6 +14,8 @@ use super::settings::Settings;
 
 /// Seconds after which a reader without a place looks for one again (`Holding::idle`).
 const RETRY: f64 = 5.0;
+/// The part of the measured time and of the measured versions that passes before: what the start has left must end.
+const WARM_UP: f64 = 0.25;
 
 #[derive(Debug)]
 pub(super) struct Simulation {
@@ -61,6 +63,8 @@ struct Learner {
     /// Actors that read no version at present.
     idle: Vec<usize>,
     retries: bool,
+    /// Unrolls that have arrived and are not read yet.
+    unread: usize,
 }
 
 #[derive(Debug, Default)]
@@ -101,6 +105,7 @@ impl Simulation {
             batch: None,
             idle: Vec::new(),
             retries: false,
+            unread: 0,
         };
         let actor = |index: usize| Actor { parked: (index * threads..).take(threads).collect(), ..Actor::default() };
         let links = learners * if settings.shared_link { 1 } else { 2 };
@@ -129,14 +134,13 @@ impl Simulation {
     /// Until the last actor acts, then a while, then the time that is measured, and then until the last actor has the last
     /// version of that time.
     pub(super) fn run(mut self) -> Observed {
-        let Settings { seconds, give_up_s, .. } = self.settings;
+        let Settings { seconds, versions, give_up_s, .. } = self.settings;
         while self.observed.start().is_none() && self.step(give_up_s) {}
-        let begin = self.now + seconds / 5.0;
-        while self.step(begin) {}
+        self.pass(seconds * WARM_UP, (versions as f64 * WARM_UP).ceil() as u64);
         let dropped = self.dropped_in_batches();
         let carried = self.carried();
-        self.observed.begin(begin);
-        while self.step(begin + seconds) {}
+        self.observed.begin(self.now);
+        self.pass(seconds, versions);
         let [bytes_in, bytes_out] = self.carried();
         self.observed.bytes = [bytes_in - carried[0], bytes_out - carried[1]];
         self.observed.dropped.in_a_batch = self.dropped_in_batches() - dropped;
@@ -144,8 +148,22 @@ impl Simulation {
             self.observed.learned(since, self.now);
         }
         self.observed.end(self.now);
-        while self.observed.awaits_a_version() && self.step(begin + seconds + give_up_s) {}
+        let limit = self.now + give_up_s;
+        while self.observed.awaits_a_version() && self.step(limit) {}
         self.observed
+    }
+
+    /// Lets this time pass, and more until this many versions are published, unless one needs too long.
+    fn pass(&mut self, seconds: f64, versions: u64) {
+        let (end, last) = (self.now + seconds, self.version + versions);
+        while self.step(end) {}
+        for newer in self.version + 1..=last {
+            let limit = self.now + self.settings.give_up_s;
+            while self.version < newer && self.step(limit) {}
+            if self.version < newer {
+                return;
+            }
+        }
     }
 
     /// The next event, if there is one until `limit`.
@@ -221,9 +239,8 @@ impl Simulation {
     /// The actors that were reading this version, whose transfers end.
     fn cut_off(&mut self, learner: usize, replaced: u64) -> Vec<usize> {
         let link = self.link(learner, Direction::Out);
-        let all = (learner..self.actors.len()).step_by(self.learners.len());
         let mut lost = Vec::new();
-        for actor in all {
+        for actor in (learner..self.actors.len()).step_by(self.learners.len()) {
             if let Some((_, key)) = self.actors[actor].reading.take_if(|(version, _)| *version == replaced) {
                 self.links[link].cancel(self.now, key);
                 lost.push(actor);
@@ -302,17 +319,20 @@ impl Simulation {
     }
 
     fn arrived(&mut self, actor: usize) {
+        let learner = self.learner_of(actor);
         self.actors[actor].unread = self.actors[actor].uploading.take();
+        self.learners[learner].unread += 1;
         self.take_unread(actor);
-        self.pump(self.learner_of(actor));
+        self.pump(learner);
     }
 
     /// The learner reads an unroll when the one before it has its place.
     fn take_unread(&mut self, actor: usize) {
-        let batcher = &mut self.learners[actor % self.settings.learners].batcher;
+        let Learner { batcher, unread, .. } = &mut self.learners[actor % self.settings.learners];
         while !self.actors[actor].inserting
             && let Some(unroll) = self.actors[actor].unread.take()
         {
+            *unread -= 1;
             match batcher.is_stale(unroll.version) {
                 true => {
                     self.observed.drop(Dropped { arriving: 1, ..Dropped::default() });
@@ -340,8 +360,8 @@ impl Simulation {
                 self.acknowledge(owner, unroll.worker);
                 self.take_unread(owner);
             }
-            let Learner { batcher, batch, .. } = &mut self.learners[learner];
-            self.observed.waiting(batcher.waiting());
+            let Learner { batcher, batch, unread, .. } = &mut self.learners[learner];
+            self.observed.waiting(batcher.waiting() + *unread);
             if batch.is_some() {
                 return;
             }
@@ -374,8 +394,7 @@ impl Simulation {
         }
         let slowest = (0..self.learners.len()).map(|_| self.about_one()).fold(0.0, f64::max);
         self.updating = Some(self.now);
-        let end = self.now + self.settings.compute() * slowest + self.settings.all_reduce();
-        self.events.add(end, Event::Updated);
+        self.events.add(self.now + self.settings.compute() * slowest + self.settings.exchanges(), Event::Updated);
     }
 
     fn updated(&mut self) {
@@ -424,9 +443,8 @@ impl Simulation {
 
     /// Bytes that the links have carried so far, in and out.
     fn carried(&mut self) -> [f64; 2] {
-        let now = self.now;
-        let links = &mut self.links;
+        let Self { now, links, .. } = self;
         [Direction::In, Direction::Out]
-            .map(|direction| links.iter_mut().map(|link| link.delivered(now, direction)).sum())
+            .map(|direction| links.iter_mut().map(|link| link.delivered(*now, direction)).sum())
     }
 }

@@ -26,11 +26,14 @@ fn small() -> Settings {
         unroll_bytes: 200_000.0,
         parameter_bytes: 5e6,
         gradient_bytes: 1e7,
+        all_reduce_gbps: FAST,
+        exchange_ms: 0.0,
         asset_bytes: 0.0,
         start_s: 0.0,
         spread: 0.0,
         any_version: false,
         seconds: 60.0,
+        versions: 0,
         give_up_s: 600.0,
         seed: 1,
     }
@@ -52,8 +55,13 @@ fn oldest(observed: &Observed) -> u64 {
 }
 
 fn publication(settings: Settings) -> f64 {
-    let times: Option<Vec<f64>> = observe(settings).publications().into_iter().collect();
-    times.unwrap().into_iter().fold(0.0, f64::max)
+    observe(settings).publications().unwrap().quantile(100).unwrap()
+}
+
+/// Megabytes of a part of a learner's memory.
+fn memory(settings: Settings, part: &str) -> f64 {
+    let lines = super::report::figures(&settings, &observe(settings));
+    lines.iter().find(|line| line["figure"] == "simulate.memory").unwrap()[part].as_f64().unwrap()
 }
 
 #[track_caller]
@@ -126,7 +134,7 @@ fn the_bytes_to_the_learner_are_those_of_its_unrolls() {
 #[test]
 fn the_bytes_from_the_learner_are_a_version_for_each_actor() {
     let observed = observe(Settings { link_gbps: 100.0, ..small() });
-    let versions = observed.publications().len() as f64;
+    let versions = observed.versions as f64;
     assert_near(observed.bytes[1], versions * 64.0 * 5e6, 0.01 + 1.0 / versions);
 }
 
@@ -149,6 +157,20 @@ fn two_learners_halve_the_update_and_the_traffic_of_each() {
     let two = Settings { learners: 2, ..one };
     assert_near(speed(two), 16.0 * 32.0 / (0.025 + 1e7 / 1e9), 0.01);
     assert_near(publication(two), publication(one) / 2.0, 0.02);
+}
+
+#[test]
+fn gradients_move_as_fast_as_the_slower_of_backend_and_link() {
+    let two = Settings { learners: 2, link_gbps: 80.0, all_reduce_gbps: 8.0, ..small() };
+    assert_near(two.exchanges(), 1e7 / 1e9, 1e-9);
+    assert_near(Settings { link_gbps: 0.8, ..two }.exchanges(), 1e7 / 1e8, 1e-9);
+}
+
+#[test]
+fn learners_pay_for_each_exchange_and_one_alone_pays_nothing() {
+    let two = Settings { learners: 2, exchange_ms: 3.0, ..small() };
+    assert_near(speed(two), 16.0 * 32.0 / (0.025 + 0.003), 0.01);
+    assert_near(speed(Settings { learners: 1, ..two }), speed(small()), 1e-9);
 }
 
 #[test]
@@ -187,6 +209,40 @@ fn actors_that_wait_for_the_announced_version_send_newer_unrolls() {
 }
 
 #[test]
+fn rare_versions_are_waited_for_until_enough_are_measured() {
+    // A version each 50 s.
+    let rare = Settings { target_period: 1000, seconds: 1.0, versions: 4, ..small() };
+    let observed = observe(rare);
+    assert_eq!(observed.versions, 4);
+    assert_near(observed.seconds, 4.0 * 50.0, 0.01);
+    // The first one does not come in time.
+    assert_eq!(observe(Settings { give_up_s: 10.0, ..rare }).versions, 0);
+}
+
+#[test]
+fn too_few_versions_for_a_steady_state_are_reported() {
+    let few = |versions| {
+        let settings = Settings { target_period: 100, seconds: 1.0, versions, ..small() };
+        super::report::figures(&settings, &observe(settings))[0]["few_versions"].clone()
+    };
+    assert_eq!([few(9), few(10)], [true, false]);
+}
+
+#[test]
+fn a_stream_holds_an_unroll_that_waits_for_its_place_and_one_in_its_window() {
+    let one = Settings { actors: 1, environments: 64, unroll_bytes: 1e6, update_ms: 1e4, ..small() };
+    assert_eq!(memory(one, "messages"), 2.0);
+}
+
+#[test]
+fn unrolls_that_messages_have_no_room_for_are_memory_as_well() {
+    // All actors but 32 wait for the learner, with an unroll of 1 MB each.
+    let crowd = Settings { actors: 832, unroll_bytes: 1e6, update_ms: 1e4, ..small() };
+    assert_near(memory(crowd, "messages"), 268.4, 0.01);
+    assert_near(memory(crowd, "messages") + memory(crowd, "windows"), 800.0, 0.05);
+}
+
+#[test]
 fn the_seed_decides_everything() {
     let settings = Settings { link_gbps: 1.0, spread: 0.3, start_s: 1.0, ..small() };
     let lines = |settings: Settings| super::report::figures(&settings, &observe(settings));
@@ -203,6 +259,12 @@ fn every_figure_of_a_hopeless_system_is_a_number_or_null() {
     assert!(value("simulate.start").is_null() && value("simulate.age").is_null());
     assert_eq!(value("simulate.steps"), 0.0);
     assert_eq!(value("simulate.waiting"), 1.0);
+}
+
+#[test]
+fn times_for_which_a_clock_is_too_coarse_are_refused() {
+    assert_eq!(super::time("1e6"), Ok(1e6));
+    assert!(super::time("1e7").is_err() && super::time_or_none("1e7").is_err() && super::time("0").is_err());
 }
 
 #[test]
