@@ -48,10 +48,10 @@ fn trained(
     (learner, losses)
 }
 
-/// Unrolls whose advantages, lengths and tasks differ from rank to rank.
-fn batches(experiment: &Experiment, spec: &TaskSpec, count: u64) -> Vec<Unrolls> {
+/// Batches of this many unrolls, whose advantages, lengths and tasks differ from rank to rank.
+fn batches(experiment: &Experiment, spec: &TaskSpec, count: u64, unrolls: usize) -> Vec<Unrolls> {
     let batch = |seed: u64| {
-        let mut unrolls = Unrolls::recorded(experiment, spec, seed, 12);
+        let mut unrolls = Unrolls::recorded(experiment, spec, seed, unrolls);
         if experiment.vmpo.action_gradient != 0.0 {
             unrolls.action_gradient = Numbers::new(seed + 200).take(unrolls.action.len());
         }
@@ -62,7 +62,7 @@ fn batches(experiment: &Experiment, spec: &TaskSpec, count: u64) -> Vec<Unrolls>
 
 /// Compares the ranks of a world with one learner. Returns the largest differences of their states and of their losses.
 fn compare(spec: &TaskSpec, experiment: &Experiment, size: usize, steps: u64) -> (f64, f64) {
-    let batches = batches(experiment, spec, steps);
+    let batches = batches(experiment, spec, steps, 12);
     let (alone, expected) = trained(spec, experiment, &World::alone(), &batches);
     let ranks = in_world(size, {
         let (spec, experiment) = (spec.clone(), experiment.clone());
@@ -113,7 +113,7 @@ fn every_kind() -> Vec<(&'static str, TaskSpec, Experiment)> {
 #[test]
 fn the_gradient_of_two_learners_with_64_unrolls_is_that_of_one_with_128() {
     for (kind, spec, experiment) in every_kind() {
-        let batch = [Unrolls::recorded(&experiment, &spec, 1, 128)];
+        let batch = batches(&experiment, &spec, 1, 128);
         let (alone, _) = trained(&spec, &experiment, &World::alone(), &batch);
         let ranks = in_world(2, {
             let (spec, experiment) = (spec.clone(), experiment.clone());
@@ -167,7 +167,7 @@ fn thirty_updates_of_two_and_of_three_ranks_are_those_of_one_learner() {
 
 #[test]
 fn a_gradient_step_speaks_with_the_other_ranks_twice() {
-    let batches = batches(&experiment(), &spec(), 3);
+    let batches = batches(&experiment(), &spec(), 3, 12);
     let operations = in_world(2, move |world| {
         trained(&spec(), &experiment(), &world, &batches);
         world.operations()

@@ -3,6 +3,7 @@
 
 mod accounts;
 mod learner;
+mod lines;
 mod logs;
 mod numbers;
 

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, Result};
 
-use super::logs::{field, incarnation, time};
+use super::lines::{field, incarnation, time};
 
 /// A learner that may have been killed and started again.
 #[derive(Debug, Default, PartialEq, Eq)]
