@@ -99,7 +99,7 @@ pub struct Simulate {
     #[arg(long, value_name = "GBPS", default_value_t = 12.0, value_parser = positive)]
     all_reduce_gbps: f64,
     /// Time of an update's exchanges between learners without the bytes of gradients, ms. The two of a gradient step took
-    /// about 6 ms on two cores that the learners shared; half of it, with cores of their own, is an assumption
+    /// about 7 ms on two cores that the learners shared; half of it, with cores of their own, is an assumption
     #[arg(long, value_name = "MS", default_value_t = 3.0, value_parser = zero_or_more)]
     exchange_ms: f64,
     /// Bytes of the assets that an actor fetches at its start; 0 where it has them

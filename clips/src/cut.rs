@@ -12,9 +12,6 @@ use crate::write::ClipWriter;
 /// Characters of the name of a file, before its ending.
 const NAME: usize = 32;
 const ENDING: &str = ".h5";
-/// It is part of what a name is made of. Whoever changes how the same clips are written raises it: then files of older releases have
-/// other names and are not used.
-const FORMAT: u8 = 1;
 
 /// A file in `directory` with these clips of `file`, sorted, whose SHA-256 is `sha256`. Clips and features are the same, bit for bit;
 /// markers, props and dates are not copied. A file that is there already is used if it reads as these clips, and is replaced if not.
@@ -22,9 +19,7 @@ const FORMAT: u8 = 1;
 /// # Errors
 /// [`Error::Unwritable`]; [`Error::Unreadable`] and [`Error::Malformed`] of `file`.
 pub(crate) fn cut(file: &ClipFile, sha256: &[u8; 32], names: &[String], directory: &Path) -> Result<PathBuf, Error> {
-    let mut origin = Sha256::new();
-    origin.update([FORMAT]);
-    origin.update(sha256);
+    let mut origin = Sha256::new_with_prefix(sha256);
     names.iter().for_each(|name| origin.update(format!("{name}/")));
     let mut name = hex::encode(origin.finalize());
     name.truncate(NAME);
@@ -58,7 +53,7 @@ fn has_exactly(path: &Path, file: &ClipFile, names: &[String]) -> Result<bool, E
     Ok(true)
 }
 
-/// Removes the files in `directory` that [`cut`] made and that are not `kept`: of an experiment with other clips, or of another release.
+/// Removes the files in `directory` that [`cut`] made and that are not `kept`: those of an experiment with other clips, or of another source.
 /// Everything else stays. A file that cannot be removed costs only its room, and the next call tries again.
 pub(crate) fn remove_other_cuts(directory: &Path, kept: &[&Path]) {
     // There is no directory until something was cut.
@@ -70,7 +65,7 @@ pub(crate) fn remove_other_cuts(directory: &Path, kept: &[&Path]) {
     }
 }
 
-/// Whether [`cut`] makes files of such a name, in this release or another.
+/// Whether [`cut`] makes files of such a name.
 fn is_cut(name: &OsStr) -> bool {
     let digits = name.to_str().and_then(|name| name.strip_suffix(ENDING)).unwrap_or_default();
     digits.len() == NAME && digits.bytes().all(|digit| matches!(digit, b'0'..=b'9' | b'a'..=b'f'))

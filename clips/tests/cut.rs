@@ -3,11 +3,12 @@
 #![allow(clippy::unwrap_used, reason = "a test stops at the first surprise")]
 
 use std::os::unix::fs::MetadataExt as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use comic_clips::edit::speed;
 use comic_clips::{Asset, Catalogue, ClipWriter};
 use comic_experiment::ClipSource;
+use tempfile::TempDir;
 
 /// A file with copies of built-in clips, each named by a letter.
 fn write(path: &Path, copies: &[(&str, &str)]) {
@@ -23,9 +24,13 @@ fn write(path: &Path, copies: &[(&str, &str)]) {
     writer.finish().unwrap();
 }
 
-/// A file of eight clips: four names for each of two built-in clips.
-fn whole(path: &Path) {
-    write(path, &[("builtin:CMU_007_01", "abcd"), ("builtin:walk", "efgh")]);
+/// A directory with a file of eight clips, four names for each of two built-in clips, and a place for its parts.
+fn whole() -> (TempDir, PathBuf, PathBuf) {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("all.h5");
+    write(&path, &[("builtin:CMU_007_01", "abcd"), ("builtin:walk", "efgh")]);
+    let cuts = directory.path().join("assets");
+    (directory, path, cuts)
 }
 
 fn some(source: &str, ids: &[&str]) -> ClipSource {
@@ -57,14 +62,11 @@ fn name(asset: &Asset) -> String {
 
 #[test]
 fn an_actor_finds_the_same_clips_in_the_part_as_in_the_whole() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("all.h5");
-    whole(&path);
+    let (_directory, path, cuts) = whole();
     let source = path.to_str().unwrap();
     // An experiment may name a source several times.
     let sources = [some(source, &["f", "a"]), some(source, &["h"])];
     let catalogue = Catalogue::open(&sources).unwrap();
-    let cuts = directory.path().join("assets");
     let assets = catalogue.assets(Some(&cuts)).unwrap();
     assert_eq!(assets.len(), 1);
     assert_eq!(assets[0].source, source);
@@ -76,11 +78,8 @@ fn an_actor_finds_the_same_clips_in_the_part_as_in_the_whole() {
 /// Actors that have the file need no other one.
 #[test]
 fn the_next_start_of_the_learner_uses_the_file_and_writes_nothing() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("all.h5");
-    whole(&path);
+    let (_directory, path, cuts) = whole();
     let catalogue = Catalogue::open(&[some(path.to_str().unwrap(), &["a", "f"])]).unwrap();
-    let cuts = directory.path().join("assets");
     let start = || {
         let assets = catalogue.assets(Some(&cuts)).unwrap();
         let file = std::fs::metadata(&assets[0].path).unwrap();
@@ -91,12 +90,9 @@ fn the_next_start_of_the_learner_uses_the_file_and_writes_nothing() {
 
 #[test]
 fn a_damaged_part_is_replaced() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("all.h5");
-    whole(&path);
+    let (_directory, path, cuts) = whole();
     let sources = [some(path.to_str().unwrap(), &["a", "f"])];
     let catalogue = Catalogue::open(&sources).unwrap();
-    let cuts = directory.path().join("assets");
     let part = catalogue.assets(Some(&cuts)).unwrap().remove(0).path;
     let good = std::fs::read(&part).unwrap();
     let damages: [(&str, &dyn Fn()); 6] = [
@@ -120,26 +116,19 @@ fn a_damaged_part_is_replaced() {
 }
 
 #[test]
-fn parts_of_other_selections_and_releases_are_removed() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("all.h5");
-    whole(&path);
-    let cuts = directory.path().join("assets");
+fn parts_of_other_selections_and_sources_are_removed() {
+    let (_directory, path, cuts) = whole();
     let cut =
         |ids: &[&str]| Catalogue::open(&[some(path.to_str().unwrap(), ids)]).unwrap().assets(Some(&cuts)).unwrap();
     cut(&["a", "f"]);
-    // Releases make names of the same form.
-    std::fs::write(cuts.join("0123456789abcdef0123456789abcdef.h5"), "of another release").unwrap();
+    std::fs::write(cuts.join("0123456789abcdef0123456789abcdef.h5"), "of another source").unwrap();
     let assets = cut(&["a", "g"]);
     assert_eq!(names(&cuts), [name(&assets[0])]);
 }
 
 #[test]
 fn files_that_are_no_parts_stay() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("all.h5");
-    whole(&path);
-    let cuts = directory.path().join("assets");
+    let (_directory, path, cuts) = whole();
     std::fs::create_dir(&cuts).unwrap();
     let digits = "0123456789abcdef".repeat(2);
     let foreign = ["0123.h5", "walks.h5", &digits, &format!("{digits}.txt"), &format!("{}.h5", digits.to_uppercase())];
@@ -155,12 +144,10 @@ fn files_that_are_no_parts_stay() {
 
 #[test]
 fn the_parts_of_all_sources_stay() {
-    let directory = tempfile::tempdir().unwrap();
-    let [first, second] = ["all.h5", "more.h5"].map(|name| directory.path().join(name));
-    whole(&first);
+    let (directory, first, cuts) = whole();
+    let second = directory.path().join("more.h5");
     write(&second, &[("builtin:walk", "xyz")]);
     let sources = [some(first.to_str().unwrap(), &["a"]), some(second.to_str().unwrap(), &["x"])];
-    let cuts = directory.path().join("assets");
     let assets = Catalogue::open(&sources).unwrap().assets(Some(&cuts)).unwrap();
     let mut expected: Vec<_> = assets.iter().map(name).collect();
     expected.sort_unstable();
@@ -169,12 +156,9 @@ fn the_parts_of_all_sources_stay() {
 
 #[test]
 fn a_file_most_of_which_is_used_is_sent_as_it_is() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("all.h5");
-    whole(&path);
+    let (_directory, path, cuts) = whole();
     let sources = [some(path.to_str().unwrap(), &["a", "b", "c", "d", "e"])];
     let catalogue = Catalogue::open(&sources).unwrap();
-    let cuts = directory.path().join("assets");
     assert_eq!(catalogue.assets(Some(&cuts)).unwrap(), catalogue.assets(None).unwrap());
     assert!(!cuts.exists());
 }
