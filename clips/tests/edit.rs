@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use comic_clips::check::check;
 use comic_clips::edit::{join, mirror, rewrite, speed};
-use comic_clips::spatial::{half_angle_between, norm, normalize, subtract};
+use comic_clips::spatial::{add, half_angle_between, norm, normalize, rotated, subtract};
 use comic_clips::{
     Catalogue, Clip, ClipWriter, Error, Features, JOINT_RANGES, JOINTS, Motion, WalkerModel, builtin_names, merge,
 };
@@ -19,12 +19,13 @@ const DT: f64 = 0.03;
 /// Tracking bodies of each side: legs, then arms; first of the left side, and first of the right side.
 const SIDES: [[usize; 3]; 2] = [[0, 5, 5], [17, 24, 7]];
 const THORAX: usize = 12;
-const ARMS: usize = 17;
-/// Greatest distance of a body from its mirror image, m: the offsets of the spine are not quite symmetric. It is 8 mm for
-/// the upper neck, 6.5 mm for the head, and 2.6 mm for arms.
-const SPINE: f64 = 0.0083;
-/// Bodies below the upper back.
-const LOWER: usize = 11;
+/// How far a body of the spine is to the left of the one that carries it, m, in the frame of that one: the body of this
+/// index by the positions of dm_control's `humanoid_CMU_V2020.xml`. All other offsets are symmetric.
+const SIDEWAYS: [(usize, f64); 4] = [(11, 0.0006790344), (12, 0.0006150336), (14, -0.003961716), (15, 0.0012021)];
+/// Twice the sideways offsets of the thorax and below: the arms are at most this far from their mirror image, m.
+const ARMS_MISS: f64 = 2.0 * (0.0006790344 + 0.0006150336);
+/// The same of the centre of mass, from all offsets of bodies and of their centres, weighted by mass, m.
+const CENTER_MISS: f64 = 2.82e-3;
 
 fn builtin(name: &str) -> Clip {
     Catalogue::open(&[ClipSource::whole(format!("builtin:{name}"))]).unwrap().load(0).unwrap()
@@ -61,6 +62,10 @@ fn other(body: usize) -> usize {
 
 fn places(features: &Features) -> Vec<Vec<[f64; 3]>> {
     features.body_positions.chunks_exact(31 * 3).map(|frame| frame.as_chunks().0.to_vec()).collect()
+}
+
+fn orientations(features: &Features) -> Vec<Vec<[f64; 4]>> {
+    features.body_quaternions.chunks_exact(31 * 4).map(|frame| frame.as_chunks().0.to_vec()).collect()
 }
 
 /// Greatest difference of two lists of numbers.
@@ -107,23 +112,28 @@ proptest! {
     fn bodies_of_a_mirrored_motion_are_the_mirror_image_of_the_bodies(clip in random_clip()) {
         let (before, after) = (features(&clip), features(&mirror(&clip).unwrap().0));
         let image = |[x, y, z]: [f64; 3]| [-x, y, z];
-        for (before, after) in places(&before).iter().zip(places(&after)) {
-            for (body, place) in before.iter().enumerate() {
-                let miss = subtract(after[other(body)], image(*place));
-                prop_assert!(norm(&miss) < if body < LOWER { 1e-9 } else { SPINE }, "body {body}: {miss:?}");
-                if body >= ARMS {
-                    let thorax = subtract(after[THORAX], image(before[THORAX]));
-                    prop_assert!(apart(&miss, &thorax) < 1e-9, "body {body}");
-                }
+        for ((before, places), turned) in places(&before).iter().zip(places(&after)).zip(orientations(&after)) {
+            let miss = |body: usize| subtract(places[other(body)], image(before[body]));
+            for body in 0..before.len() {
+                let expected = match body {
+                    ..=10 => [0.0; 3],
+                    // From the upper back to the face; each is carried by the one before it.
+                    11..=16 => {
+                        let sideways = SIDEWAYS.iter().find(|(at, _)| *at == body).map_or(0.0, |(_, offset)| *offset);
+                        add(miss(body - 1), rotated(turned[body - 1], [2.0 * sideways, 0.0, 0.0]))
+                    }
+                    _ => miss(THORAX),
+                };
+                prop_assert!(apart(&miss(body), &expected) < 1e-9, "body {body}: {:?}, {expected:?}", miss(body));
             }
         }
         for (before, after) in before.end_effectors.iter().zip(&after.end_effectors) {
             let [rradius, lradius, rfoot, lfoot] = [0, 3, 6, 9].map(|at| image(before[at..at + 3].try_into().unwrap()));
-            prop_assert!(apart(&after[..6], [lradius, rradius].as_flattened()) < SPINE);
+            prop_assert!(apart(&after[..6], [lradius, rradius].as_flattened()) < ARMS_MISS);
             prop_assert!(apart(&after[6..], [lfoot, rfoot].as_flattened()) < 1e-9);
         }
         for (before, after) in before.center_of_mass.iter().zip(&after.center_of_mass) {
-            prop_assert!(norm(&subtract(image(*before), *after)) < 2e-3);
+            prop_assert!(norm(&subtract(image(*before), *after)) < CENTER_MISS);
         }
     }
 

@@ -37,10 +37,10 @@ pub struct Fit {
 /// = 0.
 ///
 /// Positions become (−x, y, z), quaternions (w, x, −y, −z), and angular velocities, in the root frame, (x, −y, −z). The
-/// joints of both sides are exchanged, and angles about y and z change their sign. Legs are the exact mirror image. The
-/// offsets of the body's spine are not quite symmetric, so thorax and arms are up to 2.6 mm away from theirs, neck and
-/// head up to 8 mm, and the centre of mass up to 2 mm. The left
-/// foot's geoms are no exact mirror image of the right one's either: soles can be 2 mm lower.
+/// joints of both sides are exchanged, and angles about y and z change their sign. Legs are the exact mirror image. Four
+/// bodies of the spine are not exactly above the one that carries them, and each adds twice its sideways offset: thorax
+/// and arms are at most 2.6 mm away from their mirror image, the neck 11 mm, the head 13 mm, and the centre of mass 2.8
+/// mm. The left foot's geoms are no exact mirror image of the right one's either: soles can be 2 mm lower.
 ///
 /// The ranges are symmetric except that of `rhumerusrz`, which has the left arm's range. Where an arm leaves its ranges
 /// it is fitted as in [`import`](crate::import): elbow and wrist stay as near as possible to their places. The changes
