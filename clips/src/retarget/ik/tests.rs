@@ -118,7 +118,12 @@ proptest! {
     }
 
     #[test]
-    fn a_pose_is_found_again_from_a_pose_nearby(wanted in pose(), by in prop::collection::vec(-0.2..0.2f64, 56)) {
+    fn a_pose_is_found_again_from_a_pose_nearby(mut wanted in pose(), by in prop::collection::vec(-0.2..0.2f64, 56)) {
+        // Near 90° of an upper arm's second hinge the first and the third turn it about one axis. A pose nearby may then be
+        // nearer to another solution, at the end of a range: from 77° on.
+        for joint in ["lhumerusry", "rhumerusry"].map(crate::body::joint) {
+            wanted.joints[joint] = wanted.joints[joint].clamp(-1.0, 1.0);
+        }
         let solver = Solver::new(&[], 0.0);
         let goal = Goal { near: ([0.0; 56], 0.0), ..goal(&wanted) };
         let start = Pose { joints: std::array::from_fn(|joint| wanted.joints[joint] + by[joint]), ..wanted.clone() };
