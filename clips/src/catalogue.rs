@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 
 use crate::builtin;
 use crate::clip::Clip;
-use crate::cut::{cut, remove_other_cuts};
+use crate::cut::{Cut, remove_others};
 use crate::entry::Entry;
 use crate::error::Error;
 use crate::file::{ClipFile, Header};
@@ -142,31 +142,35 @@ impl Catalogue {
     }
 
     /// The files of the clips with their hashes, each file once. Built-in clips have no file. If at most half of the clips of a file
-    /// are in use and there is a directory for `cuts`, a file with these clips alone is made there and takes its place. Then the files
+    /// are in use and there is a directory for `cuts`, a file with these clips alone is made there and takes its place. Before, the files
     /// that earlier calls made there are removed, so nobody may still fetch them.
     ///
     /// # Errors
-    /// [`Error::Unreadable`]; with `cuts` also [`Error::Unwritable`].
+    /// [`Error::Unreadable`]; with `cuts` also [`Error::Unwritable`], those of [`load`](Self::load), and those of
+    /// [`ClipWriter::add`](crate::ClipWriter::add) for a clip that it does not write.
     pub fn assets(&self, cuts: Option<&Path>) -> Result<Vec<Asset>, Error> {
-        let mut assets: Vec<Asset> = Vec::new();
+        let mut chosen: Vec<(Asset, Option<Cut>)> = Vec::new();
         for source in &self.sources {
             let Source::File { source, file } = source else { continue };
-            if assets.iter().any(|asset| asset.source == *source) {
+            if chosen.iter().any(|(whole, _)| whole.source == *source) {
                 continue;
             }
             let whole = asset(source, file.path())?;
             let used = self.used(source);
-            assets.push(match cuts {
-                Some(directory) if 2 * used.len() <= file.names().len() => {
-                    asset(source, &cut(file, &whole.sha256, &used, directory)?)?
-                }
-                _ => whole,
-            });
+            let directory = cuts.filter(|_| 2 * used.len() <= file.names().len());
+            let cut = directory.map(|directory| Cut::of(file, &whole.sha256, used, directory));
+            chosen.push((whole, cut));
         }
         if let Some(directory) = cuts {
-            remove_other_cuts(directory, &assets.iter().map(|asset| asset.path.as_path()).collect::<Vec<_>>());
+            // The disk may be full of them.
+            remove_others(directory, &chosen.iter().filter_map(|(_, cut)| cut.as_ref()).collect::<Vec<_>>());
         }
-        Ok(assets)
+        let assets = chosen.into_iter().map(|(whole, cut)| {
+            let Some(cut) = cut else { return Ok(whole) };
+            cut.write()?;
+            asset(&whole.source, cut.path())
+        });
+        assets.collect()
     }
 
     /// The names of the clips of a source that are in use, sorted. An experiment may name a source several times.

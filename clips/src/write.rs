@@ -17,6 +17,8 @@ use crate::file::{MADE_FROM, check_origin};
 const STAGED: usize = 64 << 20;
 /// Greatest length of a clip's name, bytes.
 pub(crate) const LONGEST_NAME: usize = 200;
+/// How the name of a file that is not complete begins and ends. The file stays if the process is killed.
+pub(crate) const UNFINISHED: [&str; 2] = [".clips-", ".part"];
 /// Compression level; 6 is zlib's default.
 const DEFLATE: u32 = 6;
 
@@ -122,7 +124,8 @@ fn unwritable(path: &Path, error: &dyn std::fmt::Display) -> Error {
 /// A temporary file with the usual permissions of a new file. By default only the owner can read it.
 fn temporary(directory: &Path) -> std::io::Result<NamedTempFile> {
     let mut builder = tempfile::Builder::new();
-    builder.prefix(".clips-").suffix(".part");
+    let [beginning, ending] = UNFINISHED;
+    builder.prefix(beginning).suffix(ending);
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt as _;

@@ -6,7 +6,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 use comic_clips::edit::speed;
-use comic_clips::{Asset, Catalogue, ClipWriter};
+use comic_clips::{Asset, Catalogue, ClipWriter, Error};
 use comic_experiment::ClipSource;
 use tempfile::TempDir;
 
@@ -122,8 +122,23 @@ fn parts_of_other_selections_and_sources_are_removed() {
         |ids: &[&str]| Catalogue::open(&[some(path.to_str().unwrap(), ids)]).unwrap().assets(Some(&cuts)).unwrap();
     cut(&["a", "f"]);
     std::fs::write(cuts.join("0123456789abcdef0123456789abcdef.h5"), "of another source").unwrap();
+    std::fs::write(cuts.join(".clips-abcdef.part"), "of a process that was killed").unwrap();
     let assets = cut(&["a", "g"]);
     assert_eq!(names(&cuts), [name(&assets[0])]);
+}
+
+/// The room of the old ones may be what the new ones need.
+#[test]
+fn other_parts_are_removed_also_if_a_new_one_cannot_be_written() {
+    let (_directory, path, cuts) = whole();
+    let start = |id: &str| Catalogue::open(&[some(path.to_str().unwrap(), &[id])]).unwrap().assets(Some(&cuts));
+    let part = start("g").unwrap().remove(0).path;
+    start("a").unwrap();
+    // No file can take the place of a directory that has something in it.
+    std::fs::create_dir_all(part.join("foreign")).unwrap();
+    let refused = start("g").unwrap_err();
+    assert!(matches!(refused, Error::Unwritable { .. }), "{refused}");
+    assert_eq!(names(&cuts), [part.file_name().unwrap().to_str().unwrap()]);
 }
 
 #[test]
