@@ -13,7 +13,7 @@ const ON_THE_WAY: Duration = Duration::from_secs(5);
 /// How long a rank may have no actor before that is said, and said again.
 const ALONE: Duration = Duration::from_secs(60);
 /// Most names that are remembered in each of two generations, as many as actors in the roster. When there are more, the older generation
-/// is forgotten.
+/// is forgotten, but for the names that came again meanwhile.
 const CAPACITY: usize = 65_536;
 /// Most actors that count as on their way.
 const MOST_ON_THE_WAY: usize = 65_536;
@@ -85,8 +85,9 @@ impl Placement {
 
 impl State {
     fn place(&mut self, name: Owned, now: Instant) -> usize {
-        if let Some(rank) = self.names.iter().find_map(|names| names.get(&name)) {
-            return *rank;
+        if let Some(rank) = self.names.iter().find_map(|names| names.get(&name)).copied() {
+            self.remember(name, rank);
+            return rank;
         }
         while let Some((_, rank)) = self.sent.pop_front_if(|(when, _)| now.duration_since(*when) >= ON_THE_WAY) {
             self.on_the_way[rank] -= 1;
@@ -103,7 +104,7 @@ impl State {
 
     fn remember(&mut self, name: Owned, rank: usize) {
         let [younger, older] = &mut self.names;
-        if younger.len() >= CAPACITY {
+        if younger.len() >= CAPACITY && !younger.contains_key(&name) {
             *older = std::mem::take(younger);
         }
         younger.insert(name, rank);
@@ -152,6 +153,20 @@ mod tests {
         let placement = self::placement(0);
         placement.elsewhere(of("three"), Some(5), now);
         assert_eq!(placement.elsewhere(of("three"), None, now), Some("c:3"));
+    }
+
+    #[test]
+    fn a_name_in_use_outlives_any_number_of_others() {
+        let (placement, now) = (placement(0), Instant::now());
+        placement.elsewhere(of("one"), Some(2), now);
+        for other in 0..3 * CAPACITY as u64 {
+            placement.elsewhere(of(&other.to_string()), Some(other), now);
+            if other.is_multiple_of(CAPACITY as u64 / 2) {
+                assert_eq!(placement.elsewhere(of("one"), None, now), Some("c:3"), "after {other}");
+            }
+        }
+        let names = placement.state.lock().names.each_ref().map(HashMap::len);
+        assert!(names.iter().all(|names| *names <= CAPACITY), "{names:?}");
     }
 
     #[test]
