@@ -161,6 +161,9 @@ fn masked_steps_may_hold_anything() {
     {
         assert_eq!(plain.gradient(&plain_losses.total(), left), wild.gradient(&wild_losses.total(), right));
     }
+    let [plain, wild] = [(&plain, plain_losses), (&wild, wild_losses)]
+        .map(|(case, losses)| case.gradient(&losses.total(), case.multipliers.parameter()));
+    assert_eq!(plain, wild);
 }
 
 #[test]

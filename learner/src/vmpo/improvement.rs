@@ -158,7 +158,8 @@ struct ExpectationStep {
 
 fn expectation_step(advantage: &Tensor, mask: &Tensor, eta: &Tensor, limits: &KlLimits) -> ExpectationStep {
     let selected = top(advantage, mask, limits.top_fraction);
-    let scaled = advantage / eta;
+    // A step that is not valid may have NaN, and in the gradient of η 0 · NaN is NaN.
+    let scaled = advantage.where_scalarother(mask, 0.0) / eta;
     // The log-sum-exp subtracts the maximum. If no step is valid, the maximum is set to 0. Otherwise it would be −∞ on a CPU,
     // which gives NaN, and the smallest finite number on XLA, which overflows below.
     let maximum = scaled.detach().where_scalarother(&selected, f64::NEG_INFINITY).max();
