@@ -19,11 +19,14 @@ impl Error {
             | Self::Experiment(_)
             | Self::Clips(_)
             | Self::Access(_)
-            | Self::World(world::Error::Sizes { .. })
             | Self::Networks(comic_networks::Error::Experiment(_)) => 2,
             Self::Within { source, .. } => source.exit_code(),
+            // Another world size may be that of a former run, whose rank 0 still ends.
             Self::World(
-                world::Error::Lost { .. } | world::Error::Meeting { .. } | world::Error::Unreachable { .. },
+                world::Error::Lost { .. }
+                | world::Error::Meeting { .. }
+                | world::Error::Sizes { .. }
+                | world::Error::Unreachable { .. },
             ) => LOST,
             Self::World(_)
             | Self::Networks(_)

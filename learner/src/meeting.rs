@@ -38,6 +38,8 @@ pub struct WorldArguments {
 
 /// Characters that no host has, but for an IPv6 address in brackets.
 const FORBIDDEN: [char; 8] = ['/', '@', '?', ' ', '\t', ':', '[', ']'];
+/// Most bytes of a host's name (RFC 1035, without the dots at its ends).
+const HOST_LIMIT: usize = 253;
 
 /// A host and a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -53,7 +55,7 @@ impl FromStr for Rendezvous {
         let parts = text.rsplit_once(':').map(|(host, port)| (host, port.parse()));
         let host_of = |text: &str| match text.strip_prefix('[').and_then(|text| text.strip_suffix(']')) {
             Some(host) => host.parse::<Ipv6Addr>().is_ok().then(|| host.to_owned()),
-            None => (!text.is_empty() && !text.contains(FORBIDDEN)).then(|| text.to_owned()),
+            None => ((1..=HOST_LIMIT).contains(&text.len()) && !text.contains(FORBIDDEN)).then(|| text.to_owned()),
         };
         match parts.map(|(host, port)| (host_of(host), port)) {
             Some((Some(host), Ok(port))) if port > 0 => Ok(Self { host, port }),
@@ -88,6 +90,10 @@ impl WorldArguments {
         }
         if rendezvous.is_none() {
             return wrong(format!("--world-size {size} needs --rendezvous HOST:PORT, an address of rank 0's machine"));
+        }
+        if let Some(advertised) = advertise.as_ref().filter(|advertised| advertised.is_unspecified()) {
+            let remedy = format!("--advertise {advertised} is no address that actors can reach: name this machine");
+            return wrong(remedy);
         }
         experiment.share(size)?;
         if let DeviceName::Xla(_) = experiment.learner.device {
@@ -124,10 +130,6 @@ impl Meeting {
             tracing::info!(%address, "the other ranks can meet this one here");
         }
         let own = match advertise {
-            Some(advertised) if advertised.is_unspecified() => {
-                let remedy = format!("--advertise {advertised} is no address that actors can reach: name this machine");
-                return Err(Error::Configuration(remedy));
-            }
             Some(advertised) => advertised.clone(),
             None => Rendezvous::of(advertised(serving, address)?),
         };
@@ -229,6 +231,14 @@ mod tests {
         let nowhere = WorldArguments { rendezvous: None, ..arguments(2, 0) };
         assert!(refused(|_| {}, nowhere).contains("--rendezvous"));
         assert!(refused(|_| {}, arguments(1, 0)).contains("--world-size"));
+        let advertising = |text: &str| WorldArguments { advertise: Some(text.parse().unwrap()), ..arguments(4, 3) };
+        for unreachable in ["0.0.0.0:7070", "[::]:7070"] {
+            let refused = advertising(unreachable).check(&Experiment::default()).unwrap_err().to_string();
+            assert!(refused.contains(unreachable), "{refused}");
+        }
+        for reachable in ["192.0.2.7:7070", "learner-3:7070"] {
+            advertising(reachable).check(&Experiment::default()).unwrap();
+        }
         arguments(4, 3).check(&Experiment::default()).unwrap();
     }
 
@@ -241,9 +251,6 @@ mod tests {
         assert_eq!(advertised(outside, at("192.0.2.8:7071")).unwrap(), outside);
         let refused = advertised(here, at("192.0.2.8:7071")).unwrap_err();
         assert!(refused.exit_code() == 2 && refused.to_string().contains("--advertise"), "{refused}");
-        for (text, unspecified) in [("0.0.0.0:1", true), ("[::]:1", true), ("192.0.2.7:1", false), ("a:1", false)] {
-            assert_eq!(text.parse::<Rendezvous>().unwrap().is_unspecified(), unspecified, "{text}");
-        }
     }
 
     #[test]
@@ -265,6 +272,9 @@ mod tests {
             "[a]:1",
         ] {
             assert!(text.parse::<Rendezvous>().is_err(), "{text}");
+        }
+        for (length, accepted) in [(253, true), (254, false)] {
+            assert_eq!(format!("{}:1", "a".repeat(length)).parse::<Rendezvous>().is_ok(), accepted, "{length}");
         }
     }
 }

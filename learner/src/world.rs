@@ -73,7 +73,10 @@ pub enum Error {
         source: std::io::Error,
     },
     /// Rank 0 was started with another world size.
-    #[error("rank 0 has --world-size {of_first}, and rank {rank} {size}: give all ranks the same")]
+    #[error(
+        "rank 0 has --world-size {of_first}, and rank {rank} {size}: give all ranks the same, or start this one again if rank 0 is of \
+         a former run that ends"
+    )]
     Sizes {
         /// This rank.
         rank: usize,
@@ -185,7 +188,7 @@ impl World {
         }
     }
 
-    /// Replaces each tensor by its sum over all ranks, without gradient. They have the same shapes on all ranks, one device, and one
+    /// Replaces each tensor by its sum over all ranks. The tensors carry no gradient. They have the same shapes on all ranks, one device, and one
     /// element type.
     ///
     /// # Errors

@@ -153,7 +153,9 @@ impl Connector {
                 return Ok(self.joined(link));
             }
             if link.reply.learner.len() > LEARNER_LIMIT {
-                return Err(Failure::Lost(format!("the learner at {address} names another one that no host can have")));
+                let wrong =
+                    format!("the learner at {address} names another one that no host can have: see --advertise");
+                return Err(Failure::Lost(wrong));
             }
             self.home = Some(url_of_sibling(&self.address, &link.reply.learner));
         }
