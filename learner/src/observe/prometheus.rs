@@ -52,6 +52,7 @@ pub struct Prometheus {
     pub(crate) evaluations: Counter,
     pub(crate) checkpoints: Labelled<Counter>,
     pub(crate) joins: Labelled<Counter>,
+    pub(crate) rank: Gauge,
     pub(crate) connections: Gauge,
     pub(crate) connections_refused: Labelled<Counter>,
     pub(crate) requests: Gauge,
@@ -222,6 +223,7 @@ impl Default for Prometheus {
                 "Attempts to join, reconnections included: accepted, sent to another learner of the run, refused because --max-actors are present, because the \
                  learner is going down or because the name joins too often, refused for good",
             ),
+            rank: all.gauge("comic_rank", "Which of the learners of its run this is. Rank 0 writes the checkpoints"),
             connections: all.gauge("comic_connections", "Connections that are open"),
             connections_refused: all.labelled(
                 "counter",

@@ -82,6 +82,7 @@ pub(super) fn prepare(
     })?;
     let run = options.run.clone();
     let handle = service.trainer();
+    handle.prometheus.rank.set(world.rank() as i64);
     let low_level = low_level.map(|low_level| low_level.bytes);
     let parts = TrainerParts {
         experiment,
