@@ -386,11 +386,13 @@ impl Trainer {
     }
 
     fn write_checkpoint_if_sound(&mut self, name: Name) -> Result<()> {
-        if self.is_sound() {
-            return self.write_checkpoint(name);
+        if !self.is_sound() {
+            tracing::warn!(checkpoint = %name, "not written: the last gradient steps were not finite");
+            return Ok(());
         }
-        tracing::warn!(checkpoint = %name, "not written: the last gradient steps were not finite");
-        Ok(())
+        self.save_replay(name);
+        let snapshot = self.snapshot(name)?;
+        self.checkpoints.write(name, snapshot)
     }
 
     /// A step that was skipped at the very end changed nothing, so finite parameters are enough. The replay comes after the
@@ -401,16 +403,10 @@ impl Trainer {
             tracing::warn!(checkpoint = %name, "not written: the last gradient steps were not finite");
             return Ok(());
         }
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(name)?;
         self.checkpoints.write(name, snapshot)?;
         self.save_replay(name);
         Ok(())
-    }
-
-    fn write_checkpoint(&mut self, name: Name) -> Result<()> {
-        self.save_replay(name);
-        let snapshot = self.snapshot()?;
-        self.checkpoints.write(name, snapshot)
     }
 
     /// Saves the replay for a checkpoint, if the experiment wants that. Training waits meanwhile. If the disk refuses, the
@@ -426,7 +422,9 @@ impl Trainer {
         }
     }
 
-    fn snapshot(&mut self) -> Result<Snapshot> {
+    /// What this checkpoint will have. Every unroll that was acknowledged before the line in the log is in it.
+    fn snapshot(&mut self, name: Name) -> Result<Snapshot> {
+        tracing::info!(checkpoint = %name, "taking a snapshot");
         self.state.progress.seconds = self.budget.seconds();
         let ledgers = self.world.exchange(self.batcher.snapshot())?;
         let ledger = LedgerSnapshot::of_ranks(ledgers).unwrap_or_else(|| self.batcher.snapshot());

@@ -5,7 +5,6 @@ mod accounts;
 mod learner;
 mod lines;
 mod logs;
-mod numbers;
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -118,14 +117,14 @@ impl Options {
             Some(steps) => format!("budget.environment_steps={steps}"),
             None => format!("budget.minutes={:?}", self.minutes),
         };
-        // Without minutes only the steps count. The checkpoint from which the learner is resumed is read at the end. What the user
-        // sets comes last, and has precedence.
-        let kept = format!("learner.checkpoints_kept={KEPT}");
-        let ours = ["actor.threads=1", "actor.environments=4", "budget.minutes=0", &budget, &kept].map(String::from);
+        // Without minutes only the steps count. What the user sets has precedence, but the checkpoint from which the learner is
+        // resumed is read at the end.
+        let ours = ["actor.threads=1", "actor.environments=4", "budget.minutes=0", &budget].map(String::from);
+        let kept = [format!("learner.checkpoints_kept={KEPT}")];
         let job = Job::new(train::Options {
             preset: self.preset.clone(),
             clips: Vec::new(),
-            overrides: ours.into_iter().chain(self.overrides.iter().cloned()).collect(),
+            overrides: ours.into_iter().chain(self.overrides.iter().cloned()).chain(kept).collect(),
             actors: self.actors,
             run: self.run.clone(),
             port: None,
@@ -249,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn every_checkpoint_is_kept_unless_the_user_wants_fewer() {
+    fn every_checkpoint_is_kept() {
         let run = tempfile::tempdir().unwrap();
         let run = run.path().join("run").display().to_string();
         let kept = |arguments: &[&str]| {
@@ -257,7 +256,7 @@ mod tests {
             job.experiment().learner.checkpoints_kept
         };
         assert_eq!(kept(&[]), KEPT);
-        assert_eq!(kept(&["--set", "learner.checkpoints_kept=3"]), 3);
+        assert_eq!(kept(&["--set", "learner.checkpoints_kept=3"]), KEPT);
     }
 
     #[test]

@@ -139,27 +139,26 @@ impl Unrolls {
     /// Names what cannot be true of a process of which the learner had counted `before` unrolls when it was resumed, and
     /// `counted` in the last checkpoint.
     fn contradictions(&mut self, process: &Process, before: u64, counted: u64) {
-        let Process { incarnation, environments, made, ref acknowledged, covered, exited, left, .. } = *process;
+        let Process { incarnation, environments, made, acknowledged, ref unanswered, covered, exited, left, .. } =
+            *process;
         let mut fault = |text: String| self.faults.push(format!("actor {incarnation:016x} {text}"));
         if counted > made {
             fault(format!("made {made} unrolls, and {counted} are counted"));
         }
         // An actor sends its unrolls in order, also again after a restart, and the learner answers in that order.
-        for gap in acknowledged.gaps() {
+        for gap in unanswered {
             fault(format!("has later acknowledgements, and none of the unrolls {} to {}", gap.start, gap.end - 1));
         }
-        let unanswered = made.saturating_sub(acknowledged.end());
-        if unanswered > environments {
-            fault(format!(
-                "ended with {unanswered} unrolls without acknowledgement, and has {environments} environments"
-            ));
+        let last = made.saturating_sub(acknowledged);
+        if last > environments {
+            fault(format!("ended with {last} unrolls without acknowledgement, and has {environments} environments"));
         }
-        if exited && unanswered != left {
-            fault(format!("ended with {unanswered} unrolls without acknowledgement, and says that there were {left}"));
+        if exited && last != left {
+            fault(format!("ended with {last} unrolls without acknowledgement, and says that there were {left}"));
         }
         if before < covered {
             fault(format!(
-                "had {covered} acknowledged unrolls before the checkpoint was made from which the learner was resumed, which has \
+                "had {covered} acknowledged unrolls before the snapshot was taken from which the learner was resumed, which has \
                  {before}"
             ));
         }
@@ -172,8 +171,7 @@ impl Unrolls {
 
     /// Adds the unrolls of a process. `joined` says whether the learner's last process knows it.
     fn add(&mut self, process: &Process, before: u64, counted: u64, joined: bool) {
-        let Process { made, ref acknowledged, by_former, exited, .. } = *process;
-        let acknowledged = acknowledged.end();
+        let Process { made, acknowledged, by_former, exited, .. } = *process;
         self.made += made;
         // These were not sent again, so the new learner has counted them without having them.
         self.explained += by_former.min(counted).saturating_sub(before);

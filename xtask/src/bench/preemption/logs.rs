@@ -2,13 +2,13 @@
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader};
+use std::ops::Range;
 use std::path::Path;
 
 use anyhow::{Context, Result};
 
 use super::learner::Learner;
 use super::lines::{incarnation, number, time};
-use super::numbers::Numbers;
 
 /// One process of an actor.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -18,11 +18,13 @@ pub(super) struct Process {
     pub(super) environments: u64,
     /// Unrolls with a sequence number. It gives them before it sends them.
     pub(super) made: u64,
-    /// The numbers of those that the learner acknowledged.
-    pub(super) acknowledged: Numbers,
+    /// One more than the number of the last one that the learner acknowledged.
+    pub(super) acknowledged: u64,
+    /// The numbers below it without an acknowledgement. The learner answers in the order of the numbers, so there is none.
+    pub(super) unanswered: Vec<Range<u64>>,
     /// The unrolls up to the last one that was acknowledged before the learner's last start.
     pub(super) by_former: u64,
-    /// The unrolls up to the last one that was acknowledged before the checkpoint was made from which the learner was resumed.
+    /// The unrolls up to the last one that was acknowledged before the snapshot was taken from which the learner was resumed.
     pub(super) covered: u64,
     /// Whether it ended by itself, and was not killed.
     pub(super) exited: bool,
@@ -70,7 +72,10 @@ impl Reader<'_> {
             if event.starts_with("made") {
                 process.made = process.made.max(end);
             } else if event.starts_with("acknowledged") {
-                process.acknowledged.insert(sequence);
+                if sequence > process.acknowledged {
+                    process.unanswered.push(process.acknowledged..sequence);
+                }
+                process.acknowledged = process.acknowledged.max(end);
                 if self.epoch.is_some_and(|epoch| epoch < self.learner.epoch) {
                     process.by_former = process.by_former.max(end);
                 }
@@ -119,12 +124,6 @@ mod tests {
         processes(&path, learner).unwrap()
     }
 
-    fn numbers(numbers: impl IntoIterator<Item = u64>) -> Numbers {
-        let mut set = Numbers::default();
-        numbers.into_iter().for_each(|number| set.insert(number));
-        set
-    }
-
     const ACTING: &str = "acting experiment=\"quickstart\" threads=1 environments=4 pace=Free";
     const JOINED: &str = "joined the learner actor=0 learner_epoch=1";
     const JOINED_AGAIN: &str = "joined the learner actor=0 learner_epoch=2";
@@ -153,7 +152,7 @@ mod tests {
             line(3, ACTING),
             line(3, EXITING),
         ];
-        let common = Process { environments: 4, made: 2, acknowledged: numbers([0]), ..Process::default() };
+        let common = Process { environments: 4, made: 2, acknowledged: 1, ..Process::default() };
         let killed = Process { incarnation: 0xff, ..common.clone() };
         let exited = Process { incarnation: 0x9a1b_620a_e24a_a948, exited: true, left: 1, ..common };
         assert_eq!(read(&log, &Learner { epoch: 1, ..Learner::default() }), [killed, exited]);
@@ -173,7 +172,7 @@ mod tests {
         log.push(unroll(31, other, 0, "acknowledged verdict=Taken"));
         let covered = Some("2026-01-01T00:00:04.000000Z".to_owned());
         let found = read(&log, &Learner { epoch: 2, covered, ..Learner::default() });
-        assert_eq!(found[0].acknowledged, numbers([0, 1, 2, 3, 5]));
+        assert_eq!((found[0].acknowledged, found[0].unanswered.as_slice()), (6, &[4..5][..]));
         assert_eq!((found[0].by_former, found[0].covered), (3, 2));
         assert_eq!((found[1].by_former, found[1].covered), (0, 0));
     }
