@@ -19,7 +19,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 /// Like Slurm's, it gives a step cores of the job's nodes, one a task; `free` has a file for each free core. Without `--nodes` it
-/// needs a core of each node. If there are too few it waits, for ever or for the seconds of `--immediate`. It ends with the highest exit
+/// needs a core of each node. If there are too few it waits for ever, or with `--immediate` for no time. It ends with the highest exit
 /// code of its tasks, and kills them when it gets SIGTERM.
 const SRUN: &str = r#"#!/bin/bash
 shopt -s nullglob
@@ -53,15 +53,11 @@ place() {
   taken=("${chosen[@]:0:tasks}")
   rm "${taken[@]}"
 }
-waited=0
-until place; do
-  if [[ $immediate ]] && ((waited >= immediate)); then
-    echo "srun: error: Unable to create step for job $SLURM_JOB_ID: Requested nodes are busy" >&2
-    exit 1
-  fi
-  sleep 1
-  ((++waited))
-done
+if ! place; then
+  [[ $immediate ]] || exec /bin/sleep infinity
+  echo "srun: error: Unable to create step for job $SLURM_JOB_ID: Requested nodes are busy" >&2
+  exit 1
+fi
 
 for ((task = 0; task < tasks; task++)); do
   "$@" &
@@ -91,7 +87,7 @@ const SQUEUE: &str = r#"#!/bin/bash
 echo "squeue $*" >> "$STAND_INS/commands"
 cat "$STAND_INS/state"
 "#;
-/// Makes the minutes of the batch file and of `srun` short.
+/// Makes the minutes of the batch file short.
 const SLEEP: &str = "#!/bin/bash\nexec /bin/sleep 0.02\n";
 const POLL: Duration = Duration::from_millis(50);
 
