@@ -2,12 +2,14 @@
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::process::{Child, Command};
+use std::time::Instant;
 
 use anyhow::{Context as _, Result, ensure};
 use clap::Args;
 use comic_learner::device::Backend;
 use comic_learner::world::{MEETING, World};
 use serde_json::json;
+use tch::{Kind, Tensor};
 
 use super::{Networks, WARM_UP};
 use crate::median::median;
@@ -16,8 +18,8 @@ use crate::median::median;
 ///
 /// `value` is milliseconds of the step, in which each of `ranks` processes has one thread and its share of the minibatch. `floor` is
 /// the same without any exchange between them, on the same cores at the same time: the slowest process of each repeat. `one` is one
-/// learner with the whole minibatch and as many threads. All are medians of interleaved repeats. `bytes` is what each rank gives to the
-/// sum.
+/// learner with the whole minibatch and as many threads. `sum` is the addition of the gradients alone. All are medians of interleaved
+/// repeats. `bytes` is what each rank gives to the sum.
 #[derive(Args, Clone, Debug)]
 pub struct Ranks {
     /// Processes
@@ -74,7 +76,9 @@ impl Ranks {
         let mut together = Networks::new(&share, &backend, &world)?;
         let mut apart = Networks::new(&share, &backend, &World::alone())?;
         let mut one = world.is_first().then(|| Networks::new(&whole, &backend, &World::alone())).transpose()?;
-        let (mut values, mut floors, mut ones) = (Vec::new(), Vec::new(), Vec::new());
+        let parameters: usize = together.learner.parameter_counts().iter().map(|(_, count)| count).sum();
+        let mut gradients = [Tensor::zeros([parameters as i64], (Kind::Float, backend.device()))];
+        let (mut values, mut floors, mut ones, mut sums) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         for repeat in 0..self.repeats + WARM_UP {
             tch::set_num_threads(1);
             let slowest = |milliseconds: f64| {
@@ -84,22 +88,25 @@ impl Ranks {
             world.exchange(())?;
             let value = slowest(together.update(&backend)?)?;
             let floor = slowest(apart.update(&backend)?)?;
+            let begun = Instant::now();
+            world.sum(&mut gradients)?;
+            let sum = slowest(begun.elapsed().as_secs_f64() * 1e3)?;
             // The others wait meanwhile.
             tch::set_num_threads(self.ranks as i32);
             let alone = one.as_mut().map(|one| one.update(&backend)).transpose()?;
             if repeat >= WARM_UP {
                 values.push(value);
                 floors.push(floor);
+                sums.push(sum);
                 ones.extend(alone);
             }
         }
         if world.is_first() {
             let (value, floor, one) = (median(values), median(floors), median(ones));
-            let parameters: usize = together.learner.parameter_counts().iter().map(|(_, count)| count).sum();
             let line = json!({
                 "figure": format!("learner.ranks.{}", self.preset), "value": value, "unit": "ms", "floor": floor,
                 "ratio": value / floor, "one": one, "against_one": value / one, "ranks": self.ranks,
-                "repeats": self.repeats, "bytes": 4 * parameters,
+                "repeats": self.repeats, "sum": median(sums), "bytes": 4 * parameters,
             });
             println!("{line}");
         }
