@@ -94,12 +94,12 @@ pub struct Simulate {
     /// Bytes of the gradients that learners add in each update, on a network that nothing else uses
     #[arg(long, value_name = "BYTES", default_value_t = 30_500_000.0, value_parser = positive)]
     gradient_bytes: f64,
-    /// Speed at which learners add gradients, Gbit/s, if --link-gbps is not lower. The default is gloo's, between its 1 and 2
-    /// GB/s (docs/data-parallel.md)
-    #[arg(long, value_name = "GBPS", default_value_t = 12.0, value_parser = positive)]
+    /// Speed at which learners add gradients, Gbit/s, if --link-gbps is not lower. The default is gloo's between two learners
+    /// of one machine, 0.8 GB/s (docs/data-parallel.md)
+    #[arg(long, value_name = "GBPS", default_value_t = 6.4, value_parser = positive)]
     all_reduce_gbps: f64,
-    /// Time of an update's exchanges between learners without the bytes of gradients, ms. The two of a gradient step took
-    /// about 7 ms on two cores that the learners shared; half of it, with cores of their own, is an assumption
+    /// Time of all else that learners exchange in an update, ms: an assumption. On two cores the exchanges of the quickstart's
+    /// step took 7 to 10 ms, and 4.4 to 4.9 of these were for 3.5 MB of gradients
     #[arg(long, value_name = "MS", default_value_t = 3.0, value_parser = zero_or_more)]
     exchange_ms: f64,
     /// Bytes of the assets that an actor fetches at its start; 0 where it has them
