@@ -7,11 +7,12 @@ use crate::world;
 /// as done.
 pub const STOPPED: u8 = 4;
 
-/// The exit code of a learner that lost another one of its run, or did not find it: another process failed, not this one.
+/// The exit code of a learner that lost another one of its run, did not find it, or found one with another world size: another process
+/// failed, not this one.
 const LOST: u8 = 5;
 
 impl Error {
-    /// The program's exit code: 2 when starting again cannot help, because the configuration is wrong, 5 when another rank is lost,
+    /// The program's exit code: 2 when starting again cannot help, because the configuration is wrong, 5 when another rank is at fault,
     /// and 1 otherwise.
     pub fn exit_code(&self) -> u8 {
         match self {

@@ -188,8 +188,8 @@ impl World {
         }
     }
 
-    /// Replaces each tensor by its sum over all ranks. The tensors carry no gradient. They have the same shapes on all ranks, one device, and one
-    /// element type.
+    /// Replaces each tensor by its sum over all ranks. The tensors carry no gradient. They have the same shapes on all ranks, one
+    /// device, and one element type.
     ///
     /// # Errors
     /// [`Error::Lost`].

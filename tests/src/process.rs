@@ -1,12 +1,15 @@
 //! A process on this machine, and the signals that a test sends it.
 
 use std::fs::{self, File};
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ExitStatus};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
 
 /// Time between two checks of a condition.
 pub(crate) const POLL: Duration = Duration::from_millis(50);
@@ -116,6 +119,28 @@ impl Process {
     /// The whole log.
     pub fn log(&self) -> String {
         read(&self.log)
+    }
+
+    /// Host and port of a learner's metrics page, as it logs them.
+    ///
+    /// # Errors
+    /// When the learner logs no address.
+    pub fn metrics_address(&self) -> Result<String> {
+        let log = self.log();
+        let mut lines = log.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+        lines.find_map(|line| Some(line["metrics"].as_str()?.to_owned())).context("no address")
+    }
+
+    /// A learner's metrics page.
+    ///
+    /// # Errors
+    /// When the learner logs no address, or does not answer.
+    pub fn metrics_page(&self) -> Result<String> {
+        let mut stream = TcpStream::connect(self.metrics_address()?)?;
+        stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: learner\r\n\r\n")?;
+        let mut page = String::new();
+        stream.read_to_string(&mut page)?;
+        Ok(page)
     }
 
     /// Waits until the log contains `text`.

@@ -2,8 +2,7 @@
 
 use std::ffi::OsString;
 use std::fs::{self, OpenOptions};
-use std::io::{Read as _, Write as _};
-use std::net::{TcpListener, TcpStream, UdpSocket};
+use std::net::{TcpListener, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -263,26 +262,20 @@ impl System {
         self.spawn(arguments.first().copied().unwrap_or(name), command)
     }
 
-    /// Host and port of the metrics page, as the learner logs them.
+    /// Host and port of the learner's metrics page.
     ///
     /// # Errors
-    /// When the learner logs no address.
+    /// Those of [`Process::metrics_address`].
     pub fn metrics_address(&self) -> Result<String> {
-        let log = self.learner.as_ref().context("no learner")?.log();
-        let mut lines = log.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
-        lines.find_map(|line| Some(line["metrics"].as_str()?.to_owned())).context("no address")
+        self.learner.as_ref().context("no learner")?.metrics_address()
     }
 
-    /// The metrics page.
+    /// The learner's metrics page.
     ///
     /// # Errors
-    /// When the learner logs no address, or does not answer.
+    /// Those of [`Process::metrics_page`].
     pub fn metrics_page(&self) -> Result<String> {
-        let mut stream = TcpStream::connect(self.metrics_address()?)?;
-        stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: learner\r\n\r\n")?;
-        let mut page = String::new();
-        stream.read_to_string(&mut page)?;
-        Ok(page)
+        self.learner.as_ref().context("no learner")?.metrics_page()
     }
 
     /// Starts an actor in this network namespace.

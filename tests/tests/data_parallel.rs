@@ -15,7 +15,7 @@ const MANY: u64 = 300;
 
 #[tokio::test]
 async fn two_learners_train_one_run_and_survive_the_loss_of_one() -> Result<()> {
-    let mut ranks = Ranks::new(2, &SMALL)?;
+    let mut ranks = Ranks::new(2, &[&SMALL[..], &["--metrics-port", "0"]].concat())?;
     let first = ranks.start().await?;
 
     // Both actors know the address of rank 0 only. One of them is sent to rank 1.
@@ -25,6 +25,11 @@ async fn two_learners_train_one_run_and_survive_the_loss_of_one() -> Result<()> 
     }
     ranks.others[0].until_log_holds("actor joined", LIMIT).await?;
     let before = trains(&mut ranks).await?;
+    // The alert on missing checkpoints asks only rank 0.
+    for (rank, learner) in ranks.system.learner.iter().chain(&ranks.others).enumerate() {
+        let page = learner.metrics_page()?;
+        ensure!(page.contains(&format!("\ncomic_rank {rank}\n")), "not rank {rank}: {page}");
+    }
     ensure!(
         metric(&ranks.system.status().await?, "updates") * 8.0 >= before.trained as f64,
         "an unroll is counted twice"
