@@ -79,20 +79,44 @@ fn with_tls_the_learner_has_the_same_options_except_for_access() -> Result<()> {
 
 #[test]
 fn two_learners_have_the_options_of_one_and_are_two_ranks_of_one_run() -> Result<()> {
-    let plain = command("compose.yaml", "learner")?;
-    let rank = |service: &str| -> Result<(Vec<String>, Vec<String>)> {
-        let mut words = command("compose.data-parallel.yaml", service)?;
-        let at = words.iter().position(|word| word == "--world-size").context("no --world-size")?;
-        let world = words.split_off(at);
-        Ok((words, world))
+    for (file, one, advertises) in [
+        ("compose.data-parallel.yaml", "compose.yaml", false),
+        ("compose.data-parallel.tls.yaml", "compose.tls.yaml", true),
+    ] {
+        let plain = command(one, "learner")?;
+        let run = plain.iter().position(|word| word == "--run").context("no --run")?;
+        // Rank 0 has the run's directory.
+        let ranks = [("learner", plain.clone()), ("learner-1", [&plain[..run], &plain[run + 2..]].concat())];
+        for (rank, (service, options)) in ranks.into_iter().enumerate() {
+            let words = command(file, service)?;
+            let mut world = format!("--world-size 2 --rank {rank} --rendezvous learner:7071");
+            if advertises {
+                // A certificate has names, and not the address that a container happens to have.
+                world += &format!(" --advertise {service}:7070");
+            }
+            let expected = options.iter().map(String::as_str).chain(world.split(' '));
+            ensure!(words.iter().map(String::as_str).eq(expected), "{file}: {words:?}");
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn with_tls_the_second_learner_has_what_the_first_has_and_both_names_are_certified() -> Result<()> {
+    let (one, two) = (compose("compose.tls.yaml")?, compose("compose.data-parallel.tls.yaml")?);
+    let (first, second) = (&one["services"]["learner"], &two["services"]["learner-1"]);
+    for field in ["environment", "volumes"] {
+        ensure!(first[field] == second[field], "{field}: {second:?}");
+    }
+    ensure!(second["depends_on"]["certs"] == first["depends_on"]["certs"], "{second:?}");
+    let names = |document: &Value| -> Vec<String> {
+        words(&document["services"]["certs"]["command"])
+            .skip_while(|word| *word != "--name")
+            .map(str::to_owned)
+            .collect()
     };
-    let (first, world) = rank("learner")?;
-    ensure!(first == plain, "{first:?} and {plain:?}");
-    ensure!(world == ["--world-size", "2", "--rank", "0", "--rendezvous", "learner:7071"], "{world:?}");
-    let (second, world) = rank("learner-1")?;
-    let run = plain.iter().position(|word| word == "--run").context("no --run")?;
-    ensure!(second == [&plain[..run], &plain[run + 2..]].concat(), "{second:?} and {plain:?}");
-    ensure!(world == ["--world-size", "2", "--rank", "1", "--rendezvous", "learner:7071"], "{world:?}");
+    ensure!(names(&one) == ["--name", "learner", "localhost"], "{one:?}");
+    ensure!(names(&two) == ["--name", "learner", "learner-1", "localhost"], "{two:?}");
     Ok(())
 }
 
@@ -167,8 +191,11 @@ fn what_is_in_volumes_is_where_the_image_lets_it_be_written() -> Result<()> {
     let prepared =
         prepared.lines().find(|line| line.contains("install --directory --owner comic")).context("no directories")?;
     let prepared: BTreeSet<_> = prepared.split_whitespace().filter(|word| word.starts_with('/')).collect();
-    let used =
-        [("compose.yaml", ["learner", "actor", "evaluator"]), ("compose.tls.yaml", ["certs", "learner", "evaluator"])];
+    let used = [
+        ("compose.yaml", &["learner", "actor", "evaluator"][..]),
+        ("compose.tls.yaml", &["certs", "learner", "evaluator"]),
+        ("compose.data-parallel.tls.yaml", &["learner-1"]),
+    ];
     for (file, services) in used {
         for service in services {
             let service = &compose(file)?["services"][service];

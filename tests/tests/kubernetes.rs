@@ -151,7 +151,7 @@ fn images_are_pinned_to_this_version_everywhere() -> Result<()> {
         }
         Ok(())
     })?;
-    for file in ["compose.yaml", "compose.tls.yaml", "Dockerfile", "README.md"] {
+    for file in ["compose.yaml", "compose.tls.yaml", "compose.data-parallel.yaml", "Dockerfile", "README.md"] {
         let text = fs::read_to_string(root().join("deploy").join(file))?;
         let named = text.split([' ', '\n', '=', '`', '/']).filter(|word| word.contains(':'));
         let ours: Vec<_> =
