@@ -139,22 +139,23 @@ impl Unrolls {
     /// Names what cannot be true of a process of which the learner had counted `before` unrolls when it was resumed, and
     /// `counted` in the last checkpoint.
     fn contradictions(&mut self, process: &Process, before: u64, counted: u64) {
-        let Process { incarnation, environments, made, acknowledged, ref unanswered, covered, exited, left, .. } =
-            *process;
+        let Process { incarnation, environments, made, acknowledged, ref gaps, covered, exited, left, .. } = *process;
         let mut fault = |text: String| self.faults.push(format!("actor {incarnation:016x} {text}"));
         if counted > made {
             fault(format!("made {made} unrolls, and {counted} are counted"));
         }
         // An actor sends its unrolls in order, also again after a restart, and the learner answers in that order.
-        for gap in unanswered {
+        for gap in gaps {
             fault(format!("has later acknowledgements, and none of the unrolls {} to {}", gap.start, gap.end - 1));
         }
-        let last = made.saturating_sub(acknowledged);
-        if last > environments {
-            fault(format!("ended with {last} unrolls without acknowledgement, and has {environments} environments"));
+        let unanswered = made.saturating_sub(acknowledged);
+        if unanswered > environments {
+            fault(format!(
+                "ended with {unanswered} unrolls without acknowledgement, and has {environments} environments"
+            ));
         }
-        if exited && last != left {
-            fault(format!("ended with {last} unrolls without acknowledgement, and says that there were {left}"));
+        if exited && unanswered != left {
+            fault(format!("ended with {unanswered} unrolls without acknowledgement, and says that there were {left}"));
         }
         if before < covered {
             fault(format!(

@@ -21,7 +21,7 @@ pub(super) struct Process {
     /// One more than the number of the last one that the learner acknowledged.
     pub(super) acknowledged: u64,
     /// The numbers below it without an acknowledgement. The learner answers in the order of the numbers, so there is none.
-    pub(super) unanswered: Vec<Range<u64>>,
+    pub(super) gaps: Vec<Range<u64>>,
     /// The unrolls up to the last one that was acknowledged before the learner's last start.
     pub(super) by_former: u64,
     /// The unrolls up to the last one that was acknowledged before the snapshot was taken from which the learner was resumed.
@@ -73,7 +73,7 @@ impl Reader<'_> {
                 process.made = process.made.max(end);
             } else if event.starts_with("acknowledged") {
                 if sequence > process.acknowledged {
-                    process.unanswered.push(process.acknowledged..sequence);
+                    process.gaps.push(process.acknowledged..sequence);
                 }
                 process.acknowledged = process.acknowledged.max(end);
                 if self.epoch.is_some_and(|epoch| epoch < self.learner.epoch) {
@@ -173,7 +173,7 @@ mod tests {
         let covered = Some("2026-01-01T00:00:04.000000Z".to_owned());
         let found = read(&log, &Learner { epoch: 2, covered, ..Learner::default() });
         assert_eq!(found[0].acknowledged, 6);
-        assert_eq!(found[0].unanswered, vec![Range { start: 4, end: 5 }]);
+        assert_eq!(found[0].gaps, vec![Range { start: 4, end: 5 }]);
         assert_eq!((found[0].by_former, found[0].covered), (3, 2));
         assert_eq!((found[1].by_former, found[1].covered), (0, 0));
     }
