@@ -142,8 +142,8 @@ impl Catalogue {
     }
 
     /// The files of the clips with their hashes, each file once. Built-in clips have no file. If at most half of the clips of a file
-    /// are in use and there is a directory for `cuts`, a file with these clips alone is made there and takes its place. Before, the files
-    /// that earlier calls made there are removed, so nobody may still fetch them.
+    /// are in use and there is a directory for `cuts`, a file with these clips alone is made there and takes its place. The files
+    /// that earlier calls made there are removed first, so nobody may still fetch them.
     ///
     /// # Errors
     /// [`Error::Unreadable`]; with `cuts` also [`Error::Unwritable`], those of [`load`](Self::load), and those of

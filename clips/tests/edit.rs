@@ -19,8 +19,8 @@ const DT: f64 = 0.03;
 /// Tracking bodies of each side: legs, then arms; first of the left side, and first of the right side.
 const SIDES: [[usize; 3]; 2] = [[0, 5, 5], [17, 24, 7]];
 const THORAX: usize = 12;
-/// How far a body of the spine is to the left of the one that carries it, m, in the frame of that one: the body of this
-/// index by 1.2 times the positions of dm_control's `humanoid_CMU_V2020.xml`. All other offsets are symmetric.
+/// Bodies of the spine by index, and how far each is to the left of the one that carries it, m: 1.2 times the positions in
+/// dm_control's `humanoid_CMU_V2020.xml`. All other offsets are symmetric.
 const SIDEWAYS: [(usize, f64); 4] = [(11, 0.0006790344), (12, 0.0006150336), (14, -0.003961716), (15, 0.0012021)];
 /// Twice the sideways offsets of the thorax and below: the arms are at most this far from their mirror image, m.
 const ARMS_MISS: f64 = 2.0 * (0.0006790344 + 0.0006150336);
